@@ -1,0 +1,25 @@
+"""What light does with what is made.
+
+Reading order, from the substance to the picture:
+
+    material    refractive index of the DOE substrate, and its Fresnel loss
+    aperture    the clear aperture: how much of each DOE cell is open
+    camera      lens and sensor; the wave a source sends into the aperture
+    pixel       integration of a sampled intensity over square sensor pixels
+    pupil       the field behind the DOE
+    farfield    pupil -> pixel energies, the default path (eqs. 7-9 of the paper)
+    hankel      the same for rotationally symmetric pupils
+    fresnel     the direct path (eq. 5): reference for the other two
+    psf         PSF banks: every colour and depth of one height map
+    metrics     numbers read off a PSF: far-spot energy, ring:disc, MTF, 0th order, energy budget
+    store       PSF banks and height maps as OpenEXR files
+
+Conventions (pinned by tests/sim/test_conventions.py):
+
+* SI units; arrays `[y, x]`, row 0 at the lowest y; PSF banks `[wavelength, depth, y, x]`.
+* Grids are centred: coordinate (i - (n-1)/2) * pitch, so the axis lies between samples for even n.
+* Fields vary as exp(+ikz); more optical path means more phase, exp(+i phi). A surface that
+  thickens toward +y sends light to +y.
+* A PSF carries energy: its sum over an unbounded sensor is the power transmitted per unit power
+  incident on the clear aperture. Nothing is renormalised.
+"""

@@ -1,0 +1,141 @@
+"""Lens, sensor and DOE substrate of a camera, and the wave a source sends into its aperture.
+
+The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens
+cancels the quadratic term of Fresnel propagation, so only the source's own path differences and the DOE remain
+(eq. 7). A sensor out of focus leaves a quadratic remainder, which is added here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fab.grid import Grid
+from sim.material import fresnel_transmission, refractive_index
+
+
+@dataclass(frozen=True)
+class Colour:
+    """One colour channel: vacuum wavelengths in metres and their weights, which sum to 1."""
+
+    name: str
+    wavelengths_m: tuple[float, ...]
+    weights: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Everything that is fixed while a DOE is designed. Hashable: it may be a static argument of `jit`.
+
+    Attributes:
+        grid: cells of the DOE.
+        aperture_m: diameter of the clear aperture.
+        material: substrate, a key of `sim.material.MATERIALS`.
+        colours: colour channels, in the order of the bank's first axis.
+        focal_length_m: focal length of the lens.
+        pixel_m: centre-to-centre distance of sensor pixels, after binning.
+        window: sensor pixels computed per axis, centred on the chief ray; for an even count the chief ray
+            falls on the corner shared by the four middle pixels, for an odd one on the middle pixel's centre.
+        fill: side of a pixel's light-sensitive square over `pixel_m`, 0-1.
+        defocus_m: distance of the sensor beyond the focal plane.
+    """
+
+    grid: Grid
+    aperture_m: float
+    material: str
+    colours: tuple[Colour, ...]
+    focal_length_m: float
+    pixel_m: float
+    window: int
+    fill: float = 1.0
+    defocus_m: float = 0.0
+
+    @property
+    def sensor_distance_m(self) -> float:
+        """Distance from the lens to the sensor."""
+        return self.focal_length_m + self.defocus_m
+
+    def axis_m(self) -> Float[np.ndarray, " window"]:
+        """Pixel centres on the sensor relative to the chief ray, metres."""
+        return Grid((self.window, self.window), self.pixel_m).axis_m("x")
+
+    def transmission(self, wavelength_m: float) -> float:
+        """Power that passes both faces of the uncoated substrate."""
+        return fresnel_transmission(refractive_index(self.material, wavelength_m))
+
+    def waves_per_metre(self, wavelength_m: float, field_rad: tuple[float, float] = (0.0, 0.0)) -> float:
+        """Waves of delay per metre of DOE height.
+
+        (n - 1) / lambda on axis (eq. 2); for an oblique chief ray of direction sine s,
+        (sqrt(n^2 - s^2) - sqrt(1 - s^2)) / lambda, the thin-element path difference.
+        """
+        square = float(np.sum(np.square(direction_sines(field_rad))))
+        index = refractive_index(self.material, wavelength_m)
+        return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
+
+    def defocus_radius_m(self, depth_m: float) -> float:
+        """Radius on the sensor of the geometric blur disc of a point at `depth_m`.
+
+        D/2 · |d/z + 1 - d/f| for a sensor at distance d; D f / (2 z) in the focal plane.
+        """
+        distance = self.sensor_distance_m
+        inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
+        return self.aperture_m / 2 * abs(distance * inverse_depth + 1.0 - distance / self.focal_length_m)
+
+
+def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
+    """Direction sines (y, x) of the chief ray for field angles (y, x) in radians.
+
+    The angles are those of the ray's projections on the yz and xz planes, positive where the light travels
+    toward +y or +x, so the image moves to +y or +x.
+    """
+    tangents = np.tan(np.asarray(field_rad, dtype=np.float64))
+    return tangents / np.sqrt(1.0 + np.sum(tangents**2))
+
+
+def source_path_m(
+    camera: Camera, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "y x"]:
+    """Optical path from a point source to every DOE cell, relative to the chief ray, metres in float64.
+
+    Args:
+        camera: lens and grid.
+        depth_m: axial distance of the source from the DOE; `inf` for a star.
+        field_rad: field angles (y, x); the linear path (the tilt that moves the image to f tan(field)) is
+            removed, so the PSF window stays centred on the chief ray.
+
+    Eq. 1 of the paper with the constant subtracted, plus r^2/2 (1/d - 1/f) for a sensor at distance d.
+    """
+    y = camera.grid.axis_m("y")[:, None]
+    x = camera.grid.axis_m("x")[None, :]
+    return path_at_m(camera, y, x, depth_m, field_rad)
+
+
+def path_at_m(
+    camera: Camera,
+    y_m: Float[np.ndarray, "*s"],
+    x_m: Float[np.ndarray, "*t"],
+    depth_m: float,
+    field_rad: tuple[float, float] = (0.0, 0.0),
+) -> Float[np.ndarray, "*u"]:
+    """`source_path_m` at any points (y, x) of the aperture, broadcast against each other."""
+    square = y_m**2 + x_m**2
+    defocus = (square / 2) * (1.0 / camera.sensor_distance_m - 1.0 / camera.focal_length_m)
+    if np.isinf(depth_m):
+        return defocus
+    y0, x0 = (-depth_m * np.tan(angle) for angle in field_rad)
+    chief = np.sqrt(y0**2 + x0**2 + depth_m**2)
+    path = np.sqrt((y_m - y0) ** 2 + (x_m - x0) ** 2 + depth_m**2)
+    # (path - chief) without cancellation, then without its linear part -(y0 y + x0 x) / chief.
+    linear = y0 * y_m + x0 * x_m
+    return (square - 2 * linear) / (path + chief) + linear / chief + defocus
+
+
+def wrapped_waves(path_m: Float[np.ndarray, "*s"], wavelength_m: float) -> Float[np.ndarray, "*s"]:
+    """Path in waves, wrapped to [-1/2, 1/2] in float64 and only then rounded to float32.
+
+    5 cm from a 4.4 mm aperture the path is a hundred waves; float32 would leave 1e-5 of them.
+    """
+    waves = path_m / wavelength_m
+    waves -= np.round(waves)
+    return waves.astype(np.float32)

@@ -1,0 +1,161 @@
+"""Refractive indices of DOE substrates and resists, and what their faces reflect.
+
+Every entry is a dispersion formula with its published coefficients, range and citation. A wavelength
+outside the range is refused, never extrapolated.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fab.errors import InputError
+
+
+def _sellmeier(wavelength_um: float, terms: tuple[tuple[float, float], ...]) -> float:
+    """Index from n^2 - 1 = sum B l^2 / (l^2 - C), C in square micrometres."""
+    square = wavelength_um**2
+    return (1.0 + sum(b * square / (square - c) for b, c in terms)) ** 0.5
+
+
+def _cauchy(wavelength_um: float, terms: tuple[tuple[float, float], ...]) -> float:
+    """Index from n = sum A l^p."""
+    return sum(a * wavelength_um**p for a, p in terms)
+
+
+@dataclass(frozen=True)
+class Material:
+    """A transparent material at room temperature.
+
+    Attributes:
+        name: key used in specs.
+        range_m: shortest and longest vacuum wavelength the formula was fitted for, metres.
+        formula: index as a function of the wavelength in micrometres and `terms`.
+        terms: coefficients of the formula.
+        citation: where the coefficients were published.
+    """
+
+    name: str
+    range_m: tuple[float, float]
+    formula: Callable[[float, tuple[tuple[float, float], ...]], float]
+    terms: tuple[tuple[float, float], ...]
+    citation: str
+
+    def index(self, wavelength_m: float) -> float:
+        """Refractive index n at a vacuum wavelength in metres.
+
+        Raises:
+            InputError: the wavelength lies outside the range of the published fit.
+        """
+        low, high = self.range_m
+        if not low <= wavelength_m <= high:
+            raise InputError(
+                f"material {self.name}",
+                f"the wavelength must lie in {low * 1e9:.0f}-{high * 1e9:.0f} nm, the range of its published fit",
+                f"{wavelength_m * 1e9:.6g} nm",
+                "Choose a wavelength inside the range or another material.",
+            )
+        return self.formula(wavelength_m * 1e6, self.terms)
+
+
+MATERIALS: dict[str, Material] = {
+    m.name: m
+    for m in (
+        Material(
+            "fused_silica",
+            (0.21e-6, 6.7e-6),
+            _sellmeier,
+            ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
+            "I. H. Malitson, J. Opt. Soc. Am. 55, 1205 (1965); range confirmed by C. Z. Tan (1998)",
+        ),
+        Material(
+            "n_bk7",
+            (0.3e-6, 2.5e-6),
+            _sellmeier,
+            ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)),
+            "SCHOTT optical glass catalogue, 2017-01-20",
+        ),
+        Material(
+            "p_bk7",
+            (0.31e-6, 2.5e-6),
+            _sellmeier,
+            ((1.18318503, 0.00722141956), (0.0871756426, 0.0268216805), (1.03133701, 101.702362)),
+            "SCHOTT optical glass catalogue, 2017-01-20 (precision moulding)",
+        ),
+        Material(
+            "pmma",
+            (0.4368e-6, 1.052e-6),
+            _sellmeier,
+            ((1.1819, 0.011313),),
+            "N. Sultanova, S. Kasarova, I. Nikolov, Acta Phys. Pol. A 116, 585 (2009)",
+        ),
+        Material(
+            "pmma_resist",
+            (0.2e-6, 1.1e-6),
+            _cauchy,
+            ((1.488, 0), (0.002898, -2), (0.0001579, -4)),
+            "MicroChem 950 PMMA data sheet (2001)",
+        ),
+        Material(
+            "su8",
+            (0.32e-6, 0.80e-6),
+            _cauchy,
+            ((1.566, 0), (0.00796, -2), (0.00014, -4)),
+            "MicroChem SU-8 2000 data sheet (2011), uncured film",
+        ),
+    )
+}
+
+
+def material(name: str) -> Material:
+    """The material of that name.
+
+    Raises:
+        InputError: no such material; the message lists those there are.
+    """
+    if name not in MATERIALS:
+        raise InputError("material", f"must be one of {', '.join(MATERIALS)}", repr(name), "Pick one of these names.")
+    return MATERIALS[name]
+
+
+def refractive_index(name: str, wavelength_m: float) -> float:
+    """Refractive index of the named material at a vacuum wavelength in metres."""
+    return material(name).index(wavelength_m)
+
+
+def fresnel_transmission(index: float) -> float:
+    """Power that passes both uncoated faces of a plate at normal incidence, 0-1.
+
+    One face passes T = 4n/(n+1)^2 (M. Born and E. Wolf, *Principles of Optics*, §1.5); the two faces of a
+    substrate much thicker than the coherence length multiply, and light reflected twice or more is counted
+    as lost from the image.
+    """
+    return (4.0 * index / (index + 1.0) ** 2) ** 2
+
+
+def full_wave_height_m(name: str, wavelength_m: float) -> float:
+    """Height whose optical path in air is one wave, lambda / (n - 1), in metres."""
+    return wavelength_m / (refractive_index(name, wavelength_m) - 1.0)
+
+
+def full_wave_wavelength_m(name: str, height_m: float) -> float:
+    """The wavelength for which `height_m` of the material delays by exactly one wave, metres.
+
+    Solves lambda = (n(lambda) - 1) h inside the material's range. 16 levels of 75 nm in fused silica give 552 nm.
+
+    Raises:
+        InputError: no wavelength in the range is delayed by one wave.
+    """
+    from scipy.optimize import brentq
+
+    low, high = material(name).range_m
+
+    def excess(wavelength_m: float) -> float:
+        return full_wave_height_m(name, wavelength_m) - height_m
+
+    if excess(low) > 0 or excess(high) < 0:
+        raise InputError(
+            f"material {name}",
+            f"a height of one wave must lie in {full_wave_height_m(name, low):.3g}-{full_wave_height_m(name, high):.3g} m",
+            f"{height_m:.4g} m",
+            "Change process.levels or process.level_step.",
+        )
+    return float(brentq(excess, low, high, xtol=1e-15))

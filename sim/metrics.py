@@ -1,0 +1,143 @@
+"""Numbers read off a PSF, each with its definition. All work on plain arrays; none changes a PSF's energy."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.fft import fft2
+
+from sim.camera import Camera
+from sim.psf import pupil_field
+
+
+def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y x"]:
+    """Distance of every pixel centre from the centre of the window, metres."""
+    y, x = (pixel_m * (np.arange(n) - (n - 1) / 2) for n in shape)
+    return np.hypot(y[:, None], x[None, :])
+
+
+def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Float[np.ndarray, "y x"]:
+    """Share of every pixel inside a centred disc, from 8 x 8 points per pixel, float32."""
+    fine = radius_map_m((shape[0] * 8, shape[1] * 8), pixel_m / 8) <= radius_m
+    return fine.reshape(shape[0], 8, shape[1], 8).mean(axis=(1, 3), dtype=np.float32)
+
+
+def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
+    """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D."""
+    return 1.2197 * wavelength_m * camera.sensor_distance_m / camera.aperture_m
+
+
+def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
+    """Radius that counts as the far spot: the first dark ring plus one pixel, so the spot is caught wherever it
+    falls on the pixel grid.
+    """
+    return airy_radius_m(camera, wavelength_m) + camera.pixel_m
+
+
+def energy_within(psf: Float[np.ndarray, "y x"], pixel_m: float, radius_m: float) -> float:
+    """Energy inside a centred disc, with partly covered pixels counted by area."""
+    return float(np.sum(psf * disc_weights(psf.shape, pixel_m, radius_m), dtype=np.float64))
+
+
+def encircled_energy(
+    psf: Float[np.ndarray, "y x"], pixel_m: float, radii_m: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, " r"]:
+    """Energy inside centred discs of growing radius (not divided by the total)."""
+    return np.array([energy_within(psf, pixel_m, float(r)) for r in radii_m])
+
+
+class RingToDisc(NamedTuple):
+    """Energy outside and inside the geometric defocus disc, within the window."""
+
+    ratio: float
+    ring: float
+    disc: float
+    disc_radius_m: float
+    window_half_m: float
+
+
+def ring_to_disc(psf: Float[np.ndarray, "y x"], camera: Camera, depth_m: float) -> RingToDisc:
+    """Ring:disc ratio of a near PSF (the paper's simulation gives 3:1, its prototype 1:1).
+
+    The disc is the geometric defocus disc widened by one pixel, where light that the DOE does not diffract lands.
+    """
+    radius = camera.defocus_radius_m(depth_m) + camera.pixel_m
+    disc = energy_within(psf, camera.pixel_m, radius)
+    ring = float(np.sum(psf, dtype=np.float64)) - disc
+    return RingToDisc(ring / disc if disc > 0 else np.inf, ring, disc, radius, camera.window * camera.pixel_m / 2)
+
+
+def participation(psf: Array) -> Array:
+    """Sum of squared pixel energies, the concentration of a PSF: 1 for one bright pixel, 1/n for n equal ones."""
+    return jnp.sum(psf**2, axis=(-2, -1))
+
+
+def mtf(psf: Float[np.ndarray, "y x"], pixel_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Modulation transfer along x: frequencies (cycles per metre, 0 to Nyquist) and |OTF| with OTF(0) = 1.
+
+    The pixel's own transfer is in it, because the PSF is integrated over pixels. Light outside the window acts as
+    veiling glare and is not in it.
+    """
+    line = np.sum(psf, axis=0, dtype=np.float64)
+    transfer = np.abs(np.fft.rfft(line))
+    return np.fft.rfftfreq(len(line), pixel_m), transfer / transfer[0]
+
+
+def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:
+    """Fraction |<t>|^2 of the light that passes as if the plate were flat (design.md §4), t = exp(i phi) over the
+    clear aperture.
+    """
+    field = pupil_field(camera, height_m, np.inf, wavelength_m)
+    # The source at infinity is a plane wave in focus; out of focus its phase is not the plate's.
+    cells = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
+    return float(np.abs(np.asarray(field, np.complex128).sum() / cells) ** 2)
+
+
+class EnergyBudget(NamedTuple):
+    """Where the power incident on the clear aperture goes; the five parts sum to 1.
+
+    Attributes:
+        reflected: by the two faces of the substrate.
+        spot: inside the far-spot radius of the window.
+        window: elsewhere in the sensor window.
+        uncollected: within the DOE grid's band, but outside the window or between light-sensitive squares.
+        higher_orders: at angles beyond lambda / (2 pitch), scattered by the square cells and the aperture's edge.
+    """
+
+    reflected: float
+    spot: float
+    window: float
+    uncollected: float
+    higher_orders: float
+
+
+def energy_budget(
+    camera: Camera,
+    height_m: Float[np.ndarray, "y x"],
+    psf: Float[np.ndarray, "y x"],
+    depth_m: float,
+    wavelength_m: float,
+) -> EnergyBudget:
+    """Energy budget of one PSF of one wavelength.
+
+    Args:
+        camera: optics.
+        height_m: `[y, x]` the map the PSF was made from.
+        psf: `[y, x]` PSF, Fresnel loss included.
+        depth_m: source depth.
+        wavelength_m: wavelength of this PSF.
+
+    The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc²), not
+    from the PSF, so `uncollected` near zero or below it would show a fault in either.
+    """
+    passed = camera.transmission(wavelength_m)
+    spectrum = fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength_m)), workers=-1)
+    cells = camera.grid.shape[0]
+    envelope = np.sinc(np.fft.fftfreq(cells)) ** 2
+    power = spectrum.real**2 + spectrum.imag**2
+    area = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
+    band = passed * float(envelope @ power.astype(np.float64) @ envelope) / (cells**2 * area)
+    total = float(np.sum(psf, dtype=np.float64))
+    spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, wavelength_m))
+    return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)

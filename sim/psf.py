@@ -1,0 +1,110 @@
+"""PSF banks: the image of a point source for every colour and depth of one DOE height map."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+
+from sim.aperture import circle_coverage
+from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.farfield import FarField, plan_far_field
+from sim.fresnel import DirectPath, plan_direct
+from sim.pupil import PhaseRows, PupilRows, phase_pupil
+
+Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
+
+
+class PsfBank(eqx.Module):
+    """PSFs of one optical system, on one field angle.
+
+    Attributes:
+        energy: `[wavelength, depth, y, x]` energy per pixel per unit power incident on the clear aperture.
+        colours: name of each entry of the first axis.
+        depths_m: source depth of each entry of the second axis, metres.
+        pixel_m: pixel pitch, metres. The chief ray is at the centre of the window.
+        field_rad: field angles (y, x).
+    """
+
+    energy: Float[np.ndarray, "w d y x"]
+    colours: tuple[str, ...] = eqx.field(static=True)
+    depths_m: tuple[float, ...] = eqx.field(static=True)
+    pixel_m: float = eqx.field(static=True)
+    field_rad: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
+
+
+def plan_propagation(
+    camera: Camera, wavelength_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+) -> FarField | DirectPath:
+    """Operators of one wavelength for the propagation a spec names.
+
+    Raises:
+        InputError: the direct path is asked for where eq. 6 does not hold.
+    """
+    if propagation == "far_field":
+        return plan_far_field(camera, wavelength_m, sampling=sampling)
+    return plan_direct(camera, wavelength_m, propagation)
+
+
+@eqx.filter_jit
+def _energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
+    return plan.energy(pupil, rows, shared)
+
+
+def psf_bank(
+    camera: Camera,
+    height_m: Float[np.ndarray, "y x"],
+    depths_m: Sequence[float],
+    *,
+    field_rad: tuple[float, float] = (0.0, 0.0),
+    propagation: Propagation = "far_field",
+    sampling: float | None = None,
+    on_psf: Callable[[], None] = lambda: None,
+) -> PsfBank:
+    """PSFs of a height map for every colour of the camera and every depth.
+
+    Args:
+        camera: lens, sensor, substrate and DOE grid.
+        height_m: `[y, x]` DOE height on `camera.grid`, metres.
+        depths_m: source depths, metres (`inf` allowed).
+        field_rad: field angles (y, x); the window follows the chief ray.
+        propagation: far field, or one of the direct kernels.
+        sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
+        on_psf: called after every single PSF, for progress.
+
+    Returns:
+        the bank, Fresnel loss of the substrate included.
+
+    Raises:
+        ValueError: `height_m` does not match `camera.grid`.
+        InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
+    """
+    if height_m.shape != camera.grid.shape:
+        raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height_m.shape}")
+    height = jnp.asarray(height_m, jnp.float32)
+    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
+    for c, colour in enumerate(camera.colours):
+        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+            plan = plan_propagation(camera, wavelength, propagation, sampling)
+            rate = jnp.float32(camera.waves_per_metre(wavelength, field_rad))
+            factor = weight * camera.transmission(wavelength)
+            for d, depth in enumerate(depths_m):
+                source = jnp.asarray(wrapped_waves(source_path_m(camera, depth, field_rad), wavelength))
+                image = _energy(plan, phase_pupil, PhaseRows(height, source, coverage), rate)
+                energy[c, d] += factor * np.asarray(image)
+                on_psf()
+    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
+
+
+def pupil_field(
+    camera: Camera, height_m: Float[np.ndarray, "y x"], depth_m: float, wavelength_m: float
+) -> Complex[Array, "y x"]:
+    """The whole field behind the DOE for a source on the axis, `[y, x]`, unit amplitude where open."""
+    source = jnp.asarray(wrapped_waves(source_path_m(camera, depth_m), wavelength_m))
+    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+    rows = PhaseRows(jnp.asarray(height_m, jnp.float32), source, coverage)
+    return jax.jit(phase_pupil)(rows, jnp.float32(camera.waves_per_metre(wavelength_m)))

@@ -1,0 +1,54 @@
+"""The field behind the DOE, written for a block of rows so that it never has to exist as a whole."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+PupilRows = Callable[[Any, Any], Complex[Array, "row x"]]
+"""(rows of the inputs, inputs shared by all rows) -> complex field of those rows."""
+
+
+@jax.custom_jvp
+def cis(waves: Float[Array, "*s"]) -> Complex[Array, "*s"]:
+    """exp(2 pi i waves), to 4e-6, several times faster than the library's sine and cosine on a processor.
+
+    The argument is reduced to a quarter wave (exactly, in float32) where two short polynomials suffice.
+    """
+    half = jnp.round(2.0 * waves)
+    r = waves - 0.5 * half
+    z = r * r
+    sine = r * (6.2831853 + z * (-41.341702 + z * (81.605249 + z * (-76.704978 + z * 42.058))))
+    cosine = 1.0 + z * (-19.739209 + z * (64.939394 + z * (-85.456817 + z * (60.24464 + z * -26.42626))))
+    sign = 1.0 - 2.0 * jnp.abs(half - 2.0 * jnp.round(0.5 * half))
+    return jax.lax.complex(sign * cosine, sign * sine)
+
+
+@cis.defjvp
+def _cis_tangent(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    wave = cis(primals[0])
+    rate = 2 * np.pi * tangents[0]
+    return wave, jax.lax.complex(-wave.imag * rate, wave.real * rate)
+
+
+class PhaseRows(eqx.Module):
+    """Row-wise description of a phase-only pupil: height of the DOE, source wave, clear aperture.
+
+    Attributes:
+        height_m: `[y, x]` DOE height, metres.
+        source_waves: `[y, x]` wrapped optical path of the source, waves.
+        coverage: `[y, x]` open share of each cell.
+    """
+
+    height_m: Float[Array, "y x"]
+    source_waves: Float[Array, "y x"]
+    coverage: Float[Array, "y x"]
+
+
+def phase_pupil(rows: PhaseRows, waves_per_metre: Float[Array, ""]) -> Complex[Array, "y x"]:
+    """coverage * exp(2 pi i (height * waves_per_metre + source)): eqs. 1, 2 and 4 without the lens."""
+    return rows.coverage * cis(rows.height_m * waves_per_metre + rows.source_waves)
