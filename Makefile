@@ -1,0 +1,68 @@
+# Everything happens in .venv, made on the first use with the first Python >= 3.11 that is found.
+# `make demo PYTHON=/path/to/python3.12` chooses another.
+
+DEMO = .venv/bin/python -m doedesign.demo
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PINS := constraints.txt
+FORMATTED := doedesign fab sim tests bench examples
+
+.PHONY: demo test lint bench clean
+.DEFAULT_GOAL := demo
+
+demo: $(VENV)/.base
+	$(DEMO)
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check $(FORMATTED)
+	$(BIN)/ruff format --check $(FORMATTED)
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.bench
+	$(BIN)/python -m bench
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find doedesign fab sim tests bench examples -name __pycache__ -prune -exec rm -rf {} +
+
+# The stamp files say which set is installed; they are renewed when the project's needs or pins change.
+$(VENV)/.base: pyproject.toml $(PINS) | $(BIN)/python
+	@echo "Installing doedesign and its libraries into $(VENV) (about a minute) ..."
+	@$(PIP) install --constraint $(PINS) --editable .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml $(PINS) | $(BIN)/python
+	@echo "Installing doedesign with its test tools into $(VENV) (about a minute) ..."
+	@$(PIP) install --constraint $(PINS) --editable '.[dev]'
+	@touch $@ $(VENV)/.base
+
+$(VENV)/.bench: pyproject.toml $(PINS) | $(BIN)/python
+	@echo "Installing doedesign with the peers it is measured against into $(VENV) ..."
+	@$(PIP) install --constraint $(PINS) --editable '.[bench]'
+	@touch $@ $(VENV)/.base
+
+$(BIN)/python:
+	@found=; \
+	for candidate in $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python3.14); do \
+	    if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	        found=$$candidate; break; \
+	    fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	    echo "doedesign needs Python 3.11 or newer; '$(or $(PYTHON),python3)' is" \
+	        "$$($(or $(PYTHON),python3) --version 2>&1 | head -n 1)." \
+	        "Install one, or name it: make demo PYTHON=/path/to/python3.11" >&2; \
+	    exit 1; \
+	fi; \
+	rm -rf $(VENV); \
+	if ! "$$found" -m venv $(VENV); then \
+	    rm -rf $(VENV); \
+	    echo "'$$found' cannot make a virtual environment; on Debian and Ubuntu install python3-venv." >&2; \
+	    exit 1; \
+	fi

@@ -1,0 +1,17 @@
+"""Design of diffractive optical elements: from a spec to a plate that can be ordered, and what it will do.
+
+Reading order, from the user's words to the result:
+
+    spec            load a TOML spec, its JSON form and its digest; the door to the five files below
+    spec_values     the kinds of value a spec holds: lengths, names, options
+    spec_models     the spec itself: frozen tables, one per section of the TOML
+    spec_checks     rules that join several tables, and warnings
+    spec_errors     what was wrong with a spec, in words a user can act on
+    spec_text       a spec as TOML and as JSON
+
+Conventions (the whole list is in README.md): a spec's lengths are text with a unit in TOML (`pitch = "1.85 um"`)
+and SI numbers with the unit in the name everywhere else (`pitch_m`). Importing this package imports nothing
+heavy; a module that needs jax says so by being imported where it is used.
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,190 @@
+"""Specs: what the user asks for, read from TOML, checked, and compared by digest.
+
+    spec = load_spec("examples/automotive.toml", ["process.levels=8"])
+    spec.optics.focal_length_m      # 0.008
+    spec_digest(spec)               # the same for the same content, however it was written
+
+Every mistake in a file is an `InputError` that names the file, the key, the rule, the value and the cure; several
+are told together. `spec_warnings` returns what is allowed but probably not meant.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from doedesign.spec_checks import Problem, find_problems, spec_warnings
+from doedesign.spec_errors import SpecError, explain, key_as_written, spec_error
+from doedesign.spec_models import (
+    ColourSpec,
+    DoeSpec,
+    ObjectiveSpec,
+    OpticsSpec,
+    OptimizeSpec,
+    ProcessSpec,
+    SceneSpec,
+    SensorSpec,
+    Spec,
+)
+from doedesign.spec_text import spec_digest, spec_to_json, spec_to_toml
+from doedesign.spec_values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
+from fab.errors import InputError
+from fab.files import explain_os_error
+
+__all__ = [
+    "HEIGHT_FILES",
+    "OBJECTIVE_NAMES",
+    "START_NAMES",
+    "ColourSpec",
+    "DoeSpec",
+    "ObjectiveSpec",
+    "OpticsSpec",
+    "OptimizeSpec",
+    "Options",
+    "ProcessSpec",
+    "SceneSpec",
+    "SensorSpec",
+    "Spec",
+    "SpecError",
+    "input_files",
+    "load_spec",
+    "spec_digest",
+    "spec_from_json",
+    "spec_to_json",
+    "spec_to_toml",
+    "spec_warnings",
+]
+
+_OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
+
+
+def load_spec(path: str | Path, overrides: Sequence[str] = ()) -> Spec:
+    """Read a spec from TOML.
+
+    Args:
+        path: the file.
+        overrides: changes such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key (list entries
+            by their number) and a TOML value; quotes round text may be left out.
+
+    Returns:
+        The spec with every default filled in. Files it names are not opened; see `input_files`.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, or breaks a rule.
+    """
+    raw = _read_toml(Path(path))
+    keys = [_override(raw, text) for text in overrides]
+    try:
+        spec = Spec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
+    except ValidationError as error:
+        raise spec_error(str(path), explain(error, raw), keys) from None
+    return _checked(spec, raw, str(path), keys)
+
+
+def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
+    """Rebuild a spec from what `spec_to_json` returned.
+
+    Args:
+        data: the JSON object.
+        source: where it came from, for the message.
+
+    Raises:
+        InputError: the object is not a spec of this version.
+    """
+    try:
+        spec = Spec.model_validate(data)
+    except ValidationError as error:
+        raise spec_error(source, explain(error, data)) from None
+    return _checked(spec, data, source, [])
+
+
+def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
+    """Return the files a spec names, found relative to the folder of the spec file.
+
+    Args:
+        spec: the spec.
+        spec_path: the file it was loaded from.
+
+    Returns:
+        For each dotted key ("optimize.start", "objective[0].options.image") the existing file.
+
+    Raises:
+        InputError: a file is missing.
+    """
+    named = {}
+    if spec.optimize.start not in START_NAMES:
+        named["optimize.start"] = spec.optimize.start
+    for index, objective in enumerate(spec.objectives):
+        if "image" in objective.options:
+            named[f"objective[{index}].options.image"] = str(objective.options["image"])
+    files = {key: Path(spec_path).parent / name for key, name in named.items()}
+    missing = [
+        Problem(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
+        for key, file in files.items()
+        if not file.is_file()
+    ]
+    if missing:
+        raise spec_error(str(spec_path), missing)
+    return files
+
+
+def _checked(spec: Spec, raw: Mapping[str, Any], source: str, overridden: Sequence[str]) -> Spec:
+    problems = [problem._replace(key=key_as_written(problem.key, raw)) for problem in find_problems(spec)]
+    if problems:
+        raise spec_error(source, problems, overridden)
+    return spec
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        return tomllib.loads(content.decode())
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "a spec must be UTF-8 text", f"a foreign byte at {error.start}", _RESAVE) from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(str(path), "a spec must be valid TOML", f'"{error}"', "Mend that line.") from error
+    except RecursionError as error:
+        raise InputError(str(path), "a spec must be valid TOML", "brackets without end", _RESAVE) from error
+
+
+_RESAVE = "Give a spec such as examples/quick.toml."
+
+
+def _override(raw: dict[str, Any], text: str) -> str:
+    """Change one value of the tables that were read; return its dotted key."""
+    found = _OVERRIDE.fullmatch(text)
+    if not found:
+        raise InputError("--set", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
+    key, value = found[1], _override_value(found[2].strip())
+    *parents, last = key.split(".")
+    place: Any = raw
+    for part in parents:
+        place = place.setdefault(part, {}) if isinstance(place, dict) else _entry(place, part, key)
+    if isinstance(place, dict):
+        place[last] = value
+    else:
+        _entry(place, last, key)
+        place[int(last)] = value
+    return key
+
+
+def _entry(place: Any, part: str, key: str) -> Any:
+    if isinstance(place, list) and part.isdecimal() and int(part) < len(place):
+        return place[int(part)]
+    count = f"a list of {len(place)}" if isinstance(place, list) else "a single value"
+    raise InputError(f"--set: {key}", f"`{part}` must be an entry of what the spec holds there", count, "Mend the key.")
+
+
+def _override_value(text: str) -> Any:
+    """Read a TOML value; what is none is text, so that `sensor.pitch=1.85 um` needs no quotes."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return table["value"] if len(table) == 1 else text

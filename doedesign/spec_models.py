@@ -1,0 +1,262 @@
+"""The spec: one frozen table per section of the TOML, without arrays, paths opened or defaults hidden elsewhere.
+
+An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
+(`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
+Rules between two tables are in `spec_checks`; `doedesign.spec.load_spec` applies both.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+
+from doedesign.spec_values import (
+    FROM_TOML,
+    Aperture,
+    ColourName,
+    Count,
+    Defocus,
+    FarDepth,
+    FocalLength,
+    LevelCount,
+    LevelStep,
+    Material,
+    NearDepth,
+    ObjectiveName,
+    Options,
+    OptionsTable,
+    Pitch,
+    Positive,
+    SpecName,
+    Start,
+    Wavelength,
+    broken,
+)
+from fab.units import NM, parse_length
+
+__all__ = [
+    "ColourSpec",
+    "DoeSpec",
+    "ObjectiveSpec",
+    "OpticsSpec",
+    "OptimizeSpec",
+    "ProcessSpec",
+    "SceneSpec",
+    "SensorSpec",
+    "Spec",
+    "Table",
+]
+
+
+def toml_key(attribute: str) -> str:
+    """Return the TOML key of an attribute: the name without its unit."""
+    return "objective" if attribute == "objectives" else attribute.removesuffix("_m")
+
+
+class Table(BaseModel, frozen=True):
+    """One table of a spec. Unknown keys are refused, values never change."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        alias_generator=toml_key,
+        validate_by_name=True,
+        validate_by_alias=False,
+    )
+
+
+class ColourSpec(Table, frozen=True):
+    """One colour channel of the camera.
+
+    Attributes:
+        name: channel name, also in the files of PSF banks.
+        wavelengths_m: vacuum wavelengths the channel sees.
+        weights: share of each wavelength; equal shares if none are given, and scaled to sum to 1.
+    """
+
+    name: ColourName = Field(examples=['"red"'])
+    wavelengths_m: tuple[Wavelength, ...] = Field(min_length=1, examples=['["656 nm"]'])
+    weights: tuple[Positive, ...] = Field(default=(), validate_default=True)
+
+    @field_validator("weights")
+    @classmethod
+    def _complete(cls, weights: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+        count = len(info.data.get("wavelengths_m", weights))
+        if not weights:
+            return (1.0 / count,) * count if count else ()
+        if len(weights) != count:
+            raise broken(f"must have one entry per wavelength, {count} here", "Add or remove weights.")
+        total = sum(weights)
+        # Weights that already sum to 1 stay untouched, so that reading a spec twice changes no digit.
+        return weights if abs(total - 1) < 1e-12 else tuple(weight / total for weight in weights)
+
+
+class OpticsSpec(Table, frozen=True):
+    """The lens and the light.
+
+    Attributes:
+        focal_length_m: focal length of the camera lens the DOE sits on.
+        design_wavelength_m: wavelength at which the full height of the levels should be one wave.
+        colours: colour channels, in the order of a PSF bank's first axis. In TOML, `wavelengths = ["656 nm",
+            "589 nm"]` is short for one channel of one wavelength each, named after it ("656nm").
+        propagation: "far_field" (the lens cancels the quadratic phase, paper eqs. 7-9) or "fresnel" (the wave is
+            propagated from the lens to the sensor, eq. 5; needs a fine pitch, eq. 6).
+    """
+
+    focal_length_m: FocalLength = Field(examples=['"8 mm"'])
+    design_wavelength_m: Wavelength = Field(examples=['"550 nm"'])
+    colours: tuple[ColourSpec, ...] = Field(min_length=1)
+    propagation: Literal["far_field", "fresnel"] = "far_field"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _spread_wavelengths(cls, table: Any, info: ValidationInfo) -> Any:
+        if info.context != FROM_TOML or not isinstance(table, dict) or "wavelengths" not in table:
+            return table
+        if "colours" in table:
+            return table  # the short form is then reported as a key too many
+        colours = table["wavelengths"]
+        if isinstance(colours, list):
+            colours = [{"name": _colour_name(w, i), "wavelengths": [w]} for i, w in enumerate(colours)]
+        return {key: value for key, value in table.items() if key != "wavelengths"} | {"colours": colours}
+
+
+def _colour_name(wavelength: object, index: int) -> str:
+    """Name a channel after its wavelength, "656nm" or "532p5nm"; text that is no length is reported later."""
+    try:
+        nanometres = parse_length(str(wavelength)) / NM
+    except ValueError:
+        return f"colour{index}"
+    return f"{nanometres:.6g}nm".replace(".", "p").replace("+", "")
+
+
+class DoeSpec(Table, frozen=True):
+    """The plate.
+
+    Attributes:
+        samples: cells per side, N.
+        pitch_m: edge of a cell.
+        aperture_m: diameter of the clear aperture; N cells must span it to within half a pitch.
+        material: substrate, a key of `sim.material.MATERIALS`.
+    """
+
+    samples: Annotated[int, Field(strict=True, ge=2, le=20000, examples=["2400"])]
+    pitch_m: Pitch = Field(examples=['"1.85 um"'])
+    aperture_m: Aperture = Field(examples=['"4.44 mm"'])
+    material: Material = Field(examples=['"fused_silica"'])
+
+
+class ProcessSpec(Table, frozen=True):
+    """What the fab lab makes.
+
+    Attributes:
+        levels: number of heights L, a power of two.
+        level_step_m: height of one level.
+    """
+
+    levels: LevelCount = Field(examples=["16"])
+    level_step_m: LevelStep = Field(examples=['"75 nm"'])
+
+
+class SceneSpec(Table, frozen=True):
+    """Where light comes from, measured from the plate.
+
+    Attributes:
+        near_m: depths of the obstruction; may be empty where no objective looks at it.
+        far_m: depths of the scene behind it; "inf" in TOML for a star.
+    """
+
+    near_m: tuple[NearDepth, ...] = ()
+    far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
+
+
+class SensorSpec(Table, frozen=True):
+    """The sensor behind the lens.
+
+    Attributes:
+        pitch_m: distance of neighbouring photosites.
+        resolution: photosites along x and along y (as in "4000 x 3000").
+        binning: photosites per pixel and axis.
+        window: pixels per side of the square, centred on the chief ray, over which PSFs are computed; binned.
+        fill_factor: side of a pixel's light-sensitive square over its pitch; a length ratio, so 0.9 collects
+            81 % of the light.
+        defocus_m: distance of the sensor beyond the focal plane.
+    """
+
+    pitch_m: Pitch = Field(examples=['"1.85 um"'])
+    resolution: tuple[Count, Count] = Field(examples=["[4000, 3000]"])
+    binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
+    fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
+    defocus_m: Defocus = 0.0
+
+    @property
+    def pixel_m(self) -> float:
+        """Distance of neighbouring pixels after binning."""
+        return self.pitch_m * self.binning
+
+    @property
+    def window_m(self) -> float:
+        """Side of the window."""
+        return self.pixel_m * self.window
+
+
+class OptimizeSpec(Table, frozen=True):
+    """How the height map is found.
+
+    Attributes:
+        parametrization: "freeform" (every cell) or "radial" (a profile over the radius).
+        start: "flat", "random", "fresnel", "ring", or the path of a height map relative to the spec file.
+        start_options: keyword arguments of the start.
+        steps: optimisation steps; 0 evaluates the start.
+        learning_rate: step size of Adam, in radians of phase at the design wavelength.
+        seed: seed of everything random.
+        quantisation: levels in the loop: "straight_through", "annealed" or "none".
+        checkpoint_every: steps between checkpoints.
+    """
+
+    parametrization: Literal["freeform", "radial"] = "freeform"
+    start: Start = "flat"
+    start_options: OptionsTable = Options()
+    steps: Annotated[int, Field(strict=True, ge=0, le=10_000_000)] = 200
+    learning_rate: Positive = 0.1
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
+    quantisation: Literal["straight_through", "annealed", "none"] = "straight_through"
+    checkpoint_every: Count = 25
+
+
+class ObjectiveSpec(Table, frozen=True):
+    """One term of the objective.
+
+    Attributes:
+        name: a built-in objective, or a function of the user's own as "module:function".
+        weight: factor of the term; negative turns it round.
+        options: keyword arguments of the term. `image` is a path relative to the spec file.
+    """
+
+    name: ObjectiveName = Field(examples=['"far_spot"'])
+    weight: Annotated[float, Field(strict=True)] = 1.0
+    options: OptionsTable = Options()
+
+
+class Spec(Table, frozen=True):
+    """Everything that a design depends on.
+
+    Attributes:
+        name: name of the design; runs and mask sets are called after it.
+        optics: the lens and the light.
+        doe: the plate.
+        process: what the fab lab makes.
+        scene: where light comes from.
+        sensor: the sensor behind the lens.
+        optimize: how the height map is found.
+        objectives: what it is judged by; `[[objective]]` in TOML.
+    """
+
+    name: SpecName = Field(examples=['"automotive"'])
+    optics: OpticsSpec
+    doe: DoeSpec
+    process: ProcessSpec
+    scene: SceneSpec
+    sensor: SensorSpec
+    optimize: OptimizeSpec = OptimizeSpec()
+    objectives: tuple[ObjectiveSpec, ...] = ()

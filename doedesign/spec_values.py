@@ -1,0 +1,210 @@
+"""The kinds of value a spec holds, each with its range and the message for a value outside it.
+
+In TOML a length is text with a unit ("1.85 um"); in Python and JSON it is a number in metres. Which of the two
+is being read is told by the validation context: `FROM_TOML` for the former, nothing for the latter.
+"""
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from fab.units import MM, NM, UM, format_length, parse_length
+from sim.material import MATERIALS
+
+__all__ = [
+    "FROM_TOML",
+    "HEIGHT_FILES",
+    "OBJECTIVE_NAMES",
+    "START_NAMES",
+    "Aperture",
+    "ColourName",
+    "Count",
+    "Defocus",
+    "FarDepth",
+    "FocalLength",
+    "LevelCount",
+    "LevelStep",
+    "Material",
+    "NearDepth",
+    "ObjectiveName",
+    "Options",
+    "OptionsTable",
+    "Pitch",
+    "Positive",
+    "SpecName",
+    "Start",
+    "Wavelength",
+    "broken",
+    "nearest",
+]
+
+FROM_TOML = "toml"
+HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
+START_NAMES = ("flat", "random", "fresnel", "ring")
+OBJECTIVE_NAMES = ("far_spot", "near_spread", "handcrafted", "target_pattern")
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_COLOUR = re.compile(r"[A-Za-z0-9_-]{1,32}")
+_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+
+def broken(rule: str, cure: str) -> PydanticCustomError:
+    """Make the error of a broken rule, for a validator to raise.
+
+    Args:
+        rule: what must hold ("must be a power of two").
+        cure: what to do about it, a full sentence.
+
+    Returns:
+        An error of the type "spec", which `doedesign.spec_errors` knows how to tell.
+    """
+    return PydanticCustomError("spec", "{rule}", {"rule": rule, "cure": cure})
+
+
+def nearest(name: object, choices: Sequence[str]) -> str:
+    """Return "Did you mean `x`?" for the choice most like `name`, or the whole list where none is."""
+    close = get_close_matches(str(name), choices, n=1, cutoff=0.6)
+    return f"Did you mean `{close[0]}`?" if close else f"Choose one of {', '.join(choices)}."
+
+
+def _length(low_m: float, high_m: float, *, infinite: bool = False) -> Callable[[Any, ValidationInfo], float]:
+    """Return the validator of a length between two bounds, in metres."""
+
+    def validate(value: Any, info: ValidationInfo) -> float:
+        if infinite and value == "inf":
+            return math.inf
+        if info.context == FROM_TOML:
+            try:
+                metres = parse_length(value)
+            except ValueError as error:
+                raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            metres = float(value)
+        else:
+            raise broken("must be a number of metres", "Give a number.")
+        if not (low_m <= metres <= high_m or (infinite and metres == math.inf)):
+            bounds = f"must lie between {format_length(low_m)} and {format_length(high_m)}"
+            raise broken(bounds + (', or be "inf"' if infinite else ""), "Check the unit.")
+        return metres
+
+    return validate
+
+
+def _infinity_as_text(depth_m: float) -> float | str:
+    # JSON has no infinity.
+    return "inf" if math.isinf(depth_m) else depth_m
+
+
+Wavelength = Annotated[float, BeforeValidator(_length(200 * NM, 20 * UM))]
+Pitch = Annotated[float, BeforeValidator(_length(10 * NM, 1 * MM))]
+Aperture = Annotated[float, BeforeValidator(_length(1 * UM, 1.0))]
+FocalLength = Annotated[float, BeforeValidator(_length(10 * UM, 100.0))]
+LevelStep = Annotated[float, BeforeValidator(_length(0.1 * NM, 100 * UM))]
+Defocus = Annotated[float, BeforeValidator(_length(-10 * MM, 10 * MM))]
+NearDepth = Annotated[float, BeforeValidator(_length(10 * UM, 1e6))]
+FarDepth = Annotated[
+    float,
+    Field(allow_inf_nan=True),
+    BeforeValidator(_length(10 * UM, 1e12, infinite=True)),
+    PlainSerializer(_infinity_as_text, when_used="json"),
+]
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+Positive = Annotated[float, Field(strict=True, gt=0)]
+
+
+def _level_count(count: int) -> int:
+    if count not in (2, 4, 8, 16, 32, 64):
+        raise broken("must be a power of two from 2 to 64, one bit per etch mask", "Choose 2, 4, 8, 16, 32 or 64.")
+    return count
+
+
+def _matching(pattern: re.Pattern[str], rule: str) -> Callable[[str], str]:
+    def validate(text: str) -> str:
+        if not pattern.fullmatch(text):
+            raise broken(rule, "Choose a plainer name.")
+        return text
+
+    return validate
+
+
+def _material(name: str) -> str:
+    if name not in MATERIALS:
+        raise broken("must be a known material", nearest(name, tuple(MATERIALS)))
+    return name
+
+
+def _objective_name(name: str) -> str:
+    if name not in OBJECTIVE_NAMES and not _FUNCTION.fullmatch(name):
+        raise broken('must be a known objective or a function as "module:function"', nearest(name, OBJECTIVE_NAMES))
+    return name
+
+
+def _start(name: str) -> str:
+    if name not in START_NAMES and not name.lower().endswith(HEIGHT_FILES):
+        raise broken(
+            f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})", nearest(name, START_NAMES)
+        )
+    return name
+
+
+LevelCount = Annotated[int, Field(strict=True), AfterValidator(_level_count)]
+SpecName = Annotated[
+    str, AfterValidator(_matching(_NAME, "must be a file name of at most 64 letters, digits, dots, dashes"))
+]
+ColourName = Annotated[
+    str, AfterValidator(_matching(_COLOUR, "must be a name of at most 32 letters, digits, dashes, underscores"))
+]
+Material = Annotated[str, AfterValidator(_material)]
+ObjectiveName = Annotated[str, AfterValidator(_objective_name)]
+Start = Annotated[str, AfterValidator(_start)]
+
+
+@dataclass(frozen=True)
+class Options(Mapping[str, Any]):
+    """A free table of options: immutable and hashable, used like a dictionary (`**spec.optimize.start_options`).
+
+    Values are text, numbers, booleans, and lists of these (held as tuples).
+    """
+
+    entries: tuple[tuple[str, Any], ...] = ()
+
+    def __getitem__(self, key: str) -> Any:
+        return dict(self.entries)[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return (key for key, _ in self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
+def _frozen_option(key: str, value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return tuple(_frozen_option(key, item) for item in value)
+    finite = not isinstance(value, float) or math.isfinite(value)
+    if not (isinstance(value, str | bool | int | float) and finite):
+        rule = "must hold text, finite numbers, true, false, or lists of these"
+        raise broken(rule, f"Change `{key} = {value}`.")
+    return value
+
+
+def _options(value: Any) -> Options:
+    if not isinstance(value, Mapping):
+        raise broken("must be a table of options", "Write { key = value, ... }.")
+    return Options(tuple(sorted((key, _frozen_option(key, item)) for key, item in value.items())))
+
+
+def _options_as_dict(options: Options) -> dict[str, Any]:
+    # Through JSON, so that tuples at any depth become the lists they were read from.
+    return json.loads(json.dumps(dict(options)))
+
+
+OptionsTable = Annotated[Options, BeforeValidator(_options), PlainSerializer(_options_as_dict)]

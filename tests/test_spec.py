@@ -1,0 +1,359 @@
+"""Specs: what is read, what is refused and in which words, and that nothing depends on how a spec was written."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from doedesign.spec import (
+    Options,
+    SpecError,
+    input_files,
+    load_spec,
+    spec_digest,
+    spec_from_json,
+    spec_to_json,
+    spec_to_toml,
+    spec_warnings,
+)
+from fab.errors import InputError
+from fab.files import canonical_json
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+AUTOMOTIVE = EXAMPLES / "automotive.toml"
+ALL = sorted(EXAMPLES.glob("*.toml"))
+
+
+@pytest.fixture
+def edited(tmp_path: Path) -> Callable[..., Path]:
+    """Write the automotive spec with some of its text replaced."""
+
+    def write(*replacements: tuple[str, str]) -> Path:
+        text = AUTOMOTIVE.read_text("utf-8")
+        for old, new in replacements:
+            assert text.count(old) == 1, old
+            text = text.replace(old, new)
+        path = tmp_path / "edited.toml"
+        path.write_text(text, "utf-8")
+        return path
+
+    return write
+
+
+def refusal(path: Path, *overrides: str) -> str:
+    with pytest.raises(InputError) as caught:
+        load_spec(path, overrides)
+    return str(caught.value)
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+def test_automotive_is_the_papers_design_in_si_units():
+    spec = load_spec(AUTOMOTIVE)
+    assert (spec.doe.samples, spec.doe.pitch_m, spec.doe.aperture_m) == (2400, 1.85e-6, 4.44e-3)
+    assert spec.optics.focal_length_m == 8e-3
+    assert [colour.wavelengths_m for colour in spec.optics.colours] == [(656e-9,), (589e-9,), (486e-9,)]
+    assert [colour.name for colour in spec.optics.colours] == ["656nm", "589nm", "486nm"]
+    assert (spec.process.levels, spec.process.level_step_m) == (16, 75e-9)
+    assert (min(spec.scene.near_m), max(spec.scene.near_m)) == (0.05, 0.12)
+    assert (min(spec.scene.far_m), max(spec.scene.far_m)) == (5.0, 10.0)
+    assert (spec.sensor.resolution, spec.sensor.window) == ((4000, 3000), 512)
+    assert spec.sensor.pixel_m == pytest.approx(3.7e-6, rel=1e-15)  # one rounding of the product
+    assert spec.sensor.window_m == pytest.approx(512 * 3.7e-6, rel=1e-15)
+
+
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
+def test_every_example_is_sound(path: Path):
+    spec = load_spec(path)
+    assert spec.name == path.stem
+    assert spec_warnings(spec) == []
+    assert input_files(spec, path) == {}
+
+
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
+def test_json_and_toml_read_back_to_the_same_spec(path: Path, tmp_path: Path):
+    spec = load_spec(path)
+    again = spec_from_json(spec_to_json(spec), "manifest.json")
+    copy = tmp_path / "spec.toml"
+    copy.write_text(spec_to_toml(spec, ["--set process.levels=16", "two\nlines"]), "utf-8")
+    assert again == spec == load_spec(copy)
+    assert len({again, spec, load_spec(copy)}) == 1
+    assert len({spec_digest(again), spec_digest(spec), spec_digest(load_spec(copy))}) == 1
+    assert canonical_json(spec_to_json(spec)).startswith(b"{")  # finite numbers only, whatever the depths
+
+
+def test_digest_sees_content_and_not_spelling(edited: Callable[..., Path]):
+    digest = spec_digest(load_spec(AUTOMOTIVE))
+    assert spec_digest(load_spec(edited(('"8 mm"', '"0.8 cm"')))) == digest
+    assert spec_digest(load_spec(edited(('"8 mm"', '"8.001 mm"')))) != digest
+    assert spec_digest(load_spec(AUTOMOTIVE, ["process.levels=16"])) == digest
+    assert spec_digest(load_spec(AUTOMOTIVE, ["optimize.seed=2"])) != digest
+
+
+def test_colour_tables_complete_and_normalise_their_weights(edited: Callable[..., Path]):
+    spec = load_spec(
+        edited(
+            ('wavelengths = ["656 nm", "589 nm", "486 nm"]', ""),
+            (
+                "[doe]",
+                '[[optics.colours]]\nname = "red"\nwavelengths = ["640 nm", "656 nm"]\nweights = [1.0, 3.0]\n'
+                '[[optics.colours]]\nname = "green"\nwavelengths = ["520 nm", "530 nm"]\n[doe]',
+            ),
+        )
+    )
+    assert [(c.name, c.weights) for c in spec.optics.colours] == [("red", (0.25, 0.75)), ("green", (0.5, 0.5))]
+
+
+@given(weights=st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6))
+def test_reading_weights_again_changes_no_digit(weights: list[float]):
+    table = [{"name": "white", "wavelengths_m": [500e-9 + 1e-9 * i for i in range(len(weights))], "weights": weights}]
+    data = spec_to_json(load_spec(AUTOMOTIVE))
+    data["optics"]["colours"] = table
+    once = spec_from_json(data, "test")
+    assert sum(once.optics.colours[0].weights) == pytest.approx(1, abs=1e-12)  # six roundings of 1e-16
+    assert spec_from_json(spec_to_json(once), "test") == once
+
+
+@given(pitch_m=st.floats(1e-8, 1e-3), focal_m=st.floats(1e-5, 100))
+def test_toml_keeps_every_digit_of_a_length(pitch_m: float, focal_m: float, tmp_path_factory: pytest.TempPathFactory):
+    data = spec_to_json(load_spec(AUTOMOTIVE))
+    # Fifteen digits are what text with a unit holds; a spec never has more.
+    data["sensor"]["pitch_m"], data["optics"]["focal_length_m"] = float(f"{pitch_m:.15g}"), float(f"{focal_m:.15g}")
+    spec = spec_from_json(data, "test")
+    path = tmp_path_factory.mktemp("digits") / "spec.toml"
+    path.write_text(spec_to_toml(spec), "utf-8")
+    assert load_spec(path) == spec
+
+
+def test_infinite_depth_survives_json():
+    spec = load_spec(AUTOMOTIVE, ['scene.far=["5 m", "inf"]'])
+    assert spec.scene.far_m == (5.0, math.inf)
+    assert spec_to_json(spec)["scene"]["far_m"] == [5.0, "inf"]
+    assert spec_from_json(spec_to_json(spec), "test").scene.far_m == (5.0, math.inf)
+
+
+def test_options_are_an_immutable_table():
+    spec = load_spec(AUTOMOTIVE, ["optimize.start_options={radius=3, parts=[1, [2.5, 'a']], on=true}"])
+    options = spec.optimize.start_options
+    assert dict(options) == {"on": True, "parts": (1, (2.5, "a")), "radius": 3}
+    assert hash(options) == hash(Options(tuple(sorted(options.items()))))
+    assert spec_to_json(spec)["optimize"]["start_options"] == {"on": True, "parts": [1, [2.5, "a"]], "radius": 3}
+
+
+def test_specs_are_frozen():
+    spec = load_spec(AUTOMOTIVE)
+    with pytest.raises(ValueError, match="frozen"):
+        spec.process.levels = 8  # type: ignore[misc]
+
+
+# --- overrides --------------------------------------------------------------------------------------------------------
+
+
+def test_overrides_change_single_values():
+    spec = load_spec(
+        AUTOMOTIVE,
+        [
+            "process.levels=8",
+            "process.level_step = 150 nm",
+            'optics.wavelengths=["532 nm"]',
+            "objective.1.weight=2.5",
+            "optimize.start_options.far_energy=0.3",
+            "sensor.defocus='-20 um'",
+        ],
+    )
+    assert (spec.process.levels, spec.process.level_step_m) == (8, 150e-9)
+    assert [colour.name for colour in spec.optics.colours] == ["532nm"]
+    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5]
+    assert dict(spec.optimize.start_options) == {"far_energy": 0.3}
+    assert spec.sensor.defocus_m == -20e-6
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
+        ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 2"),
+        ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
+        ("process.levls=8", "--set: process.levls: must be a known key of [process], but got `levls`. Did you mean"),
+        ("process.levels=8\nname='x'", "--set: process.levels: must be a whole number"),
+    ],
+)
+def test_a_wrong_override_is_named(override: str, message: str):
+    assert message in refusal(AUTOMOTIVE, override)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+REFUSED = [
+    # key, its new value, and what the message must say
+    ("sensor.pich", '"2 um"', ["sensor.pich", "`pich`", "Did you mean `pitch`?"]),
+    ("sensor.focal_length", '"2 um"', ["sensor.focal_length", "It belongs to [optics]."]),
+    ("optics.focal_length", "8", ["optics.focal_length", 'a number with a unit such as "75 nm"', "got 8."]),
+    ("optics.focal_length", '"8"', ["optics.focal_length", "a number with a unit", 'got "8"']),
+    ("optics.focal_length", '"8 kg"', ["optics.focal_length", "a number with a unit", 'got "8 kg"']),
+    ("optics.focal_length", '"-8 mm"', ["optics.focal_length", "between 10 um and 100 m", 'got "-8 mm"']),
+    ("optics.wavelengths", '["656 nm", "1 nm"]', ["optics.wavelengths[1]", "between 200 nm and 20 um", "1 nm"]),
+    ("optics.wavelengths", '["656 nm", "8 um"]', ["optics.wavelengths[1]", "210-6700 nm", "fused_silica", "8000 nm"]),
+    ("optics.wavelengths", '["656 nm", "656 nm"]', ["optics.wavelengths[1]", "its own name", "'656nm' twice"]),
+    ("optics.wavelengths", "[]", ["optics.wavelengths", "must not be empty"]),
+    ("optics.wavelengths", '"656 nm"', ["optics.wavelengths", "must be a list"]),
+    ("optics.colours", '[{name="red", wavelengths=["656 nm"]}]', ["optics.wavelengths", "must be stated once"]),
+    ("optics.propagation", '"fresnell"', ["optics.propagation", "far_field, fresnel", "Did you mean `fresnel`?"]),
+    ("doe.material", '"fused_slica"', ["doe.material", "a known material", "Did you mean `fused_silica`?"]),
+    ("doe.samples", "30000", ["doe.samples", "must be at most 20000", "30000"]),
+    ("doe.samples", "2400.5", ["doe.samples", "must be a whole number", "2400.5"]),
+    ("doe.samples", "2401", ["doe.aperture", "2401 x 1.85 um = 4.44185 mm", "4.44 mm", "samples = 2400"]),
+    ("doe.aperture", '"4 mm"', ["doe.aperture", "to within half a pitch", "got 4 mm", 'aperture = "4.44 mm"']),
+    ("process.levels", "12", ["process.levels", "a power of two from 2 to 64", "got 12", "8, 16"]),
+    ("process.levels", "128", ["process.levels", "a power of two from 2 to 64"]),
+    ("process.levels", "true", ["process.levels", "must be a whole number", "got true"]),
+    ("scene.near", '["5 cm", "6 m"]', ["scene.near", "smaller than every far depth", "6 m near and 5 m far"]),
+    ("scene.near", '["inf"]', ["scene.near[0]", "a number with a unit"]),
+    ("scene.near", '["1 cm"]', ["scene.near", "16.9 mm", "cannot follow the wave", "got 10 mm"]),
+    ("scene.near", "[]", ["objective[1].name", '"near_spread" looks at near depths', "an empty scene.near"]),
+    ("scene.far", "[]", ["scene.far", "must not be empty"]),
+    ("sensor.resolution", "[4000]", ["sensor.resolution[1]", "must be given"]),
+    ("sensor.fill_factor", "1.2", ["sensor.fill_factor", "must be at most 1"]),
+    ("optimize.learning_rate", "nan", ["optimize.learning_rate", "must be finite"]),
+    ("optimize.start", '"rings"', ["optimize.start", "a known start or a height map file", "Did you mean `ring`?"]),
+    ("optimize.start_options", "{a = {b = 1}}", ["optimize.start_options", "lists of these"]),
+    ("objective", "[]", ["objective", "must have something to improve", "no [[objective]]"]),
+    ("objective", "{}", ["objective", "must be a list", "Write [[objective]] tables."]),
+    ("objective.0.name", '"far_spott"', ["objective[0].name", "a known objective", "Did you mean `far_spot`?"]),
+    ("objective.0.weight", "inf", ["objective[0].weight", "must be finite"]),
+    ("name", '"a/b"', ["name", "must be a file name", 'got "a/b"']),
+    ("lens", "{}", ["lens", "must be a known key of the spec", "`lens`"]),
+    ("scene", "3", ["scene", "must be a table", "got 3"]),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "parts"), REFUSED, ids=[f"{key}={value}" for key, value, _ in REFUSED])
+def test_a_mistake_is_named_with_key_rule_value_and_cure(key: str, value: str, parts: list[str]):
+    message = refusal(AUTOMOTIVE, f"{key}={value}")
+    for part in parts:
+        assert part in message
+    assert len(message.splitlines()) == 1
+
+
+def test_a_mistake_in_the_file_names_the_file(edited: Callable[..., Path]):
+    path = edited(("levels = 16 ", "levls = 16 "))
+    message = refusal(path)
+    assert (
+        f"{path}: process.levls: must be a known key of [process], but got `levls`. Did you mean `levels`?" in message
+    )
+    assert f"{path}: process.levels: must be given, but got nothing. For example `levels = 16`." in message
+
+
+def test_several_mistakes_are_told_together(edited: Callable[..., Path]):
+    path = edited(("samples = 2400", "samples = 1"), ('"8 mm"', '"8 s"'), ('"fused_silica"', "3"))
+    with pytest.raises(SpecError) as caught:
+        load_spec(path)
+    assert len(caught.value.mistakes) == 3
+    assert len(str(caught.value).splitlines()) == 3
+
+
+def test_missing_tables_and_values_are_named(tmp_path: Path):
+    path = tmp_path / "empty.toml"
+    path.write_text('name = "empty"\n[optics]\nfocal_length = "8 mm"\n', "utf-8")
+    message = refusal(path)
+    assert "optics.wavelengths: must be given" in message
+    assert "optics.design_wavelength: must be given" in message
+    for table in ("doe", "process", "scene", "sensor"):
+        assert f"{table}: must be given, but got nothing. Add a table [{table}]." in message
+
+
+def test_fresnel_needs_the_pitch_of_equation_6():
+    message = refusal(AUTOMOTIVE, "optics.propagation=fresnel")
+    # 2400 (1.85 um)^2 / 486 nm = 16.9 mm; the cure's grid must pass the same check.
+    assert "16.9 mm > 8 mm at 486 nm" in message
+    assert "at most 875.7 nm (samples = 5072" in message
+    cured = ["optics.propagation=fresnel", "doe.samples=5072", "doe.pitch=875.4 nm", "doe.aperture=4.44 mm"]
+    assert load_spec(AUTOMOTIVE, cured).optics.propagation == "fresnel"
+
+
+def test_half_a_pitch_is_the_limit_of_the_aperture():
+    assert load_spec(AUTOMOTIVE, ["doe.aperture=4.4409 mm"]).doe.aperture_m == 4.4409e-3
+    assert "doe.aperture" in refusal(AUTOMOTIVE, "doe.aperture=4.44094 mm")
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        (b'name = "x"\n[optics\n', ["must be valid TOML", "line 2, column 8"]),
+        (b'name = "x"\nname = "y"\n', ["must be valid TOML", "line 2"]),
+        (b"\xff\xfe\x00", ["must be UTF-8 text", "byte at 0"]),
+        (b"v = " + b"[" * 100_000, ["must be valid TOML"]),
+    ],
+    ids=["cut", "twice", "binary", "nested"],
+)
+def test_a_file_that_is_no_toml_is_refused(tmp_path: Path, content: bytes, parts: list[str]):
+    path = tmp_path / "broken.toml"
+    path.write_bytes(content)
+    message = refusal(path)
+    for part in [str(path), *parts]:
+        assert part in message
+
+
+def test_truncation_anywhere_is_one_clear_message(tmp_path: Path):
+    text = AUTOMOTIVE.read_bytes()
+    path = tmp_path / "short.toml"
+    for length in range(0, len(text), 101):
+        path.write_bytes(text[:length])
+        try:
+            load_spec(path)
+        except InputError as error:
+            assert str(path) in str(error)  # noqa: PT017 - a cut in the last comment leaves a whole spec
+
+
+def test_missing_files_are_named(tmp_path: Path):
+    assert str(tmp_path / "none.toml") in refusal(tmp_path / "none.toml")
+    assert str(tmp_path) in refusal(tmp_path)
+    spec = load_spec(AUTOMOTIVE, ["optimize.start=start.exr", "objective.0.options.image=picture.png"])
+    with pytest.raises(InputError, match=r"optimize\.start: the file must exist") as caught:
+        input_files(spec, AUTOMOTIVE)
+    assert "objective[0].options.image" in str(caught.value)
+
+
+def test_files_are_found_beside_the_spec(edited: Callable[..., Path]):
+    path = edited(('"ring"', '"start.npy"'))
+    (path.parent / "start.npy").touch()
+    assert input_files(load_spec(path), path) == {"optimize.start": path.parent / "start.npy"}
+
+
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5), st.lists))
+def test_foreign_json_is_refused_as_bad_input(value: object):
+    data = spec_to_json(load_spec(AUTOMOTIVE))
+    for table in ("name", "optics", "scene", "objectives"):
+        with pytest.raises(InputError):
+            spec_from_json({**data, table: {"wavelengths": value, "near_m": value, "x": value}}, "manifest.json")
+
+
+# --- warnings ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_level_step_that_misses_the_wave_is_explained():
+    (warning,) = spec_warnings(load_spec(AUTOMOTIVE, ["optics.design_wavelength=520 nm"]))
+    assert "16 x 75 nm = 1.2 um of fused_silica is one wave at 552 nm" in warning
+    # 1.2 um (n - 1) / 520 nm with Malitson's n = 1.46128
+    assert "at the design wavelength of 520 nm it is 1.0645 waves, +6.4 % off" in warning
+    assert 'A level_step of "70.46 nm" would.' in warning
+
+
+@pytest.mark.parametrize(
+    ("overrides", "part"),
+    [
+        (["process.level_step=1 nm"], "is one wave at no wavelength fused_silica is known for"),
+        (["sensor.resolution=[600, 2000]"], "512 pixels are more than the 300 binned pixels"),
+        (["sensor.window=600"], "only 1051 um far; beyond that the PSF repeats. At most 568 pixels avoid it."),
+        (["sensor.window=128"], "the blur disc of a point at 50 mm is 710.4 um wide"),
+    ],
+)
+def test_doubts_are_said(overrides: list[str], part: str):
+    assert any(part in warning for warning in spec_warnings(load_spec(AUTOMOTIVE, overrides)))
