@@ -19,7 +19,7 @@ gradient is written out here (one adjoint transform) and checked against finite 
 
 Sampling. `sampling` counts samples per lambda d / D: 2 is the Nyquist rate of the intensity, and the default adds as
 much as a short integration rule needs for a predicted error of 2e-3. At `sampling=1` the transform is the bare FFT of the pupil: a quarter of the
-work, enough for an unbiased estimate of energies when `shift` moves the samples from call to call, as the optimiser does.
+work, enough to estimate energies when the image moves by a fraction of a pixel from call to call (`displaced`).
 """
 
 from typing import Any
@@ -33,7 +33,7 @@ from scipy.fft import next_fast_len
 
 from sim.camera import Camera
 from sim.pixel import Banded, pixel_weights, sampling_for
-from sim.pupil import PupilRows
+from sim.pupil import PupilRows, cis
 
 # One block of rows (64-256 of a few thousand samples) fits a processor's second-level cache.
 _BLOCK = 128
@@ -44,23 +44,25 @@ class FarField(eqx.Module):
     """Operators of one wavelength, shared by every depth and field angle.
 
     Attributes:
-        gather: samples -> pixels (with the cell's sinc² and all constant factors), along either axis; the order is (y, x).
-        spread: their transposes.
-        tilt: phase ramps (y, x) over the pupil that move the samples by a fraction of their spacing.
+        gather: samples -> pixels along either axis, with the cell's sinc² and all constant factors.
+        spread: its transpose.
+        tilt: phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`).
         cells: DOE cells per axis.
         length: transform length per axis.
         kept: samples kept around the axis.
         blocks: rows per block in the pupil and on the sensor.
+        spacing_m: distance of samples on the sensor.
         expected_error: predicted relative L2 error of the pixel energies of a speckle-like image.
     """
 
-    gather: tuple[Banded, Banded]
-    spread: tuple[Banded, Banded]
+    gather: Banded
+    spread: Banded
     tilt: tuple[Complex[Array, " cell"], Complex[Array, " cell"]] | None
     cells: int = eqx.field(static=True)
     length: int = eqx.field(static=True)
     kept: int = eqx.field(static=True)
     blocks: tuple[int, int] = eqx.field(static=True)
+    spacing_m: float = eqx.field(static=True)
     expected_error: float = eqx.field(static=True)
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
@@ -91,7 +93,6 @@ def plan_far_field(
     wavelength_m: float,
     *,
     sampling: float | None = None,
-    shift: tuple[float, float] = (0.0, 0.0),
     cell: bool = True,
 ) -> FarField:
     """Prepare the transform of one wavelength.
@@ -101,8 +102,6 @@ def plan_far_field(
         wavelength_m: vacuum wavelength.
         sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
             at most `TOLERANCE`.
-        shift: displacement (y, x) of the samples in units of their spacing. It changes what the rule
-            misses, not where the pixels are.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
 
     Returns:
@@ -129,25 +128,35 @@ def plan_far_field(
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for spacing².
     area = np.pi * camera.aperture_m**2 / 4
     scale = (pitch**2 / (wavelength_m * camera.sensor_distance_m)) * spacing / np.sqrt(area)
-    gather, errors = [], []
-    for offset in shift:
-        centres = camera.axis_m() / spacing + kept // 2 - offset
-        weights = pixel_weights(centres, width, cutoff, kept)
-        frequency = (np.arange(kept) - kept // 2 + offset) / length
-        envelope = np.sinc(frequency) ** 2 if cell else np.ones(kept)
-        gather.append(weights.matrix * (scale * envelope)[:, None])
-        errors.append(weights.expected_error)
-    cells = np.arange(nx)
-    ramps = [np.exp(-2j * np.pi * offset * cells / length).astype(np.complex64) for offset in shift]
+    weights = pixel_weights(camera.axis_m() / spacing + kept // 2, width, cutoff, kept)
+    envelope = np.sinc((np.arange(kept) - kept // 2) / length) ** 2 if cell else np.ones(kept)
+    matrix = weights.matrix * (scale * envelope)[:, None]
     return FarField(
-        gather=(Banded.from_dense(gather[0]), Banded.from_dense(gather[1])),
-        spread=(Banded.from_dense(gather[0].T, 256), Banded.from_dense(gather[1].T, 256)),
-        tilt=(jnp.asarray(ramps[0]), jnp.asarray(ramps[1])) if any(shift) else None,
+        gather=Banded.from_dense(matrix),
+        spread=Banded.from_dense(matrix.T, 256),
+        tilt=None,
         cells=nx,
         length=length,
         kept=kept,
         blocks=(_block(nx), _block(kept)),
-        expected_error=float(np.hypot(*errors)),
+        spacing_m=spacing,
+        expected_error=float(np.sqrt(2) * weights.expected_error),
+    )
+
+
+def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
+    """The same plan with every image moved by (y, x) metres on the sensor, by tilting the pupil.
+
+    The optimiser moves the image by a random fraction of a pixel at every step: a design must not depend on where
+    on the pixel grid a point of the scene falls, and the errors of a sparse `sampling` then average out.
+    """
+    cells = jnp.arange(plan.cells) - (plan.cells - 1) / 2
+    waves = cells / (plan.length * plan.spacing_m)
+    return eqx.tree_at(
+        lambda p: p.tilt,
+        plan,
+        (cis(waves * offset_m[0]), cis(waves * offset_m[1])),
+        is_leaf=lambda leaf: leaf is None,
     )
 
 
@@ -207,10 +216,10 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
         if plan.tilt is not None:
             columns = columns * plan.tilt[0]
         field = _central(_transform(columns, plan.length), plan.kept)
-        return plan.gather[0](field.real**2 + field.imag**2), field
+        return plan.gather(field.real**2 + field.imag**2), field
 
     columns, field = jax.lax.map(along_y, jnp.arange(plan.kept // sensor_block))
-    return plan.gather[1](columns.reshape(plan.kept, -1).T), field
+    return plan.gather(columns.reshape(plan.kept, -1).T), field
 
 
 @eqx.filter_custom_vjp
@@ -239,11 +248,11 @@ def _adjoint(
     """
     (rows, shared), (constant_rows, constant_shared) = eqx.partition(operands, perturbed)
     pupil_block, sensor_block = plan.blocks
-    half_spread = plan.spread[1](cotangent).T.reshape(-1, sensor_block, cotangent.shape[0])
+    half_spread = plan.spread(cotangent).T.reshape(-1, sensor_block, cotangent.shape[0])
 
     def along_y(block: tuple[Array, Array]) -> Array:
         weights, sensor = block
-        back = 2.0 * plan.spread[0](weights) * jnp.conj(sensor)
+        back = 2.0 * plan.spread(weights) * jnp.conj(sensor)
         columns = _transform(_uncentral(back, plan.length), plan.length)[:, : plan.cells]
         return columns if plan.tilt is None else columns * plan.tilt[0]
 

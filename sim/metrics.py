@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import fft2
 
-from sim.camera import Camera
+from sim.camera import Camera, Colour
 from sim.psf import pupil_field
 
 
@@ -26,6 +26,11 @@ def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Flo
 def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
     """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D."""
     return 1.2197 * wavelength_m * camera.sensor_distance_m / camera.aperture_m
+
+
+def mean_wavelength_m(colour: Colour) -> float:
+    """Weighted mean wavelength of a colour channel."""
+    return float(np.dot(colour.wavelengths_m, colour.weights))
 
 
 def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
@@ -117,27 +122,29 @@ def energy_budget(
     height_m: Float[np.ndarray, "y x"],
     psf: Float[np.ndarray, "y x"],
     depth_m: float,
-    wavelength_m: float,
+    colour: Colour,
 ) -> EnergyBudget:
-    """Energy budget of one PSF of one wavelength.
+    """Energy budget of one PSF of one colour.
 
     Args:
         camera: optics.
         height_m: `[y, x]` the map the PSF was made from.
         psf: `[y, x]` PSF, Fresnel loss included.
         depth_m: source depth.
-        wavelength_m: wavelength of this PSF.
+        colour: colour of this PSF.
 
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc²), not
     from the PSF, so `uncollected` near zero or below it would show a fault in either.
     """
-    passed = camera.transmission(wavelength_m)
-    spectrum = fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength_m)), workers=-1)
-    cells = camera.grid.shape[0]
-    envelope = np.sinc(np.fft.fftfreq(cells)) ** 2
-    power = spectrum.real**2 + spectrum.imag**2
-    area = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
-    band = passed * float(envelope @ power.astype(np.float64) @ envelope) / (cells**2 * area)
+    envelope = np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2
+    scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
+    passed = band = 0.0
+    for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+        spectrum = fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1)
+        power = (spectrum.real**2 + spectrum.imag**2).astype(np.float64)
+        share = weight * camera.transmission(wavelength)
+        passed += share
+        band += share * float(envelope @ power @ envelope) / scale
     total = float(np.sum(psf, dtype=np.float64))
-    spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, wavelength_m))
+    spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
     return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)

@@ -1,0 +1,167 @@
+"""Optimisation of a height map: Adam on the parameters, quantisation in the loop, resumable at any moment.
+
+A step looks at every colour, one near and one far depth (shuffled rounds), and a random displacement of the image by a
+fraction of a pixel; all follow from the seed and the step number, so a run that was killed and resumed ends
+with the same bytes as one that was not.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from doedesign.parametrize import softness_at
+from doedesign.problem import Look, Problem, Scene, compiler_options, judge_height, losses, view_of
+from doedesign.spec import START_NAMES, Spec
+from doedesign.starts import start_heights
+from fab.errors import InputError
+from sim.hankel import radial_profile, revolve, ring_count
+
+Start = Callable[[Path], Float[np.ndarray, "y x"]]
+
+
+class State(NamedTuple):
+    """Everything a step changes: parameters in radians, Adam's moments, and the number of steps done."""
+
+    radians: Array
+    adam: optax.OptState
+    step: int
+
+
+class Record(NamedTuple):
+    """One line of the history: the loss of a step before its update, and every term's value."""
+
+    step: int
+    loss: float
+    terms: tuple[float, ...]
+
+
+class Design(NamedTuple):
+    """A finished design on the DOE grid, metres, float32 `[y, x]`.
+
+    Attributes:
+        drawn_m: what will be made: quantised, unless the spec says `quantisation = "none"`.
+        continuous_m: the same parameters before rounding.
+    """
+
+    drawn_m: Float[np.ndarray, "y x"]
+    continuous_m: Float[np.ndarray, "y x"]
+
+
+def optimiser_of(spec: Spec) -> optax.GradientTransformation:
+    """Adam whose step size falls to a tenth along a cosine, so that levels settle."""
+    schedule = optax.cosine_decay_schedule(spec.optimize.learning_rate, max(spec.optimize.steps, 1), alpha=0.1)
+    return optax.adam(schedule)
+
+
+def initial_state(spec: Spec, problem: Problem, scene: Scene, files: Mapping[str, Path], read_start: Start) -> State:
+    """Parameters and moments before the first step.
+
+    Args:
+        spec: the spec.
+        problem: its problem.
+        scene: its sources.
+        files: input files by key.
+        read_start: reads a height map in metres when the spec's start is a file.
+
+    Raises:
+        InputError: a start that does not fit the grid or is no raster of rings where rings are optimised.
+    """
+    camera = problem.camera
+    if spec.optimize.start in START_NAMES:
+        heights = start_heights(
+            spec.optimize.start,
+            spec.optimize.start_options,
+            camera,
+            radial=problem.radial,
+            wavelength_m=spec.optics.design_wavelength_m,
+            seed=spec.optimize.seed,
+            judge=lambda h: judge_height(problem, scene, h),
+        )
+    else:
+        path = files["optimize.start"]
+        heights = read_start(path)
+        if heights.shape != camera.grid.shape:
+            raise InputError(
+                str(path), f"a start must have the grid's shape {camera.grid.shape}", heights.shape, "Resample it."
+            )
+        if problem.radial:
+            profile = radial_profile(heights, camera.grid)
+            if profile is None:
+                raise InputError(
+                    str(path),
+                    "the start of a radial design must be a raster of rings one cell wide",
+                    "a map with other structure",
+                    'Use parametrization = "freeform", or another start.',
+                )
+            heights = profile[: ring_count(camera)]
+    radians = jnp.asarray(problem.staircase.radians_of(heights))
+    return State(radians, optimiser_of(spec).init(radians), 0)
+
+
+def _loss(radians: Array, problem: Problem, look: Look, softness: Array) -> tuple[Array, Array]:
+    return losses(problem, view_of(problem, problem.staircase.height_m(radians, softness), look))
+
+
+Constants = tuple[Problem, Look, Array]
+Update = Callable[[Constants, tuple[Array, optax.OptState]], tuple[tuple[Array, optax.OptState], Array, Array]]
+
+
+def make_update(spec: Spec) -> Update:
+    """The compiled update (constants, (radians, adam)) -> ((radians, adam), loss, terms); it reuses the state's memory."""
+    optimiser = optimiser_of(spec)
+
+    def update(constants: Constants, state: tuple[Array, optax.OptState]) -> Any:
+        radians, adam = state
+        (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(radians, *constants)
+        updates, adam = optimiser.update(gradient, adam)
+        return (optax.apply_updates(radians, updates), adam), loss, terms
+
+    return eqx.filter_jit(update, donate="all-except-first", compiler_options=compiler_options())
+
+
+def constants_at(spec: Spec, problem: Problem, scene: Scene, step: int) -> Constants:
+    """What the update of step number `step` is given besides the state."""
+    softness = softness_at(spec.optimize.quantisation, step, spec.optimize.steps)
+    return problem, scene.look(spec.optimize.seed, step), jnp.float32(softness)
+
+
+def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[tuple[State, Record]]:
+    """Run the remaining steps one by one.
+
+    Yields:
+        the state after each step and its record. A state is valid until the next one is asked for.
+
+    Raises:
+        InputError: the loss is no longer finite.
+    """
+    update = make_update(spec)
+    for step in range(state.step, spec.optimize.steps):
+        constants = constants_at(spec, problem, scene, step)
+        (radians, adam), loss, terms = update(constants, (state.radians, state.adam))
+        state = State(radians, adam, step + 1)
+        record = Record(step, float(loss), tuple(float(t) for t in terms))
+        if not np.isfinite(record.loss):
+            raise InputError(
+                f"optimize, step {step}", "the loss must stay finite", record.loss, "Lower optimize.learning_rate."
+            )
+        yield state, record
+
+
+def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
+    """Height maps of the parameters."""
+    staircase = problem.staircase
+    softness = 1.0 if spec.optimize.quantisation == "none" else 0.0
+    drawn = np.asarray(staircase.height_m(state.radians, jnp.float32(softness)))
+    continuous = np.asarray(staircase.continuous_m(state.radians))
+    if problem.radial:
+        grid = problem.camera.grid
+        return Design(revolve(drawn, grid), revolve(continuous, grid))
+    return Design(drawn, continuous)
+

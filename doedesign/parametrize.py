@@ -1,0 +1,88 @@
+"""From free parameters to a height map that can be drawn.
+
+The parameters are phases at the design wavelength in radians, one per cell (free-form) or per ring (radial), unbounded. Their
+height is taken modulo the full staircase, L steps, which is close to one wave there. Every colour sees that same
+height, so a wrap is a real step for the others, and the optimiser pays for it.
+
+Quantisation in the loop. The forward value is a height the process can make, so what is optimised is what is drawn.
+"straight_through" passes the gradient as if there were no rounding (Y. Bengio et al., arXiv:1308.3432). "annealed" blends
+from the continuous to the quantised height while the cubic schedule of L. Li et al., CVPR 2022 (quantisation-aware
+deep optics), runs from a tenth to nine tenths of the steps. "none" leaves heights continuous.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fab.levels import Levels
+from sim.material import full_wave_height_m
+
+Quantisation = Literal["straight_through", "annealed", "none"]
+
+
+class Staircase(eqx.Module):
+    """How parameters become heights.
+
+    Attributes:
+        metres_per_radian: height of one radian of phase at the design wavelength.
+        levels: the process's staircase.
+    """
+
+    metres_per_radian: float = eqx.field(static=True)
+    levels: Levels = eqx.field(static=True)
+
+    @staticmethod
+    def at(material: str, design_wavelength_m: float, levels: Levels) -> "Staircase":
+        """The staircase of a substrate at a design wavelength."""
+        return Staircase(full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels)
+
+    def continuous_m(self, radians: Float[Array, "*s"]) -> Float[Array, "*s"]:
+        """Wrapped height before quantisation, 0 up to L steps, metres."""
+        return jnp.mod(radians * self.metres_per_radian, self.levels.count * self.levels.step_m)
+
+    def level(self, height_m: Float[Array, "*s"]) -> Float[Array, "*s"]:
+        """Nearest level of a wrapped height, 0 .. L-1 (the top half step belongs to level 0 of the next wave)."""
+        nearest = jnp.round(height_m / self.levels.step_m)
+        return jnp.where(nearest >= self.levels.count, 0.0, nearest)
+
+    def height_m(self, radians: Float[Array, "*s"], softness: Float[Array, ""]) -> Float[Array, "*s"]:
+        """Height that is optimised: quantised at softness 0, continuous at 1, blended between.
+
+        The gradient is that of the continuous height at softness 0 and 1 (straight-through), and the blend's own
+        otherwise.
+        """
+        height = self.continuous_m(radians)
+        stepped = _pass_through(height, self.level(height) * self.levels.step_m)
+        blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
+        return jnp.where(softness > 0, blended, stepped)
+
+    def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
+        """Parameters that make a given height, float32."""
+        return (np.asarray(height_m) / self.metres_per_radian).astype(np.float32)
+
+
+@jax.custom_jvp
+def _pass_through(height_m: Array, stepped_m: Array) -> Array:
+    """`stepped_m`, exactly, with the gradient of `height_m`."""
+    del height_m
+    return stepped_m
+
+
+@_pass_through.defjvp
+def _pass_through_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    return primals[1], tangents[0]
+
+
+def softness_at(quantisation: Quantisation, step: int, steps: int) -> float:
+    """Softness of the staircase at a step: 0 is what will be drawn."""
+    if quantisation == "straight_through":
+        return 0.0
+    if quantisation == "none":
+        return 1.0
+    start, end = 0.1 * steps, 0.9 * steps
+    remaining = np.clip((end - step) / max(end - start, 1), 0.0, 1.0)
+    return float(remaining**3)

@@ -1,0 +1,359 @@
+"""Height maps and PSF banks as OpenEXR files; the only importer of OpenEXR.
+
+* The first scan line is the highest y, so a viewer shows +y up. Arrays here have row 0 at the lowest y; rows are
+  turned over on the way out and on the way in, and the round trip is exact.
+* Channels are float32: `height` in metres; for a bank one channel per depth and colour, `z50mm.red`, in
+  energy per pixel per unit power incident on the clear aperture.
+* Lengths and angles are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because EXR's own
+  number attributes are float32.
+* A digest of pixels and lengths rides along as the text `sha256` and is checked on reading (EXR itself leaves
+  incompressible blocks unguarded). Files without one are taken as they are.
+* The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`).
+
+A PSF measured elsewhere (channels R, G, B, or one channel of any name; half, float or integer) is read as a bank of one
+depth. Its values are whatever its author wrote: counts, as a rule, not energies, and perhaps negative where a
+background was taken off.
+"""
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fab.errors import InputError
+from fab.files import canonical_json, explain_os_error, write_atomic
+
+if TYPE_CHECKING:
+    import sim.psf
+
+_BANK = "psf_bank"
+_DIGEST = "sha256"
+_GUARDED = ("aperture_m", "pitch_m", _BANK)
+
+
+class StoredHeight(NamedTuple):
+    """A height map as its file holds it.
+
+    Attributes:
+        height_m: `[y, x]` heights, metres, row 0 at the lowest y.
+        pitch_m: cell pitch, metres; None if the file does not say.
+        aperture_m: diameter of the clear aperture, metres; None if the file does not say.
+        metadata: the other text attributes.
+    """
+
+    height_m: Float[np.ndarray, "y x"]
+    pitch_m: float | None
+    aperture_m: float | None
+    metadata: dict[str, str]
+
+
+class _Picture(NamedTuple):
+    """Channels `[y, x]` (row 0 at the lowest y) and text attributes of an EXR file."""
+
+    channels: dict[str, np.ndarray]
+    texts: dict[str, str]
+
+
+def write_height(
+    path: str | Path,
+    height_m: Float[np.ndarray, "y x"],
+    pitch_m: float,
+    aperture_m: float,
+    extra: Mapping[str, str] | None = None,
+) -> None:
+    """Write a height map.
+
+    Args:
+        path: the file; its folder is made if missing.
+        height_m: `[y, x]` heights, metres, rounded to float32.
+        pitch_m: cell pitch, metres.
+        aperture_m: diameter of the clear aperture, metres.
+        extra: further text attributes.
+
+    Raises:
+        InputError: the system refuses the path.
+        ValueError: an extra attribute has a name that is taken.
+    """
+    texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": repr(float(aperture_m))}
+    _write(Path(path), {"height": height_m}, texts, extra)
+
+
+def read_height(path: str | Path) -> StoredHeight:
+    """Read a height map.
+
+    Raises:
+        InputError: the file is missing, no whole EXR file, has no channel `height`, or holds a height that is
+            negative or not finite.
+    """
+    picture = _read(Path(path))
+    if "height" not in picture.channels:
+        raise InputError(
+            str(path),
+            "a height map must have a channel named height, in metres",
+            f"the channels {', '.join(sorted(picture.channels))}",
+            "Give a height map, or rename its channel.",
+        )
+    height = picture.channels["height"]
+    if not (np.isfinite(height).all() and height.min() >= 0):
+        bad = np.argwhere(~(np.isfinite(height) & (height >= 0)))
+        y, x = (int(i) for i in bad[0])
+        raise InputError(
+            str(path),
+            "heights must be finite and at least 0",
+            f"{height[y, x]:.6g} m at row {y}, column {x} ({len(bad)} such pixels)",
+            "Measure heights from the deepest floor upward, or write the file again.",
+        )
+    texts = dict(picture.texts)
+    pitch, aperture = (
+        _length(path, key, texts.pop(key)) if key in texts else None for key in ("pitch_m", "aperture_m")
+    )
+    return StoredHeight(height, pitch, aperture, texts)
+
+
+def write_bank(path: str | Path, bank: "sim.psf.PsfBank", extra: Mapping[str, str] | None = None) -> None:
+    """Write a PSF bank, one channel per depth and colour.
+
+    Args:
+        path: the file; its folder is made if missing.
+        bank: PSFs, rounded to float32.
+        extra: further text attributes.
+
+    Raises:
+        InputError: the system refuses the path.
+        ValueError: two depths or colours have the same name, or an extra attribute has one that is taken.
+    """
+    channels = {
+        _channel_name(depth, colour): bank.energy[c, d]
+        for c, colour in enumerate(bank.colours)
+        for d, depth in enumerate(bank.depths_m)
+    }
+    if len(channels) != len(bank.colours) * len(bank.depths_m):
+        raise ValueError(f"depths and colours must differ, but got {bank.depths_m} and {bank.colours}")
+    description = {
+        "colours": list(bank.colours),
+        "depths_m": [repr(float(depth)) for depth in bank.depths_m],
+        "pixel_m": repr(float(bank.pixel_m)),
+        "field_rad": [repr(float(angle)) for angle in bank.field_rad],
+    }
+    _write(Path(path), channels, {_BANK: canonical_json(description).decode()}, extra)
+
+
+def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = np.inf) -> "sim.psf.PsfBank":
+    """Read a PSF bank, or a measured PSF written by another program.
+
+    Args:
+        path: the file.
+        pixel_m: pixel pitch of a measured PSF, metres. A bank of our own knows its pitch.
+        depth_m: source depth of a measured PSF, metres.
+
+    Returns:
+        the bank; a measured PSF has the colours R, G, B or the name of its one channel, and its own scale.
+
+    Raises:
+        InputError: the file is missing, no whole EXR file, holds neither a bank nor a PSF, or holds values
+            that are not finite; or a pixel pitch is missing or contradicts the file.
+    """
+    from sim.psf import PsfBank
+
+    picture = _read(Path(path))
+    for name, pixels in picture.channels.items():
+        if not np.isfinite(pixels).all():
+            raise InputError(
+                f"{path}: channel {name}", "a PSF must be finite", "NaN or infinity", "Write the file again."
+            )
+    if _BANK not in picture.texts:
+        colours, stored = _measured_colours(path, picture), _given_pixel(path, pixel_m)
+        energy = np.stack([picture.channels[c] for c in colours])[:, None]
+        return PsfBank(energy, colours, (float(depth_m),), stored)
+    colours, depths, stored, field = _bank_description(path, picture.texts[_BANK])
+    if pixel_m is not None and not np.isclose(pixel_m, stored, rtol=1e-6, atol=0):
+        raise InputError(
+            str(path),
+            "the pixel pitch given must be that of the file",
+            f"{pixel_m:.9g} m against {stored:.9g} m",
+            "Leave it out: the file knows it.",
+        )
+    names = [[_channel_name(depth, colour) for depth in depths] for colour in colours]
+    missing = [name for row in names for name in row if name not in picture.channels]
+    if missing:
+        raise InputError(
+            str(path), "every PSF of the bank must be there", f"no channel {missing[0]}", "Write the file again."
+        )
+    energy = np.stack([np.stack([picture.channels[name] for name in row]) for row in names])
+    return PsfBank(energy, colours, depths, stored, field)
+
+
+def _channel_name(depth_m: float, colour: str) -> str:
+    """`z50mm.red`. A dot separates layers in EXR, so a depth of 0.5 mm is z0p5mm; infinity is zinf."""
+    depth = "inf" if np.isinf(depth_m) else f"{depth_m * 1e3:.12g}mm".replace(".", "p")
+    return f"z{depth}.{colour}"
+
+
+def _bank_description(
+    path: str | Path, text: str
+) -> tuple[tuple[str, ...], tuple[float, ...], float, tuple[float, float]]:
+    try:
+        described = json.loads(text)
+        colours = tuple(str(colour) for colour in described["colours"])
+        depths = tuple(float(depth) for depth in described["depths_m"])
+        y, x = (float(angle) for angle in described["field_rad"])
+        pixel = described["pixel_m"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: {_BANK}",
+            "must list colours, depths_m, pixel_m and field_rad",
+            f'"{error!r}"',
+            "Write the file again.",
+        ) from error
+    if not colours or not all(depth > 0 for depth in depths) or not depths:
+        raise InputError(
+            f"{path}: {_BANK}",
+            "needs at least one colour and depths above 0",
+            f"{colours} and {depths}",
+            "Write the file again.",
+        )
+    return colours, depths, _length(path, f"{_BANK}.pixel_m", pixel), (y, x)
+
+
+def _measured_colours(path: str | Path, picture: _Picture) -> tuple[str, ...]:
+    names = set(picture.channels)
+    if {"R", "G", "B"} <= names:
+        return ("R", "G", "B")
+    without_alpha = sorted(names - {"A"})
+    if len(without_alpha) == 1:
+        return (without_alpha[0],)
+    raise InputError(
+        str(path),
+        "a measured PSF must have the channels R, G, B or a single one",
+        f"the channels {', '.join(sorted(names))}",
+        "Keep one layer of the picture.",
+    )
+
+
+def _given_pixel(path: str | Path, pixel_m: float | None) -> float:
+    if pixel_m is None:
+        raise InputError(
+            str(path),
+            "the pixel pitch of a PSF from another program must be given",
+            "none",
+            "Give the pixel pitch (after binning).",
+        )
+    return _length(path, "pixel pitch", pixel_m)
+
+
+def _length(path: str | Path, key: str, text: object) -> float:
+    """A positive, finite length in metres."""
+    try:
+        value = float(text)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        value = np.nan
+    if not 0 < value < np.inf:
+        raise InputError(f"{path}: {key}", "must be a positive length in metres", repr(text), "Correct it.")
+    return value
+
+
+def _write(path: Path, channels: Mapping[str, Any], texts: Mapping[str, str], extra: Mapping[str, str] | None) -> None:
+    import OpenEXR
+
+    taken = {_DIGEST, *_GUARDED} & (extra or {}).keys()
+    if taken:
+        raise ValueError(f"extra attributes must have names of their own, but got {sorted(taken)}")
+    # OpenEXR takes the memory as it lies, without a look at strides, and refuses float64: hand it contiguous float32
+    # copies. It also replaces the values in the dictionaries it is given, so both are made here.
+    pixels = {name: np.array(np.asarray(values)[::-1], np.float32, order="C") for name, values in channels.items()}
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {**texts, **(extra or {}), _DIGEST: _digest(pixels, texts)}
+    stream = io.BytesIO()
+    OpenEXR.File(header, pixels).write(stream)
+    write_atomic(path, stream.getvalue())
+
+
+def _digest(pixels: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> str:
+    """SHA-256 over the lengths and the pixels as they lie in the file, rows from the top."""
+    shapes = {name: list(values.shape) for name, values in pixels.items()}
+    guarded = {key: texts[key] for key in _GUARDED if key in texts}
+    digest = hashlib.sha256(canonical_json([shapes, guarded]))
+    for name in sorted(pixels):
+        digest.update(pixels[name].data)
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> _Picture:
+    import OpenEXR
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        with _silence() as said:
+            file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
+            parts = [(dict(part.header), dict(part.channels)) for part in file.parts]
+    except Exception as error:  # the binding raises RuntimeError, ValueError, MemoryError ... for broken content
+        raise _broken(path, str(error)) from error
+    if not parts:
+        raise _broken(path, said() or "no picture in it")
+    if len(parts) > 1:
+        raise InputError(str(path), "the file must have one part", f"{len(parts)} parts", "Save one part alone.")
+    header, channels = parts[0]
+    shape = _window_shape(path, header)
+    pictures = {name: np.ascontiguousarray(channel.pixels) for name, channel in channels.items()}
+    for name, pixels in pictures.items():
+        if pixels.shape != shape or pixels.dtype.kind not in "fu":
+            raise _broken(path, f"channel {name} with {pixels.dtype} pixels of shape {pixels.shape} for {shape}")
+    texts = {key: value for key, value in header.items() if isinstance(value, str)}
+    if _DIGEST in texts and texts.pop(_DIGEST) != _digest(pictures, texts):
+        raise InputError(
+            str(path),
+            "pixels and lengths must match the digest written with them",
+            "a file that has changed since",
+            f"Restore the file; if it was edited on purpose, remove its attribute {_DIGEST}.",
+        )
+    return _Picture({k: np.ascontiguousarray(v[::-1], np.float32) for k, v in pictures.items()}, texts)
+
+
+def _window_shape(path: Path, header: dict[str, Any]) -> tuple[int, int]:
+    """Rows and columns of the picture; a cropped one has lost its centre and is refused."""
+    data, display = (np.asarray(header[key]) for key in ("dataWindow", "displayWindow"))
+    if not np.array_equal(data, display):
+        raise InputError(
+            str(path),
+            "the picture must fill its display window, whose centre is the optical axis",
+            f"data window {data.tolist()} in {display.tolist()}",
+            "Save it uncropped.",
+        )
+    (x0, y0), (x1, y1) = data.tolist()
+    return y1 - y0 + 1, x1 - x0 + 1
+
+
+def _broken(path: Path, what: str) -> InputError:
+    return InputError(
+        str(path),
+        "the file must be a whole OpenEXR picture",
+        " ".join(what.replace("'<python_buffer>'", "it").split()),
+        "Write it again from its source.",
+    )
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[Callable[[], str]]:
+    """Keep what OpenEXR prints about broken files off the terminal; yields a function that returns it.
+
+    It prints through Python's stdout, which must carry data only, and says more straight to the process's stderr.
+    """
+    printed = io.StringIO()
+    saved = os.dup(2)
+    with contextlib.redirect_stdout(printed), open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield lambda: printed.getvalue().removeprefix("Warning: ")
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
