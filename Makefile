@@ -1,7 +1,7 @@
 # Everything happens in .venv, made on the first use with the first Python >= 3.11 that is found.
 # `make demo PYTHON=/path/to/python3.12` chooses another.
 
-DEMO = .venv/bin/python -m doedesign.demo
+DEMO = .venv/bin/python examples/demo.py
 
 VENV := .venv
 BIN := $(VENV)/bin

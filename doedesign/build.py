@@ -10,7 +10,8 @@ def camera_of(spec: Spec) -> Camera:
     """Lens, sensor, substrate and DOE grid of a spec."""
     return Camera(
         grid=Grid((spec.doe.samples, spec.doe.samples), spec.doe.pitch_m),
-        aperture_m=spec.doe.aperture_m,
+        # What the chrome leaves open, not what is etched: this is the circle light passes.
+        aperture_m=spec.doe.aperture_m - 2 * spec.process.chrome_overlap_m,
         material=spec.doe.material,
         colours=tuple(Colour(c.name, c.wavelengths_m, c.weights) for c in spec.optics.colours),
         focal_length_m=spec.optics.focal_length_m,

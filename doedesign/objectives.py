@@ -80,6 +80,16 @@ def near_spread(view: View) -> Array:
     return jnp.mean(participation(view.near) / view.lens_participation)
 
 
+def window_loss(view: View) -> Array:
+    """Share of the light that misses the sensor window, 0-1, averaged over colours and depths.
+
+    Without it `near_spread` and `far_spot` agree on sending unwanted light to angles beyond the window, where it
+    becomes stray light on the rest of the sensor.
+    """
+    images = jnp.concatenate([view.near, view.far], axis=1)
+    return 1.0 - jnp.mean(jnp.sum(images, axis=(-2, -1)))
+
+
 def handcrafted(view: View, *, near_weight: float = 1.0) -> Array:
     """The paper's hand-crafted variant (§4): far PSF towards a point, near PSF towards an even window.
 
@@ -102,6 +112,7 @@ def target_pattern(view: View, *, target: Float[np.ndarray, "y x"]) -> Array:
 _BUILT_IN: dict[str, Callable[..., Array]] = {
     "far_spot": far_spot,
     "near_spread": near_spread,
+    "window_loss": window_loss,
     "handcrafted": handcrafted,
     "target_pattern": target_pattern,
 }

@@ -21,6 +21,7 @@ from doedesign.problem import Look, Problem, Scene, compiler_options, judge_heig
 from doedesign.spec import START_NAMES, Spec
 from doedesign.starts import start_heights
 from fab.errors import InputError
+from fab.levels import height_of
 from sim.hankel import radial_profile, revolve, ring_count
 
 Start = Callable[[Path], Float[np.ndarray, "y x"]]
@@ -156,12 +157,14 @@ def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[
 
 def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
     """Height maps of the parameters."""
-    staircase = problem.staircase
-    softness = 1.0 if spec.optimize.quantisation == "none" else 0.0
-    drawn = np.asarray(staircase.height_m(state.radians, jnp.float32(softness)))
+    staircase, grid = problem.staircase, problem.camera.grid
     continuous = np.asarray(staircase.continuous_m(state.radians))
     if problem.radial:
-        grid = problem.camera.grid
-        return Design(revolve(drawn, grid), revolve(continuous, grid))
+        continuous = revolve(continuous, grid)
+    if spec.optimize.quantisation == "none":
+        drawn = continuous
+    else:
+        # By way of whole levels, so that the heights are the ones a mask file gives back, to the last bit.
+        level = np.asarray(staircase.level(jnp.asarray(continuous))).astype(np.uint8)
+        drawn = height_of(level, staircase.levels).astype(np.float32)
     return Design(drawn, continuous)
-

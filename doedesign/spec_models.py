@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from doedesign.spec_values import (
     FROM_TOML,
     Aperture,
+    ChromeOverlap,
     ColourName,
     Count,
     Defocus,
@@ -135,7 +136,7 @@ class DoeSpec(Table, frozen=True):
     Attributes:
         samples: cells per side, N.
         pitch_m: edge of a cell.
-        aperture_m: diameter of the clear aperture; N cells must span it to within half a pitch.
+        aperture_m: diameter of the relief; N cells must span it to within half a pitch.
         material: substrate, a key of `sim.material.MATERIALS`.
     """
 
@@ -151,10 +152,13 @@ class ProcessSpec(Table, frozen=True):
     Attributes:
         levels: number of heights L, a power of two.
         level_step_m: height of one level.
+        chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
+            little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
     """
 
     levels: LevelCount = Field(examples=["16"])
     level_step_m: LevelStep = Field(examples=['"75 nm"'])
+    chrome_overlap_m: ChromeOverlap = 5e-6
 
 
 class SceneSpec(Table, frozen=True):

@@ -24,6 +24,7 @@ __all__ = [
     "OBJECTIVE_NAMES",
     "START_NAMES",
     "Aperture",
+    "ChromeOverlap",
     "ColourName",
     "Count",
     "Defocus",
@@ -48,7 +49,7 @@ __all__ = [
 FROM_TOML = "toml"
 HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
 START_NAMES = ("flat", "random", "fresnel", "ring")
-OBJECTIVE_NAMES = ("far_spot", "near_spread", "handcrafted", "target_pattern")
+OBJECTIVE_NAMES = ("far_spot", "near_spread", "window_loss", "handcrafted", "target_pattern")
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _COLOUR = re.compile(r"[A-Za-z0-9_-]{1,32}")
@@ -107,6 +108,7 @@ Pitch = Annotated[float, BeforeValidator(_length(10 * NM, 1 * MM))]
 Aperture = Annotated[float, BeforeValidator(_length(1 * UM, 1.0))]
 FocalLength = Annotated[float, BeforeValidator(_length(10 * UM, 100.0))]
 LevelStep = Annotated[float, BeforeValidator(_length(0.1 * NM, 100 * UM))]
+ChromeOverlap = Annotated[float, BeforeValidator(_length(0.0, 1 * MM))]
 Defocus = Annotated[float, BeforeValidator(_length(-10 * MM, 10 * MM))]
 NearDepth = Annotated[float, BeforeValidator(_length(10 * UM, 1e6))]
 FarDepth = Annotated[

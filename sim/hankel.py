@@ -32,18 +32,18 @@ class Hankel(eqx.Module):
     """Operators of one wavelength for a profile of rings.
 
     Attributes:
-        rings_to_field: `[subring, radius]`, float32, all constant factors included.
+        rings_to_field: `[subring, coarse radius]`, float32, all constant factors included.
         refine: coarse radii -> fine radii.
         first: first fine radius used by each distinct pixel.
-        areas: `[distinct pixel, radius]` weights of the fine radii from `first` on.
+        areas: `[distinct pixel, fine radius]` weights of the fine radii from `first` on.
         distinct: `[y, x]` index of the distinct pixel that equals this one.
         subrings: number of sub-rings per ring.
     """
 
-    rings_to_field: Float[Array, "subring radius"]
+    rings_to_field: Float[Array, "subring coarse"]
     refine: Banded
     first: Int[Array, " distinct"]
-    areas: Float[Array, "distinct radius"]
+    areas: Float[Array, "distinct fine"]
     distinct: Int[Array, "y x"]
     subrings: int = eqx.field(static=True)
 

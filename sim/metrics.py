@@ -1,5 +1,6 @@
 """Numbers read off a PSF, each with its definition. All work on plain arrays; none changes a PSF's energy."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -93,8 +94,8 @@ def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_
     """Fraction |<t>|^2 of the light that passes as if the plate were flat (design.md §4), t = exp(i phi) over the
     clear aperture.
     """
-    field = pupil_field(camera, height_m, np.inf, wavelength_m)
-    # The source at infinity is a plane wave in focus; out of focus its phase is not the plate's.
+    # A star in focus is a plane wave; out of focus, a phase that is not the plate's would be added.
+    field = pupil_field(replace(camera, defocus_m=0.0), height_m, np.inf, wavelength_m)
     cells = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     return float(np.abs(np.asarray(field, np.complex128).sum() / cells) ** 2)
 
@@ -120,7 +121,7 @@ class EnergyBudget(NamedTuple):
 def energy_budget(
     camera: Camera,
     height_m: Float[np.ndarray, "y x"],
-    psf: Float[np.ndarray, "y x"],
+    psf: Float[np.ndarray, "v u"],
     depth_m: float,
     colour: Colour,
 ) -> EnergyBudget:
@@ -129,7 +130,7 @@ def energy_budget(
     Args:
         camera: optics.
         height_m: `[y, x]` the map the PSF was made from.
-        psf: `[y, x]` PSF, Fresnel loss included.
+        psf: `[y, x]` PSF on the sensor, Fresnel loss included.
         depth_m: source depth.
         colour: colour of this PSF.
 

@@ -117,7 +117,7 @@ class Banded(eqx.Module):
         starts: first input index of every tile's window.
     """
 
-    tiles: tuple[Float[Array, "window tile"], ...]
+    tiles: tuple[Float[Array, "_ _"], ...]  # of different sizes
     starts: tuple[int, ...] = eqx.field(static=True)
 
     @staticmethod

@@ -13,6 +13,7 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.farfield import FarField, plan_far_field
 from sim.fresnel import DirectPath, plan_direct
+from sim.hankel import plan_hankel, ring_source_waves
 from sim.pupil import PhaseRows, PupilRows, phase_pupil
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
@@ -108,3 +109,34 @@ def pupil_field(
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     rows = PhaseRows(jnp.asarray(height_m, jnp.float32), source, coverage)
     return jax.jit(phase_pupil)(rows, jnp.float32(camera.waves_per_metre(wavelength_m)))
+
+
+def radial_psf_bank(
+    camera: Camera,
+    profile_m: Float[np.ndarray, " ring"],
+    depths_m: Sequence[float],
+    *,
+    on_psf: Callable[[], None] = lambda: None,
+) -> PsfBank:
+    """PSFs on the axis of rings drawn as rings, by the Hankel path.
+
+    Args:
+        camera: optics.
+        profile_m: height of every ring of one cell's width, metres (`sim.hankel.ring_count` of them).
+        depths_m: source depths, metres.
+        on_psf: called after every single PSF, for progress.
+
+    Returns:
+        the bank, Fresnel loss of the substrate included.
+    """
+    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
+    profile = jnp.asarray(profile_m, jnp.float32)
+    for c, colour in enumerate(camera.colours):
+        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+            plan = plan_hankel(camera, wavelength)
+            rate = jnp.float32(camera.waves_per_metre(wavelength))
+            for d, depth in enumerate(depths_m):
+                source = jnp.asarray(ring_source_waves(camera, depth, wavelength))
+                energy[c, d] += weight * camera.transmission(wavelength) * np.asarray(plan.energy(profile, source, rate))
+                on_psf()
+    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m)

@@ -22,7 +22,7 @@ from doedesign.spec import (
 from fab.errors import InputError
 from fab.files import canonical_json
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 AUTOMOTIVE = EXAMPLES / "automotive.toml"
 ALL = sorted(EXAMPLES.glob("*.toml"))
 
@@ -167,7 +167,7 @@ def test_overrides_change_single_values():
     )
     assert (spec.process.levels, spec.process.level_step_m) == (8, 150e-9)
     assert [colour.name for colour in spec.optics.colours] == ["532nm"]
-    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5]
+    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5, 1.0]
     assert dict(spec.optimize.start_options) == {"far_energy": 0.3}
     assert spec.sensor.defocus_m == -20e-6
 
@@ -176,7 +176,7 @@ def test_overrides_change_single_values():
     ("override", "message"),
     [
         ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
-        ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 2"),
+        ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 3"),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
         ("process.levls=8", "--set: process.levls: must be a known key of [process], but got `levls`. Did you mean"),
         ("process.levels=8\nname='x'", "--set: process.levels: must be a whole number"),

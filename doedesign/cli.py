@@ -1,0 +1,192 @@
+"""The command line. stdout is data (paths, or JSON with --json), stderr is talk.
+
+Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted. Heavy packages are imported where they are used, so
+that --help answers at once.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+from doedesign import __version__
+from fab.errors import CheckFailed, InputError
+
+app = App(
+    name="doedesign",
+    help="Design diffractive optical elements and the masks that make them.",
+    version=__version__,
+)
+
+Overrides = Annotated[tuple[str, ...], Parameter(name="--set", negative="", help="Change one value of the spec, KEY=VALUE.")]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON instead of paths.")]
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _print(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
+    if as_json:
+        print(json.dumps({"paths": [str(path) for path in paths], **more}, sort_keys=True))
+    else:
+        for path in paths:
+            print(path)
+
+
+def _length(option: str, text: str | None) -> float | None:
+    if text is None:
+        return None
+    from fab.units import parse_length
+
+    try:
+        return parse_length(text)
+    except ValueError as error:
+        raise InputError(option, "must be a length with a unit", f'"{text}"', 'For example "75 nm".') from error
+
+
+@app.command
+def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_: AsJson = False) -> None:
+    """Optimise a spec into a run folder, or resume it where it was stopped.
+
+    Args:
+        spec: TOML spec, such as examples/automotive.toml.
+        out: Run folder; runs/NAME by default.
+    """
+    from doedesign.commands.optimize import optimize as work
+    from doedesign.spec import load_spec, spec_warnings
+
+    for warning in spec_warnings(load_spec(spec, set_)):
+        _say(f"warning: {warning}")
+    run = work(spec, out, set_, _say)
+    _print([run.folder], json_, metrics=str(run.path("metrics.json")))
+
+
+@app.command
+def masks(
+    source: Path,
+    *,
+    levels: int | None = None,
+    out: Path | None = None,
+    step: str | None = None,
+    pitch_um: float | None = None,
+    scale: str | None = None,
+    aperture: str | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Write the mask order of a run or of any height map, and prove it by reading it back.
+
+    Args:
+        source: Run folder, or a height map (.exr, .npy, .tif, .png).
+        levels: Number of heights; the run's own by default.
+        out: Order folder; masks/NAME by default.
+        step: Height of one level, such as "75 nm"; for a bare height map.
+        pitch_um: Pixel pitch of a bare height map in micrometres.
+        scale: Height of one count of an integer map, such as "1 nm".
+        aperture: Diameter of the relief; the map's shorter side by default.
+    """
+    from doedesign.commands.heights import level_map_from
+    from doedesign.commands.masks import write_masks
+
+    drawing = level_map_from(
+        source,
+        levels,
+        step_m=_length("--step", step),
+        pitch_m=None if pitch_um is None else pitch_um * 1e-6,
+        scale_m=_length("--scale", scale),
+        aperture_m=_length("--aperture", aperture),
+    )
+    folder, report = write_masks(source, drawing, out, _say)
+    _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
+    _print([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
+
+
+@app.command
+def verify(order: Path, *, json_: AsJson = False) -> None:
+    """Prove a mask order from its files alone; exit 1 names what differs.
+
+    Args:
+        order: Folder that masks wrote.
+    """
+    from doedesign.commands.masks import verify as work
+
+    report = work(order)
+    if json_:
+        checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
+        print(json.dumps({"passed": report.passed, "checks": checks}))
+    report.require()
+    _say(f"{len(report.checks)} checks passed")
+
+
+@app.command
+def psf(
+    run: Path,
+    *,
+    masks: Path | None = None,
+    depths: tuple[str, ...] = (),
+    field_deg: tuple[float, float] = (0.0, 0.0),
+    json_: AsJson = False,
+) -> None:
+    """Compute PSF banks and pictures of the continuous, the quantised and the drawn design.
+
+    Args:
+        run: Run folder.
+        masks: Its mask order; masks/NAME by default.
+        depths: Source depths, such as "5 cm" or inf; the spec's by default.
+        field_deg: Field angles along y and x in degrees.
+    """
+    from math import inf, radians
+
+    from doedesign.commands.psf import psf as work
+
+    depths_m = [inf if text == "inf" else _length("--depths", text) or 0.0 for text in depths]
+    if any(not z > 0 for z in depths_m):
+        raise InputError("--depths", "must be positive", ", ".join(depths), 'For example --depths "5 cm".')
+    if any(abs(angle) > 60 for angle in field_deg):
+        raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
+    folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), _say)
+    _print([folder, *sorted(folder.iterdir())], json_)
+
+
+def exit_code(work: Callable[[], Any]) -> int:
+    """Run a command's work; tell a user's mistake in one message instead of a traceback.
+
+    Returns:
+        0 done, 1 a check failed, 2 bad input, 130 interrupted.
+    """
+    try:
+        work()
+    except InputError as error:
+        _say(f"doedesign: {error}")
+        return 2
+    except CheckFailed as error:
+        _say(f"doedesign: check failed\n{error}")
+        return 1
+    except CycloptsError as error:
+        _say(f"doedesign: {error}\nTry: doedesign --help")
+        return 2
+    except KeyboardInterrupt:
+        _say("doedesign: interrupted; what was finished is kept, the same command goes on from there")
+        return 130
+    except BrokenPipeError:
+        return 0
+    except OSError as error:
+        from fab.files import explain_os_error
+
+        if error.filename is None and error.errno is None:
+            raise
+        _say(f"doedesign: {explain_os_error(error, str(error.filename or 'output'))}")
+        return 2
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the `doedesign` command."""
+    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

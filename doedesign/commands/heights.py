@@ -1,0 +1,100 @@
+"""Height maps from wherever they come: a run, an EXR file, or a map the user brings."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from doedesign.runs import Run, open_run
+from doedesign.spec import HEIGHT_FILES
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.height import HeightMap, read_height
+from fab.levels import Levels, quantise
+
+
+@dataclass(frozen=True)
+class LevelMap:
+    """A map that can be drawn: level numbers `[y, x]`, the staircase, the raster and the relief's diameter."""
+
+    level: NDArray[np.uint8]
+    levels: Levels
+    grid: Grid
+    aperture_m: float
+    name: str
+
+
+def read_any_height(
+    path: Path, pitch_m: float | None = None, scale_m: float | None = None, aperture_m: float | None = None
+) -> HeightMap:
+    """Read a height map from .exr, .npy, .tif or .png.
+
+    Args:
+        path: the file.
+        pitch_m: pixel pitch; needed unless the file holds it (EXR of our own).
+        scale_m: metres per count, for integers.
+        aperture_m: diameter of the relief; by default what the file says, or its shorter side.
+
+    Raises:
+        InputError: the file cannot be read or something needed is missing.
+    """
+    if path.is_dir():
+        raise InputError(str(path), f"a height map is a file ({', '.join(HEIGHT_FILES)})", "a folder", "Give the file.")
+    if path.suffix.lower() != ".exr":
+        return read_height(path, pitch_m, scale_m, aperture_m)
+    from sim.store import read_height as read_exr
+
+    stored = read_exr(path)
+    pitch = pitch_m or stored.pitch_m
+    if pitch is None:
+        raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Add --pitch-um.")
+    ny, nx = stored.height_m.shape
+    grid = Grid((ny, nx), pitch)
+    return HeightMap(stored.height_m, grid, aperture_m or stored.aperture_m or min(grid.extent_m))
+
+
+def levels_of_run(run: Run, count: int | None = None) -> LevelMap:
+    """What a run draws, or its continuous design rounded to another number of levels over the same full height."""
+    drawn = Levels(run.spec.process.levels, run.spec.process.level_step_m)
+    aperture = run.spec.doe.aperture_m
+    if count in (None, drawn.count) and run.spec.optimize.quantisation != "none":
+        height = read_any_height(run.path("height.exr"))
+        return LevelMap(quantise(height.height_m, drawn), drawn, height.grid, aperture, run.spec.name)
+    levels = Levels(count or drawn.count, drawn.count * drawn.step_m / (count or drawn.count))
+    height = read_any_height(run.path("height_continuous.exr"))
+    # The design repeats with the full height, so the top half step rounds to the lowest level.
+    wrapped = np.mod(np.rint(height.height_m / levels.step_m), levels.count).astype(np.uint8)
+    return LevelMap(wrapped, levels, height.grid, aperture, run.spec.name)
+
+
+def level_map_from(
+    source: Path,
+    count: int | None,
+    *,
+    step_m: float | None = None,
+    pitch_m: float | None = None,
+    scale_m: float | None = None,
+    aperture_m: float | None = None,
+) -> LevelMap:
+    """The level map of a run folder or of a height map.
+
+    Raises:
+        InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
+    """
+    if not source.exists():
+        raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
+    if source.is_dir():
+        given = [f for f, v in (("step", step_m), ("pitch-um", pitch_m), ("scale", scale_m), ("aperture", aperture_m)) if v]
+        if given:
+            raise InputError(
+                f"--{given[0]}", "a run brings its own geometry", "a value", "Leave the option out, or give a height map."
+            )
+        return levels_of_run(open_run(source), count)
+    if count is None or step_m is None:
+        missing, example = ("--levels", "--levels 16") if count is None else ("--step", '--step "75 nm"')
+        raise InputError(str(source), f"a bare height map needs {missing}", "none", f"Add {example}.")
+    height = read_any_height(source, pitch_m, scale_m, aperture_m)
+    levels = Levels(count, step_m)
+    name = "".join(c if c.isalnum() else "_" for c in source.stem) or "height"
+    return LevelMap(quantise(height.height_m, levels), levels, height.grid, height.aperture_m, name)

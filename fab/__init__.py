@@ -1,0 +1,29 @@
+"""What is made: from a height map to the mask files a fab lab writes, and back. Knows no light.
+
+Map of the package, in the order the work flows:
+
+    errors    InputError (the user's mistake, exit 2) and CheckFailed (a proof that failed, exit 1)
+    units     text with a unit -> SI number, and back; the only border of the package
+    files     atomic files and folders, digests, canonical JSON
+    grid      Grid: the pixel raster of a plate
+    height    HeightMap, and the reader of maps a user brings (.npy, .tif, .png)
+    levels    Levels: height <-> level number
+    masks     level map <-> bit planes, one plane per etch mask
+    polygons  bitmap <-> rectangles (numba), circles as annulus sectors
+    layout    Layer, Shapes, Layout: the geometry of a mask set in integer database units
+    stream    GDSII and OASIS files
+    walker    this package's own GDSII reader
+    manifest  what every file of a mask order is
+    preview   the picture of a mask set
+    order     the folder that goes to the lab, with its manifest
+    readback  the same files read by a library that had no part in the writing
+    compare   what was read against what should be there
+    verify    the proof of such a folder
+
+Units and axes. Everything inside is SI and the unit stands in the name (``pitch_m``). Arrays are
+``[y, x]``; row 0 is the lowest y and +y is up, so the row index grows with y in the drawing as well.
+Heights are measured from the deepest etched floor, so ``height_m >= 0``. Level l of L stands
+``l * step`` high; bit k of ``L - 1 - l`` set means that mask k opens there and etches ``2**k * step``.
+A polygon in an etch layer means "etched here", a polygon in the chrome layer "chrome here".
+Mask bit k is drawn on layer k + 1. Importing this package imports nothing heavy.
+"""

@@ -1,0 +1,155 @@
+"""What was read from a mask file against what it should hold; every difference becomes a sentence.
+
+Pure comparisons, no files. The sentences name the layer, how many pixels or shapes differ, and the first.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.layout import Layer, Layout, PixelEdges, Shapes
+from fab.manifest import ChromeEntry, FileEntry, Manifest, MaskEntry
+from fab.polygons import doubled_area, paint
+from fab.readback import Reading
+from fab.units import MM, NM, UM
+
+__all__ = ["Expected", "layout_problems", "reading_problems"]
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What the files of an order should hold.
+
+    Attributes:
+        manifest: the manifest of the order.
+        planes: ``[bit, y, x]`` the pixels each etch mask should open.
+        edges: where the pixel edges fall in the drawing.
+    """
+
+    manifest: Manifest
+    planes: NDArray[np.uint8]
+    edges: PixelEdges
+
+    def etch_layers(self, entry: FileEntry) -> dict[Layer, MaskEntry]:
+        """Return the etch layers that a file should hold, each with its mask."""
+        layers = {Layer(mask.layer, mask.datatype): mask for mask in self.manifest.masks}
+        return {layer: mask for layer, mask in layers.items() if str(layer) in entry.layers}
+
+    def chrome_layer(self, entry: FileEntry) -> Layer | None:
+        """Return the chrome layer if a file should hold it."""
+        layer = Layer(self.manifest.chrome.layer, self.manifest.chrome.datatype)
+        return layer if str(layer) in entry.layers else None
+
+
+def _pixel_problems(layer: Layer, differs: NDArray[np.bool_]) -> list[str]:
+    count = int(np.count_nonzero(differs))
+    if not count:
+        return []
+    row, column = np.unravel_index(int(np.argmax(differs)), differs.shape)
+    noun = "pixel differs" if count == 1 else "pixels differ"
+    return [f"layer {layer}: {count} {noun} from the level map, the first at row {row}, column {column}"]
+
+
+def _count_problem(layer: Layer, count: int, what: str) -> list[str]:
+    return [f"layer {layer}: {count} {what}"] if count else []
+
+
+def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: ChromeEntry, dbu_m: float) -> list[str]:
+    """Check that polygons make the stated annulus: count, radii, chords, and area to the chords' error."""
+    if len(polygons) != chrome.polygons:
+        return [f"layer {layer}: {len(polygons)} chrome polygons instead of {chrome.polygons}"]
+    inner, outer = (mm * MM / 2 / dbu_m for mm in (chrome.opening_diameter_mm, chrome.outer_diameter_mm))
+    x, y = np.concatenate(polygons).astype(np.float64).T
+    radius = np.hypot(x, y)
+    # A vertex is rounded by up to half a unit in x and in y.
+    on_inner, on_outer = (np.abs(radius - wanted) <= 1 for wanted in (inner, outer))
+    problems = _count_problem(
+        layer, int(np.count_nonzero(~(on_inner | on_outer))), "chrome vertices lie on neither of the two circles"
+    )
+    chord = chrome.chord_error_nm * NM / dbu_m + 1
+    for name, on_circle, wanted in (("opening", on_inner, inner), ("outer edge", on_outer, outer)):
+        angle = np.sort(np.arctan2(y[on_circle], x[on_circle]))
+        widest = np.max(np.diff(angle, append=angle[:1] + 2 * math.pi), initial=0.0) if angle.size else 2 * math.pi
+        sagitta = wanted * (1 - math.cos(min(widest, 2 * math.pi) / 2))
+        if sagitta > chord:
+            problems.append(f"layer {layer}: the {name} leaves its circle by {sagitta * dbu_m / NM:.3g} nm")
+    area = sum(abs(doubled_area(polygon)) for polygon in polygons) / 2
+    off = abs(area - math.pi * (outer**2 - inner**2))
+    if off > 2 * math.pi * (outer + inner) * chord:
+        problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
+    return problems
+
+
+def _etch_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expected) -> list[str]:
+    """Compare one etch layer, as the own reader found it, with its plane."""
+    canvas = np.zeros(expected.planes.shape[1:], dtype=np.uint8)
+    painted = paint(shapes.rectangles, expected.edges.x, expected.edges.y, 0, canvas)
+    missing = abs(len(shapes) - mask.polygons)
+    return [
+        *_count_problem(layer, missing, f"polygons more or less than the {mask.polygons} of the manifest"),
+        *_count_problem(layer, len(shapes.polygons), "shapes are no rectangles"),
+        *_count_problem(
+            layer, painted.strays, f"rectangles are off the pixel raster, the first is number {painted.first_stray}"
+        ),
+        *_count_problem(layer, painted.overlaps, "pixels are covered more than once"),
+        *_pixel_problems(layer, canvas != expected.planes[mask.bit]),
+    ]
+
+
+def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
+    """Compare a file, as this package's own reader found it, with what it should hold.
+
+    Args:
+        layout: the content of the file.
+        entry: the manifest's entry of the file.
+        expected: what the order should hold.
+
+    Returns:
+        One sentence per difference.
+    """
+    problems = []
+    if layout.cell != entry.cell:
+        problems.append(f"the cell is named {layout.cell!r} instead of {entry.cell!r}")
+    if abs(layout.dbu_m / expected.edges.dbu_m - 1) > 1e-9:
+        right = expected.edges.dbu_m
+        problems.append(f"the database unit is {layout.dbu_m / NM:.9g} nm instead of {right / NM:.9g} nm")
+    etch = expected.etch_layers(entry)
+    chrome = expected.chrome_layer(entry)
+    none = Shapes(np.empty((0, 4), dtype=np.int32))
+    for layer, shapes in layout.shapes.items():
+        if layer not in etch and layer != chrome:
+            problems += _count_problem(layer, len(shapes), "shapes on a layer that should be empty")
+    for layer, mask in etch.items():
+        problems += _etch_problems(layer, layout.shapes.get(layer, none), mask, expected)
+    if chrome is not None:
+        shapes = layout.shapes.get(chrome, none)
+        problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
+        problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, layout.dbu_m)
+    return problems
+
+
+def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> list[str]:
+    """Compare one layer, as the other library found it, with what it should hold.
+
+    Args:
+        reading: the layer.
+        entry: the manifest's entry of the file.
+        expected: what the order should hold.
+
+    Returns:
+        One sentence per difference.
+    """
+    layer, winding = reading.layer, reading.winding
+    problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
+    mask = expected.etch_layers(entry).get(layer)
+    if mask is None:
+        covered = int(np.count_nonzero(winding))
+        problems += _count_problem(layer, covered, "pixels are covered by rectangles in the chrome")
+        return problems + _chrome_problems(
+            layer, list(reading.polygons), expected.manifest.chrome, expected.edges.dbu_m
+        )
+    problems += _count_problem(layer, len(reading.polygons), "shapes are no rectangles")
+    problems += _count_problem(layer, int(np.count_nonzero(winding > 1)), "pixels are covered more than once")
+    return problems + _pixel_problems(layer, (winding > 0) != expected.planes[mask.bit])

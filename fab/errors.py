@@ -1,0 +1,48 @@
+"""The two errors that a caller is expected to catch; everything else is a defect."""
+
+from collections.abc import Sequence
+
+__all__ = ["CheckFailed", "InputError"]
+
+
+class InputError(ValueError):
+    """Something that the user gave is wrong: a file, a key, a value (exit code 2).
+
+    The message is one sentence and its cure: ``{where}: {rule}, but got {got}. {cure}``.
+    """
+
+    def __init__(self, where: str, rule: str, got: object, cure: str) -> None:
+        """Build the message from its four parts.
+
+        Args:
+            where: the file, or "file: key", that holds the mistake.
+            rule: what has to hold, without a full stop ("levels must be a power of two").
+            got: what came instead.
+            cure: what to do about it, a full sentence.
+        """
+        self.where = where
+        self.rule = rule
+        self.got = got
+        self.cure = cure
+        super().__init__(where, rule, got, cure)
+
+    def __str__(self) -> str:
+        """Return the one-line message that the command line prints."""
+        return f"{self.where}: {self.rule}, but got {self.got}. {self.cure}"
+
+
+class CheckFailed(Exception):
+    """A verification found differences (exit code 1); nothing is wrong with the input itself."""
+
+    def __init__(self, differences: Sequence[str]) -> None:
+        """Collect the differences.
+
+        Args:
+            differences: one sentence per difference, each naming the file it was found in.
+        """
+        self.differences = tuple(differences)
+        super().__init__(self.differences)
+
+    def __str__(self) -> str:
+        """Return the differences, one per line."""
+        return "\n".join(self.differences)

@@ -1,0 +1,275 @@
+"""Files and folders that appear whole or not at all, their digests, and canonical JSON.
+
+A result is first written under a temporary name beside its final place, forced to the disk and then renamed.
+Whatever happens in between (an exception, a full disk, a kill), the final path holds the old content or the
+new one and never a half. What the operating system refuses is told as an `InputError` that names the path.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+
+__all__ = [
+    "MANIFEST_NAME",
+    "atomic_folder",
+    "canonical_json",
+    "explain_os_error",
+    "read_json",
+    "read_npy",
+    "sha256_bytes",
+    "sha256_file",
+    "write_atomic",
+]
+
+MANIFEST_NAME = "manifest.json"
+
+_CURES = {
+    errno.EACCES: ("the place must be writable", "Choose another output folder or change its permissions."),
+    errno.EPERM: ("the place must be writable", "Choose another output folder or change its permissions."),
+    errno.EROFS: ("the file system must be writable", "Choose an output folder on a writable disk."),
+    errno.ENOSPC: ("the disk must have room for the result", "Free some space or choose another disk."),
+    errno.EDQUOT: ("the disk quota must have room for the result", "Free some space or choose another disk."),
+    errno.ENOTDIR: ("every part of the path above the last must be a folder", "Choose another output path."),
+    errno.EISDIR: ("the path must be a file", "Give the file inside that folder."),
+    errno.EEXIST: ("the folder's parent must not be a file", "Choose another output path."),
+    errno.ENOENT: ("the file must exist", "Check the path."),
+    errno.ENAMETOOLONG: ("the path must be shorter", "Choose a shorter name."),
+}
+
+
+def explain_os_error(error: OSError, path: str | Path) -> InputError:
+    """Turn an operating-system error into the message a user can act on.
+
+    Args:
+        error: what the system said.
+        path: the file or folder the caller was working on.
+
+    Returns:
+        The `InputError` to raise from it.
+    """
+    rule, cure = _CURES.get(error.errno or 0, ("the path must be usable", "Check the path and the disk."))
+    return InputError(str(path), rule, f'"{error.strerror or error}"', cure)
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_atomic(path: str | Path, data: bytes) -> None:
+    """Write a whole file: temporary sibling, fsync, rename.
+
+    Args:
+        path: the final path; its folder is made if missing.
+        data: the content.
+
+    Raises:
+        InputError: the system refuses the path (read-only, full, not a folder ...).
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        temporary = Path(name)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    # There is no call that only reads it.
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _require_replaceable(path: Path) -> None:
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not path.is_dir():
+        raise InputError(str(path), "the output must be a folder", "a file", "Choose another output path.")
+    if not (path / MANIFEST_NAME).is_file():
+        raise InputError(
+            str(path),
+            f"an output folder that exists must be empty or an earlier result (with {MANIFEST_NAME})",
+            f"a folder with other content, such as {min(p.name for p in path.iterdir())!r}",
+            "Choose another output folder, or empty this one yourself.",
+        )
+
+
+def _sync_tree(folder: Path) -> None:
+    for root, _, names in os.walk(folder):
+        for name in names:
+            handle = os.open(Path(root) / name, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+        _sync_folder(Path(root))
+
+
+def _swap(fresh: Path, path: Path) -> None:
+    """Put `fresh` at `path`; an earlier result moves aside first and comes back if the rename fails."""
+    aside = None
+    if path.exists():
+        aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+        path.rename(aside / path.name)
+    try:
+        fresh.rename(path)
+    except OSError:
+        if aside is not None:
+            (aside / path.name).rename(path)
+            aside.rmdir()
+        raise
+    if aside is not None:
+        shutil.rmtree(aside, ignore_errors=True)
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Fill a folder that appears at its final path only when everything in it is on the disk.
+
+    Args:
+        path: the final folder. It may be missing, empty, or an earlier result (a folder that holds
+            ``manifest.json``), which is then replaced whole.
+
+    Yields:
+        A temporary folder beside it to write into. It is removed if the body raises.
+
+    Raises:
+        InputError: the path is a file, a folder with foreign content, or refused by the system.
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        _require_replaceable(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.new.", dir=path.parent))
+        temporary.chmod(0o777 & ~_umask())
+        yield temporary
+        _sync_tree(temporary)
+        _swap(temporary, path)
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def sha256_bytes(data: bytes | memoryview) -> str:
+    """Return the SHA-256 of a byte string, in lower-case hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: str | Path) -> str:
+    """Return the SHA-256 of a file's content, in lower-case hexadecimal.
+
+    Raises:
+        InputError: the file is missing or cannot be read.
+    """
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+
+
+def canonical_json(value: object) -> bytes:
+    """Write a value as JSON whose bytes depend on the value alone.
+
+    Args:
+        value: dictionaries, lists, text, finite numbers, booleans and None.
+
+    Returns:
+        UTF-8 text with sorted keys, one-space indent and a newline at the end.
+
+    Raises:
+        ValueError: the value holds NaN or an infinity, which JSON cannot say.
+    """
+    return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The object.
+
+    Raises:
+        InputError: the file is missing, is not JSON, or holds something else than an object.
+    """
+    try:
+        text = Path(path).read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise InputError(str(path), "the file must be JSON", str(error), "Write it again from its source.") from error
+    if not isinstance(value, dict):
+        raise InputError(
+            str(path), "the file must hold one JSON object", type(value).__name__, "Write it again from its source."
+        )
+    return value
+
+
+def read_npy(path: str | Path, most: int = 1 << 28) -> NDArray[Any]:
+    """Read an array file; objects that would have to be unpickled are refused.
+
+    Args:
+        path: a ``.npy`` file.
+        most: the largest number of elements.
+
+    Returns:
+        The array, in memory.
+
+    Raises:
+        InputError: the file is missing, cut off, corrupt, an archive, too large, or holds objects.
+    """
+    rule = f"the file must be a whole .npy file of 1 to {most} plain numbers"
+    cure = "Write the file again from its source."
+    try:
+        with warnings.catch_warnings():
+            # A damaged header can look like one of an old version of Python.
+            warnings.simplefilter("ignore", UserWarning)
+            # Mapped, so that a header that promises more than the file holds asks for no memory.
+            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    # What numpy raises on a damaged header depends on where the damage is: syntax, token, type, value errors.
+    except Exception as error:
+        raise InputError(str(path), rule, str(error) or type(error).__name__, cure) from error
+    if not isinstance(mapped, np.ndarray) or not 0 < mapped.size <= most:
+        got = f"shape {mapped.shape}" if isinstance(mapped, np.ndarray) else "an archive of several arrays"
+        raise InputError(str(path), rule, got, cure)
+    return np.array(mapped)

@@ -1,0 +1,74 @@
+"""Grid: the pixel raster of a plate, and where its centre is."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+
+__all__ = ["Grid"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A raster of square pixels centred on the optical axis.
+
+    The origin lies in the middle of the raster: between two samples for an even count, on the middle
+    sample for an odd one. Row 0 is the lowest y.
+
+    Attributes:
+        shape: pixels ``(ny, nx)``.
+        pitch_m: edge of one pixel, metres.
+    """
+
+    shape: tuple[int, int]
+    pitch_m: float
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: a count below one, or a pitch that is not positive and finite.
+        """
+        ny, nx = self.shape
+        if ny < 1 or nx < 1:
+            raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
+        if not 0 < self.pitch_m < float("inf"):
+            raise InputError("grid: pitch", "must be positive and finite", self.pitch_m, "Give the pixel pitch.")
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Height and width ``(y, x)`` of the raster from edge to edge, metres."""
+        return self.shape[0] * self.pitch_m, self.shape[1] * self.pitch_m
+
+    def axis_m(self, axis: Literal["x", "y"]) -> NDArray[np.float64]:
+        """Return the pixel centres along one axis.
+
+        Args:
+            axis: ``"x"`` or ``"y"``.
+
+        Returns:
+            Coordinates ``(i - (n - 1) / 2) * pitch_m`` in metres, increasing, shape ``(n,)``.
+        """
+        n = self.shape[1] if axis == "x" else self.shape[0]
+        return (np.arange(n, dtype=np.float64) - (n - 1) / 2) * np.float64(self.pitch_m)
+
+    def inside_circle(self, diameter_m: float) -> NDArray[np.bool_]:
+        """Tell which pixels belong to a centred circle.
+
+        Args:
+            diameter_m: diameter of the circle, metres.
+
+        Returns:
+            ``[y, x]`` true where the centre of the pixel lies inside the circle or on it.
+        """
+        y_squared = self.axis_m("y") ** 2
+        x_squared = self.axis_m("x") ** 2
+        # The slack of one part in 1e12 keeps pixels whose centre is exactly on the circle.
+        limit = (diameter_m / 2) ** 2 * (1 + 1e-12)
+        inside = np.empty(self.shape, dtype=np.bool_)
+        for row, rest in enumerate(limit - y_squared):
+            np.less_equal(x_squared, rest, out=inside[row])
+        return inside

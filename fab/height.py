@@ -1,0 +1,187 @@
+"""HeightMap: the relief that a user brings, and the reader of its file.
+
+Three kinds of file are read. A bare array (.npy) of floats is metres, ``[y, x]``, row 0 at the lowest y.
+A picture (.png, .tif) is stored from the top row down, as pictures are, so it is turned: what is up in
+the picture is +y. Numbers that are not metres need a scale, the metres that one count stands for: a
+16-bit picture whose full scale 65535 means 1.2 um has the scale 1.2e-6 / 65535.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import explain_os_error, read_npy
+from fab.grid import Grid
+from fab.units import format_length
+
+__all__ = ["HeightMap", "read_height", "refuse_where", "require_heights"]
+
+# 16384 x 16384: 2 GB as float64, beyond which a plate of micrometre pixels is a mistake.
+_MOST_PIXELS = 1 << 28
+_CURE = "Write the file again from its source."
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """A relief on its raster.
+
+    Attributes:
+        height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative.
+        grid: the raster.
+        aperture_m: diameter of the clear aperture, metres.
+    """
+
+    height_m: NDArray[np.floating]
+    grid: Grid
+    aperture_m: float
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
+        """
+        if self.height_m.shape != self.grid.shape:
+            got = f"{self.height_m.shape} on {self.grid.shape}"
+            raise InputError("height map", "must have the grid's shape", got, "Use its own grid.")
+        if not 0 < self.aperture_m < float("inf"):
+            raise InputError("aperture", "must be positive and finite", self.aperture_m, "Give the diameter.")
+        require_heights(self.height_m, "height map")
+
+
+def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where: str, rule: str, cure: str) -> None:
+    """Refuse a map if any pixel breaks a rule, and say how many do and where the first is.
+
+    Args:
+        height_m: heights, metres, ``[y, x]``.
+        wrong: true where the rule is broken, same shape.
+        where: what the message starts with.
+        rule: the rule.
+        cure: what to do.
+
+    Raises:
+        InputError: some pixel is wrong.
+    """
+    count = int(np.count_nonzero(wrong))
+    if count:
+        row, column = (int(i) for i in np.unravel_index(int(np.argmax(wrong)), wrong.shape))
+        value = float(height_m[row, column])
+        shown = format_length(value) if np.isfinite(value) else str(value)
+        pixels = "1 pixel does not" if count == 1 else f"{count} pixels do not"
+        raise InputError(where, rule, f"{pixels}, the first at row {row}, column {column} ({shown})", cure)
+
+
+def require_heights(height_m: NDArray[Any], where: str) -> None:
+    """Check that an array can be a height map.
+
+    Args:
+        height_m: the array.
+        where: what the message starts with.
+
+    Raises:
+        InputError: not two-dimensional, empty, not real floats, or a height that is NaN, infinite or negative.
+    """
+    if height_m.ndim != 2 or height_m.size == 0 or height_m.dtype not in (np.float32, np.float64):
+        got = f"{height_m.dtype} of shape {height_m.shape}"
+        rule = "must be a filled two-dimensional array of float32 or float64"
+        raise InputError(where, rule, got, "Give metres, [y, x].")
+    rule = "every height must be a finite number"
+    refuse_where(height_m, ~np.isfinite(height_m), where, rule, "Fill the holes of the map.")
+    cure = "Add a constant so that the deepest floor is at 0."
+    refuse_where(height_m, height_m < 0, where, "no height may be negative", cure)
+
+
+def _load_tiff(path: Path) -> NDArray[Any]:
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        _require_size(path, file.pages[0].shape)
+        if len(file.pages) != 1:
+            raise ValueError(f"{len(file.pages)} pages")
+        return file.asarray()[::-1]
+
+
+def _load_png(path: Path) -> NDArray[Any]:
+    from PIL import Image
+
+    with Image.open(path, formats=["PNG"]) as image:
+        _require_size(path, image.size)
+        if image.mode not in ("L", "I;16", "I;16B", "I"):
+            raise ValueError(f"colours (mode {image.mode})")
+        return np.asarray(image)[::-1]
+
+
+_LOADERS = {".npy": read_npy, ".tif": _load_tiff, ".tiff": _load_tiff, ".png": _load_png}
+
+
+def _require_size(path: Path, shape: tuple[int, ...]) -> None:
+    if len(shape) != 2 or not 0 < shape[0] * shape[1] <= _MOST_PIXELS:
+        rule = f"a height map must have two axes and 1 to {_MOST_PIXELS} pixels"
+        raise InputError(str(path), rule, f"shape {shape}", "Give one plane of heights, [y, x].")
+
+
+def _load(path: Path) -> NDArray[Any]:
+    loader = _LOADERS.get(path.suffix.lower())
+    if loader is None:
+        kinds = ", ".join(sorted(_LOADERS))
+        raise InputError(str(path), f"the file must be one of {kinds}", path.suffix or "no suffix", "Convert it first.")
+    try:
+        values = loader(path)
+    except InputError:
+        raise
+    except OSError as error:
+        if error.errno is None:
+            raise InputError(str(path), "the file must be whole and of its kind", str(error), _CURE) from error
+        raise explain_os_error(error, path) from error
+    # The three libraries raise what they like on a damaged file; all of it means the same to the user.
+    except Exception as error:
+        got = str(error) or type(error).__name__
+        raise InputError(str(path), "the file must be whole and hold one array of numbers", got, _CURE) from error
+    _require_size(path, values.shape)
+    return values
+
+
+def read_height(
+    path: str | Path,
+    pitch_m: float | None = None,
+    scale_m: float | None = None,
+    aperture_m: float | None = None,
+) -> HeightMap:
+    """Read a height map that a user brings.
+
+    Args:
+        path: ``.npy`` (row 0 at the lowest y), ``.tif``, ``.tiff`` or ``.png`` (first row on top; turned).
+        pitch_m: edge of a pixel, metres. None of these files holds it, so it must be given.
+        scale_m: metres that one count of the file stands for. Floats are metres if it is left out;
+            integers, and so every PNG, need it.
+        aperture_m: diameter of the clear aperture, metres; the shorter side of the map if left out.
+
+    Returns:
+        The height map, float32 if the file holds float32 or float16, otherwise float64.
+
+    Raises:
+        InputError: the file is missing, of another kind, cut off, corrupt, too large, complex, not
+            two-dimensional, or holds NaN, infinite or negative heights; or pitch or scale is missing.
+    """
+    path = Path(path)
+    if pitch_m is None:
+        raise InputError(str(path), "the pixel pitch must be given", "none", "Add --pitch-um.")
+    values = _load(path)
+    if values.dtype.kind not in "fiu":
+        raise InputError(str(path), "heights must be real numbers", values.dtype, "Save floats in metres.")
+    if scale_m is None and values.dtype.kind != "f":
+        rule = "integers need a scale, the metres that one count stands for"
+        raise InputError(str(path), rule, f"{values.dtype} and no scale", "Give the scale.")
+    if scale_m is not None and not 0 < scale_m < float("inf"):
+        raise InputError(str(path), "the scale must be positive and finite", scale_m, "Give metres per count.")
+    narrow = values.dtype.kind == "f" and values.dtype.itemsize <= 4
+    height_m = np.ascontiguousarray(values, dtype=np.float32 if narrow else np.float64)
+    if scale_m is not None:
+        height_m *= scale_m
+    require_heights(height_m, str(path))
+    grid = Grid((height_m.shape[0], height_m.shape[1]), pitch_m)
+    return HeightMap(height_m, grid, min(grid.extent_m) if aperture_m is None else aperture_m)

@@ -1,0 +1,81 @@
+"""Bit planes: which pixels each etch mask opens, and the level map that they make together.
+
+Mask k opens a pixel of level l where bit k of ``L - 1 - l`` is 1 and etches ``2**k`` steps there, so the
+etches add up to ``(L - 1 - l)`` steps. Splitting and joining are exact inverses.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels, require_levels
+
+__all__ = ["levels_of", "planes", "unetched_outside"]
+
+
+def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
+    """Split a level map into its etch masks.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+
+    Returns:
+        ``[bit, y, x]``: 1 where mask `bit` is open (etched), 0 where resist stays.
+
+    Raises:
+        InputError: the array is not a level map of this staircase.
+    """
+    etched = np.uint8(levels.count - 1) - require_levels(level_map, levels)
+    out = np.empty((levels.bits, *etched.shape), dtype=np.uint8)
+    for bit in range(levels.bits):
+        np.bitwise_and(etched >> np.uint8(bit), np.uint8(1), out=out[bit])
+    return out
+
+
+def levels_of(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
+    """Join etch masks into the level map that they make.
+
+    Args:
+        bit_planes: ``[bit, y, x]`` of 0 and 1, one plane per mask, mask 0 first.
+        levels: the staircase.
+
+    Returns:
+        Level numbers ``[y, x]``.
+
+    Raises:
+        InputError: the number of planes is not that of the staircase, or a value is neither 0 nor 1.
+    """
+    if bit_planes.ndim != 3 or bit_planes.shape[0] != levels.bits:
+        rule = f"{levels.count} levels need {levels.bits} planes [bit, y, x]"
+        raise InputError("bit planes", rule, f"shape {bit_planes.shape}", "Give one plane per mask.")
+    if bit_planes.size and (bit_planes.min() < 0 or bit_planes.max() > 1):
+        raise InputError("bit planes", "every value must be 0 or 1", "another value", "Threshold the planes first.")
+    etched = np.zeros(bit_planes.shape[1:], dtype=np.uint8)
+    for bit in range(levels.bits):
+        etched |= bit_planes[bit].astype(np.uint8) << np.uint8(bit)
+    return np.uint8(levels.count - 1) - etched
+
+
+def unetched_outside(
+    level_map: NDArray[np.integer], levels: Levels, grid: Grid, aperture_m: float
+) -> NDArray[np.uint8]:
+    """Leave the glass blank outside the clear aperture, where chrome covers it.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        aperture_m: diameter of the clear aperture, metres.
+
+    Returns:
+        A copy with the top level at every pixel whose centre lies outside the circle.
+
+    Raises:
+        InputError: the array is not a level map of this staircase, or not of the grid's shape.
+    """
+    checked = require_levels(level_map, levels)
+    if checked.shape != grid.shape:
+        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
+    return np.where(grid.inside_circle(aperture_m), checked, np.uint8(levels.count - 1))

@@ -1,0 +1,252 @@
+"""Bitmaps as rectangles, and circles as sectors: the two shapes that masks are drawn from.
+
+A pixel plane becomes rectangles in one sweep. Every row is cut into its maximal runs of ones; a run that
+has exactly the columns of a run in the row below continues that rectangle, any other run opens a new
+one. The result covers each set pixel once and nothing else, has no holes and no polygon that touches
+itself at a corner, and is listed from the lowest row up, each row from left to right. It is not the
+smallest cover, but it is linear in the pixels, while a merge to large polygons is quadratic in their
+holes. Painting the rectangles back counts every pixel that is covered twice.
+
+A clear aperture is drawn as the annulus around it. GDSII knows neither circles nor holes, so the annulus
+is cut into equal sectors of few vertices that share their radial edges point by point.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["MAX_VERTICES", "Painted", "annulus_sectors", "doubled_area", "paint", "rectangles", "smallest_runs"]
+
+# The classic limit of 200 points per GDSII boundary counts the closing point.
+MAX_VERTICES = 199
+
+
+@njit(cache=True, nogil=True)
+def _count_runs(bitmap):  # pragma: no cover - compiled
+    runs = 0
+    for y in range(bitmap.shape[0]):
+        before = 0
+        for x in range(bitmap.shape[1]):
+            value = bitmap[y, x] != 0
+            runs += value & (before ^ 1)
+            before = value
+    return runs
+
+
+@njit(cache=True, nogil=True)
+def _sweep(bitmap, x_edges, y_edges, out):  # pragma: no cover - compiled
+    ny, nx = bitmap.shape
+    # The runs of the row below: first column, end column, and the rectangle each belongs to.
+    below = np.empty((3, nx // 2 + 2), np.int32)
+    here = np.empty((3, nx // 2 + 2), np.int32)
+    below_count = 0
+    used = 0
+    for y in range(ny):
+        count = 0
+        candidate = 0
+        x = 0
+        while x < nx:
+            if bitmap[y, x] == 0:
+                x += 1
+                continue
+            start = x
+            while x < nx and bitmap[y, x] != 0:
+                x += 1
+            while candidate < below_count and below[0, candidate] < start:
+                candidate += 1
+            if candidate < below_count and below[0, candidate] == start and below[1, candidate] == x:
+                index = below[2, candidate]
+            else:
+                index = used
+                used += 1
+                out[index, 0] = x_edges[start]
+                out[index, 1] = y_edges[y]
+                out[index, 2] = x_edges[x]
+            out[index, 3] = y_edges[y + 1]
+            here[0, count] = start
+            here[1, count] = x
+            here[2, count] = index
+            count += 1
+        below, here = here, below
+        below_count = count
+    return used
+
+
+def rectangles(
+    bitmap: NDArray[np.uint8],
+    x_edges: NDArray[np.int32] | None = None,
+    y_edges: NDArray[np.int32] | None = None,
+) -> NDArray[np.int32]:
+    """Cover the set pixels of a bitmap with disjoint rectangles.
+
+    Args:
+        bitmap: ``[y, x]``, zero or not.
+        x_edges: coordinate of each pixel edge along x, increasing, shape ``(nx + 1,)``; pixel numbers
+            if left out.
+        y_edges: the same along y, shape ``(ny + 1,)``.
+
+    Returns:
+        ``(n, 4)`` int32: x0, y0, x1, y1 of each rectangle, sorted by y0, then x0.
+    """
+    bitmap = np.ascontiguousarray(bitmap).view(np.uint8)
+    ny, nx = bitmap.shape
+    x_edges = np.arange(nx + 1, dtype=np.int32) if x_edges is None else x_edges
+    y_edges = np.arange(ny + 1, dtype=np.int32) if y_edges is None else y_edges
+    # Memory beyond the rectangles that are found is reserved but never touched.
+    out = np.empty((_count_runs(bitmap), 4), dtype=np.int32)
+    return out[: _sweep(bitmap, x_edges, y_edges, out)]
+
+
+@dataclass(frozen=True)
+class Painted:
+    """What was wrong with the rectangles of a plane; all zero for a sound one.
+
+    Attributes:
+        overlaps: how many pixels were covered again.
+        strays: rectangles with an edge off the pixel raster or outside it; they are not painted.
+        first_stray: number of the first of them, -1 if there is none.
+    """
+
+    overlaps: int
+    strays: int
+    first_stray: int
+
+
+@njit(cache=True, nogil=True)
+def _edge_number(value, edges, scale):  # pragma: no cover - compiled
+    number = int((value - edges[0]) * scale + 0.5)
+    if number < 0 or number >= edges.size or edges[number] != value:
+        return -1
+    return number
+
+
+@njit(cache=True, nogil=True)
+def _paint(rects, x_edges, y_edges, value, canvas):  # pragma: no cover - compiled
+    x_scale = (x_edges.size - 1) / (x_edges[-1] - x_edges[0])
+    y_scale = (y_edges.size - 1) / (y_edges[-1] - y_edges[0])
+    overlaps = 0
+    strays = 0
+    first = -1
+    for i in range(rects.shape[0]):
+        x0 = _edge_number(rects[i, 0], x_edges, x_scale)
+        y0 = _edge_number(rects[i, 1], y_edges, y_scale)
+        x1 = _edge_number(rects[i, 2], x_edges, x_scale)
+        y1 = _edge_number(rects[i, 3], y_edges, y_scale)
+        if x0 < 0 or y0 < 0 or x1 < 0 or y1 < 0:
+            if first < 0:
+                first = i
+            strays += 1
+            continue
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                overlaps += (canvas[y, x] & value) != 0
+                canvas[y, x] |= value
+    return overlaps, strays, first
+
+
+def paint(
+    rects: NDArray[np.int32],
+    x_edges: NDArray[np.int32],
+    y_edges: NDArray[np.int32],
+    bit: int,
+    canvas: NDArray[np.uint8],
+) -> Painted:
+    """Paint the rectangles of one plane back onto the pixel raster they were made from.
+
+    Args:
+        rects: ``(n, 4)``: x0, y0, x1, y1, in the units of the edges.
+        x_edges: coordinate of each pixel edge along x, increasing and even to half a pixel, ``(nx + 1,)``.
+        y_edges: the same along y, ``(ny + 1,)``.
+        bit: which bit of the canvas the plane is, 0 to 7; a pixel where it is set counts as covered.
+        canvas: ``[y, x]``, changed in place: the bit is set wherever a rectangle lies.
+
+    Returns:
+        What was wrong with the rectangles.
+    """
+    overlaps, strays, first = _paint(rects, x_edges, y_edges, np.uint8(1 << bit), canvas)
+    return Painted(int(overlaps), int(strays), int(first))
+
+
+@njit(cache=True, nogil=True)
+def _smallest_runs(bitmap, none):  # pragma: no cover - compiled
+    width = space = none
+    for y in range(bitmap.shape[0]):
+        start = 0
+        for x in range(1, bitmap.shape[1] + 1):
+            if x < bitmap.shape[1] and (bitmap[y, x] != 0) == (bitmap[y, x - 1] != 0):
+                continue
+            if bitmap[y, x - 1] != 0:
+                width = min(width, x - start)
+            elif start > 0 and x < bitmap.shape[1]:
+                space = min(space, x - start)
+            start = x
+        if width == 1 and space == 1:
+            break
+    return width, space
+
+
+def smallest_runs(bitmap: NDArray[np.uint8]) -> tuple[int | None, int | None]:
+    """Return the narrowest line and the narrowest gap of a plane, along x or y.
+
+    Args:
+        bitmap: ``[y, x]``, zero or not.
+
+    Returns:
+        The shortest run of set pixels, and the shortest run of clear pixels between two set ones, in
+        pixels; None where there is no such run.
+    """
+    none = max(bitmap.shape) + 1
+    lines = (np.ascontiguousarray(bitmap), np.ascontiguousarray(bitmap.T))
+    width, space = (min(pair) for pair in zip(*(_smallest_runs(line, none) for line in lines), strict=True))
+    return (width if width < none else None), (space if space < none else None)
+
+
+def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[np.int32]]:
+    """Draw the annulus between two centred circles as sectors without holes.
+
+    The vertices lie on the circles (rounded to whole units) and the chords inside them, so the opening is
+    smaller than the circle by at most the chord error. The number of sectors is a multiple of four.
+
+    Args:
+        inner: radius of the opening, in database units.
+        outer: outer radius, in database units.
+        chord_error: largest distance between a circle and its chords, in database units.
+
+    Returns:
+        One ``(v, 2)`` int32 polygon of x, y per sector, counter-clockwise from angle 0, at most
+        `MAX_VERTICES` vertices each.
+
+    Raises:
+        ValueError: the radii are not ``0 < inner < outer`` or the chord error is not positive.
+    """
+    if not 0 < inner < outer or not chord_error > 0:
+        raise ValueError(f"need 0 < inner < outer and chord_error > 0, but got {inner}, {outer}, {chord_error}")
+    # A chord that spans the angle a leaves the sagitta r (1 - cos(a / 2)); the outer circle decides.
+    half = math.acos(max(0.0, 1 - chord_error / outer))
+    steps = math.ceil(math.pi / half)
+    sectors = 4 * math.ceil(steps / (4 * (MAX_VERTICES // 2 - 1)))
+    per_sector = math.ceil(steps / sectors)
+    angle = np.arange(sectors * per_sector + 1) * (2 * math.pi / (sectors * per_sector))
+    angle[-1] = 0.0
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    near, far = (np.rint(radius * circle).astype(np.int32) for radius in (inner, outer))
+    starts = range(0, sectors * per_sector, per_sector)
+    return [np.concatenate([far[s : s + per_sector + 1], near[s : s + per_sector + 1][::-1]]) for s in starts]
+
+
+def doubled_area(polygon: NDArray[np.integer]) -> int:
+    """Return twice the signed area of a polygon, exactly.
+
+    Args:
+        polygon: ``(v, 2)`` integer vertices, not closed.
+
+    Returns:
+        Twice the area in squared units; positive for counter-clockwise.
+    """
+    x, y = polygon.astype(np.int64).T
+    # Differences from the first vertex keep the products far from the limits of int64.
+    x, y = x - x[0], y - y[0]
+    return int(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))

@@ -1,0 +1,178 @@
+"""The second opinion: mask files read by a library that had no part in writing them.
+
+Everything here rests on gdstk and numpy alone and shares no code with the writer, the reader or the
+painter of this package: a mistake in those cannot hide itself. Rectangles are counted into a winding
+number per pixel by a difference array and two running sums; a sound plane has 0 and 1 only.
+
+OASIS keeps repeated shapes folded. They are unfolded here by the library's own list of offsets; reading
+the polygons alone would silently miss most of a mask.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import gdstk
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.layout import Layer, PixelEdges
+from fab.units import UM
+
+__all__ = ["Reading", "read_gds_again", "read_oasis_again"]
+
+# The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
+_MOST_AT_ONCE = 2_200_000
+_BATCH = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One layer as the other library sees it.
+
+    Attributes:
+        layer: the layer.
+        winding: ``[y, x]`` int32, how many rectangles cover each pixel.
+        strays: four-point shapes that are no rectangle on the pixel raster; they are not counted in.
+        polygons: shapes with any other number of points, ``(v, 2)`` int64 in database units.
+    """
+
+    layer: Layer
+    winding: NDArray[np.int32]
+    strays: int
+    polygons: list[NDArray[np.int64]]
+
+
+def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    count = edges.size - 1
+    guess = np.rint((values - edges[0]) * (count / (int(edges[-1]) - int(edges[0])))).astype(np.int64)
+    numbers = np.clip(guess, 0, count)
+    return numbers, edges[numbers] == values
+
+
+class _Counter:
+    """Collects the shapes of one layer."""
+
+    def __init__(self, layer: Layer, edges: PixelEdges) -> None:
+        self.layer = layer
+        self.edges = edges
+        self.steps = np.zeros(edges.y.size * edges.x.size, dtype=np.int32)
+        self.strays = 0
+        self.polygons: list[NDArray[np.int64]] = []
+
+    def add(self, points_um: NDArray[np.float64]) -> None:
+        """Take shapes of equal size, ``(n, v, 2)``."""
+        points = np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
+        if points.shape[1] != 4:
+            self.polygons.extend(points)
+            return
+        # The long axis last: numpy is slow along axes of four.
+        x, y = np.ascontiguousarray(points.transpose(2, 1, 0))
+        # Every side runs along one axis; with a box that is not flat, that leaves only rectangles.
+        along = (np.roll(x, -1, axis=0) == x) != (np.roll(y, -1, axis=0) == y)
+        (x0, x0_found), (x1, x1_found) = (_edge_numbers(v, self.edges.x) for v in (x.min(axis=0), x.max(axis=0)))
+        (y0, y0_found), (y1, y1_found) = (_edge_numbers(v, self.edges.y) for v in (y.min(axis=0), y.max(axis=0)))
+        sound = along.all(axis=0) & x0_found & x1_found & y0_found & y1_found & (x0 < x1) & (y0 < y1)
+        self.strays += int(np.count_nonzero(~sound))
+        x0, x1, y0, y1 = (numbers[sound] for numbers in (x0, x1, y0, y1))
+        width = self.edges.x.size
+        for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
+            np.add.at(self.steps, rows * width + columns, np.int32(step))
+
+    def reading(self) -> Reading:
+        """Sum the steps up, in place."""
+        winding = self.steps.reshape(self.edges.y.size, self.edges.x.size)
+        np.add.accumulate(winding, axis=0, out=winding)
+        np.add.accumulate(winding, axis=1, out=winding)
+        return Reading(self.layer, winding[:-1, :-1], self.strays, self.polygons)
+
+
+def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
+    """Cut a list of library polygons where layer or number of points changes, and into batches."""
+    # Attributes are fetched without a loop in Python, which would take most of the time.
+    layers, datatypes, sizes = (
+        np.fromiter(map(attrgetter(name), polygons), dtype=np.int64, count=len(polygons))
+        for name in ("layer", "datatype", "size")
+    )
+    changes = (np.diff(layers) != 0) | (np.diff(datatypes) != 0) | (np.diff(sizes) != 0)
+    cuts = {0, len(polygons), *range(0, len(polygons), _BATCH)}
+    cuts.update((np.flatnonzero(changes) + 1).tolist())
+    bounds = sorted(cuts) if polygons else []
+    for start, end in pairwise(bounds):
+        first = polygons[start]
+        yield Layer(first.layer, first.datatype), first.size, polygons[start:end]
+
+
+def _joined(polygons: list[Any], size: int) -> NDArray[np.float64]:
+    return np.frombuffer(b"".join([p.points for p in polygons]), dtype=np.float64).reshape(-1, size, 2)
+
+
+def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
+    """Yield the points of polygons with one copy per repetition, in batches."""
+    origin = np.zeros((1, 2))
+    offsets = [polygon.repetition.get_offsets() if polygon.repetition.size else origin for polygon in polygons]
+    owners = np.repeat(np.arange(len(polygons)), [len(copies) for copies in offsets])
+    shifts = np.concatenate(offsets)
+    points_um = _joined(polygons, size)
+    for start in range(0, len(owners), _BATCH):
+        part = slice(start, start + _BATCH)
+        yield points_um[owners[part]] + shifts[part, None, :]
+
+
+def read_gds_again(path: str | Path, layers: Mapping[Layer, int], edges: PixelEdges) -> Iterator[Reading]:
+    """Read layers of a GDSII file of one cell with gdstk, few enough at a time to bound the memory.
+
+    The file must be sound as a stream of records: the library is not safe against broken ones, so this
+    package's own reader goes first.
+
+    Args:
+        path: the file.
+        layers: the layers to read, with the number of shapes expected on each.
+        edges: the pixel raster.
+
+    Yields:
+        One reading per layer, in the order given.
+    """
+    waiting = list(layers)
+    while waiting:
+        group = [waiting.pop(0)]
+        while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
+            group.append(waiting.pop(0))
+        counters = {layer: _Counter(layer, edges) for layer in group}
+        wanted = {(layer.number, layer.datatype) for layer in group}
+        cells: list[Any] = gdstk.read_gds(str(path), unit=UM, filter=wanted).cells
+        for cell in cells:
+            for layer, size, polygons in _runs(cell.polygons):
+                counters[layer].add(_joined(polygons, size))
+        for layer in group:
+            yield counters.pop(layer).reading()
+
+
+def read_oasis_again(path: str | Path, layers: list[Layer], edges: PixelEdges) -> tuple[list[Reading], list[str]]:
+    """Read an OASIS file with gdstk and unfold its repetitions.
+
+    Args:
+        path: the file, known to be whole.
+        layers: the layers that it should hold.
+        edges: the pixel raster.
+
+    Returns:
+        One reading per layer, in the order given; and one sentence per thing that should not be in the
+        file (a second cell, references, labels, paths, other layers).
+    """
+    cells: list[Any] = gdstk.read_oas(str(path), unit=UM).cells
+    counters = {layer: _Counter(layer, edges) for layer in layers}
+    problems = [] if len(cells) == 1 else [f"it holds {len(cells)} cells instead of one"]
+    for cell in cells:
+        if cell.references or cell.labels or cell.paths:
+            problems.append(f"cell {cell.name} holds references, labels or paths")
+        for layer, size, polygons in _runs(cell.polygons):
+            if layer not in counters:
+                problems.append(f"layer {layer} holds shapes that should not be there")
+                continue
+            for points_um in _unfolded(polygons, size):
+                counters[layer].add(points_um)
+    return [counters[layer].reading() for layer in layers], problems

@@ -1,0 +1,100 @@
+"""The border between human units and SI: text such as "75 nm" in, metres out, and back.
+
+Inside the packages every number is SI and carries its unit in its name; only specs, the command line,
+pictures and file metadata speak of nanometres. Text is parsed by pint, which is slow to import and is
+therefore loaded on the first use.
+"""
+
+import math
+import re
+from functools import cache
+from typing import Any
+
+__all__ = ["MM", "NM", "UM", "format_length", "parse_angle", "parse_length"]
+
+NM = 1e-9
+UM = 1e-6
+MM = 1e-3
+
+_LENGTH_STEPS = ((1.0, "m"), (MM, "mm"), (UM, "um"), (NM, "nm"))
+
+
+# One number and one unit, so that no text is ever evaluated as an expression.
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_]+|\N{DEGREE SIGN})\s*")
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry(cache_folder=None)
+
+
+def _parse(text: object, unit: str, example: str) -> float:
+    found = _QUANTITY.fullmatch(text) if isinstance(text, str) else None
+    problem = f'must be a number with a unit such as "{example}", but got {text!r}'
+    if found is None:
+        raise ValueError(problem)
+    import pint
+
+    registry = _registry()
+    try:
+        quantity = registry.Quantity(float(found[1]), registry.parse_units(found[2]))
+        # By base unit, not by dimension: pint calls percent and steradian dimensionless, like the radian.
+        if quantity.to_base_units().units != registry.Unit(unit):
+            raise ValueError(problem)
+        value: Any = quantity.m_as(unit)
+    except (pint.errors.PintError, AttributeError) as error:
+        raise ValueError(problem) from error
+    if not math.isfinite(value):
+        raise ValueError(f'must be finite, such as "{example}", but got {text!r}')
+    # 75 * 1e-9 is 7.500000000000001e-08; fifteen digits give back the number that was meant.
+    return float(f"{value:.15g}")
+
+
+def parse_length(text: str) -> float:
+    """Turn a length with its unit into metres.
+
+    Args:
+        text: for example ``"75 nm"``, ``"1.85um"``, ``"0.4 m"``.
+
+    Returns:
+        The length in metres.
+
+    Raises:
+        ValueError: no unit, a unit that is not a length, or no finite number; the text says so and
+            gives an example, ready to stand behind a file and a key.
+    """
+    return _parse(text, "m", "75 nm")
+
+
+def parse_angle(text: str) -> float:
+    """Turn an angle with its unit into radians.
+
+    Args:
+        text: for example ``"2 deg"``, ``"5 mrad"``, ``"0.1 rad"``.
+
+    Returns:
+        The angle in radians.
+
+    Raises:
+        ValueError: no unit, a unit that is not an angle, or no finite number.
+    """
+    return _parse(text, "rad", "2 deg")
+
+
+def format_length(length_m: float) -> str:
+    """Write a length in the largest unit of m, mm, um, nm that leaves at least one whole unit.
+
+    Args:
+        length_m: the length in metres; any sign.
+
+    Returns:
+        Text such as ``"75 nm"`` or ``"4.44 mm"``, ASCII only and exact to twelve digits, which
+        `parse_length` reads back.
+    """
+    size = abs(length_m)
+    for unit_m, name in _LENGTH_STEPS:
+        if size >= unit_m * (1 - 1e-12):
+            return f"{length_m / unit_m:.12g} {name}"
+    return f"{length_m / NM:.12g} nm"

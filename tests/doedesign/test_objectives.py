@@ -1,0 +1,108 @@
+"""Objectives against PSFs whose value is known."""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from doedesign.objectives import View, far_spot, handcrafted, near_spread, terms_of, window_loss
+from doedesign.patterns import target_pattern_image
+from doedesign.spec import load_spec
+from fab.errors import InputError
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+from sim.metrics import participation
+from sim.psf import psf_bank
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CAMERA = Camera(
+    Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64
+)
+
+
+def view(near: np.ndarray, far: np.ndarray, lens: float = 1.0) -> View:
+    return View(jnp.asarray(near)[None, None], jnp.asarray(far)[None, None], jnp.full((1, 1), lens), CAMERA)
+
+
+def even() -> np.ndarray:
+    return np.full((64, 64), 1 / 64**2, np.float32)
+
+
+def point() -> np.ndarray:
+    image = np.zeros((64, 64), np.float32)
+    image[31:33, 31:33] = 0.25
+    return image
+
+
+def test_far_spot_is_the_light_that_misses() -> None:
+    assert float(far_spot(view(even(), point()))) == pytest.approx(0.0, abs=1e-6)
+    assert float(far_spot(view(even(), 0.3 * point()))) == pytest.approx(0.7, abs=1e-6)
+
+
+def test_near_spread_is_one_for_the_plain_lens() -> None:
+    bank = psf_bank(CAMERA, np.zeros((64, 64)), [0.05])
+    lens = float(participation(jnp.asarray(bank.energy[0, 0])))
+    assert float(near_spread(view(bank.energy[0, 0], point(), lens))) == pytest.approx(1.0, rel=1e-6)
+    assert float(near_spread(view(even(), point(), lens))) == pytest.approx(1 / 64**2 / lens, rel=1e-5)
+
+
+def test_coherent_light_obeys_its_bound() -> None:
+    # A fraction s of the field passes undiffracted; the near PSF keeps s times the lens's disc, hence s² of its square.
+    bank = psf_bank(CAMERA, np.zeros((64, 64)), [0.05]).energy[0, 0]
+    lens = float(participation(jnp.asarray(bank)))
+    s = 0.4
+    assert float(near_spread(view(s * bank, point(), lens))) == pytest.approx(s**2, rel=1e-5)
+
+
+def test_window_loss_counts_what_is_not_there() -> None:
+    assert float(window_loss(view(0.5 * even(), point()))) == pytest.approx(0.25, abs=1e-6)
+
+
+def test_handcrafted_is_zero_at_its_targets() -> None:
+    from doedesign.objectives import spot_weights
+
+    spots = spot_weights(CAMERA)[0]
+    assert float(handcrafted(view(even(), spots / spots.sum()))) == pytest.approx(0.0, abs=1e-5)
+    assert float(handcrafted(view(point(), even()))) > 1.0
+
+
+def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:
+    spec = load_spec(EXAMPLES / "beam_splitter.toml")
+    from doedesign.build import camera_of
+
+    camera = camera_of(spec)
+    (term,) = terms_of(spec, camera, {})
+    target = target_pattern_image(camera, dict(spec.objectives[0].options), None, "objective")
+    assert target.sum() == pytest.approx(1.0, abs=1e-5)
+    images = View(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
+    assert float(term.value(images)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("users_objectives")
+    module.dark_centre = lambda view, *, power=1.0: jnp.mean(view.near) ** power  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "users_objectives", module)
+    overrides = ["objective.0.name=users_objectives:dark_centre", "objective.0.options.power=2.0"]
+    spec = load_spec(EXAMPLES / "quick.toml", overrides)
+    term = terms_of(spec, CAMERA, {})[0]
+    assert float(term.value(view(even(), point()))) == pytest.approx(1 / 64**4, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["objective.0.name=no_such_module:f"], "importable module:function"),
+        (["objective.0.name=math:no_such_function"], "importable module:function"),
+        (["objective.0.name=math:pi"], "must be a function"),
+        (["objective.0.options.radius=3"], "must be options of far_spot"),
+        (["objective.0.name=target_pattern", "objective.0.options.pattern=hexagon"], "must be one of spots"),
+        (["objective.0.name=target_pattern", "objective.0.options.pattern=square"], "must be a length"),
+    ],
+)
+def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", overrides)
+    with pytest.raises(InputError, match=words):
+        terms_of(spec, CAMERA, {})

@@ -1,0 +1,90 @@
+"""The optimisation loop: right gradients, falling loss, and the same bytes however often it was interrupted."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from doedesign.optimize import State, finished_design, initial_state, steps
+from doedesign.problem import losses, problem_of, view_of
+from doedesign.spec import Spec, load_spec
+from fab.levels import quantise
+from sim.hankel import radial_profile
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SMALL = ["doe.samples=128", "doe.aperture=0.2368 mm", "sensor.window=96", "optimize.steps=12"]
+
+
+def unread(path: Path) -> np.ndarray:
+    raise AssertionError(path)
+
+
+def run(spec: Spec, start: State | None = None, stop: int | None = None) -> tuple[State, list[float]]:
+    problem, scene = problem_of(spec, {})
+    state = start or initial_state(spec, problem, scene, {}, unread)
+    history = []
+    for state, record in steps(spec, problem, scene, state):
+        history.append(record.loss)
+        if state.step == stop:
+            break
+    return jax.tree.map(np.asarray, state), history
+
+
+@pytest.mark.parametrize("parametrization", ["freeform", "radial"])
+@pytest.mark.parametrize("quantisation", ["straight_through", "annealed", "none"])
+def test_loss_falls(parametrization: str, quantisation: str) -> None:
+    overrides = [*SMALL, f"optimize.parametrization={parametrization}", f"optimize.quantisation={quantisation}"]
+    _, history = run(load_spec(EXAMPLES / "quick.toml", [*overrides, "optimize.steps=30"]))
+    # The mean over rounds of depths, so that a hard depth is not held against a step.
+    assert np.mean(history[-6:]) < np.mean(history[:6])
+
+
+@pytest.mark.parametrize("parametrization", ["freeform", "radial"])
+def test_gradient_of_the_whole_chain(parametrization: str) -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, f"optimize.parametrization={parametrization}"])
+    problem, scene = problem_of(spec, {})
+    state = initial_state(spec, problem, scene, {}, unread)
+    look = scene.look(0, 0)
+
+    def loss(radians: jax.Array) -> jax.Array:
+        height = radians * problem.staircase.metres_per_radian  # no wrap: it has no derivative
+        return losses(problem, view_of(problem, height, look))[0]
+
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=state.radians.shape), jnp.float32)
+    slope = float(jnp.vdot(jax.grad(loss)(state.radians), direction))
+    step = 3e-3
+    difference = float(loss(state.radians + step * direction) - loss(state.radians - step * direction)) / (2 * step)
+    # Central differences in float32: rounding 1e-7 / 6e-3 = 2e-5 of the loss, curvature of the same order.
+    assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
+
+
+def test_resumed_run_has_the_same_bits() -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    whole, history = run(spec)
+    half, first = run(spec, stop=5)
+    resumed, second = run(spec, start=jax.tree.map(jnp.asarray, half)._replace(step=5))
+    assert first + second == history
+    assert np.array_equal(whole.radians, resumed.radians)
+
+
+def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.parametrization=radial", "optimize.steps=2"])
+    problem, scene = problem_of(spec, {})
+    design = finished_design(spec, problem, initial_state(spec, problem, scene, {}, unread))
+    level = quantise(design.drawn_m, problem.staircase.levels)
+    np.testing.assert_allclose(design.drawn_m, level * 75e-9, rtol=1e-6)
+    assert radial_profile(design.continuous_m, problem.camera.grid) is not None
+
+
+def test_looks_see_every_depth_equally_often() -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    _, scene = problem_of(spec, {})
+    seen = [scene.look(7, step).near[0][0] for step in range(6)]
+    counts = [sum(one is source for one in seen) for source in scene.near[0]]
+    assert counts == [2, 2, 2]
+    offsets = np.array([scene.look(7, step).offset_m for step in range(200)])
+    assert np.abs(offsets).max() <= spec.sensor.pixel_m / 2
+    # The mean of 200 uniform numbers of half-width 1/2 pixel is within 4 sigma = 4 x 0.29 / sqrt(200) = 8 % of a pixel.
+    assert np.abs(offsets.mean(axis=0)).max() < 0.08 * spec.sensor.pixel_m

@@ -1,0 +1,97 @@
+"""Baseline designs: each has a closed form to meet."""
+
+import numpy as np
+import pytest
+
+from doedesign.starts import flat, lens, random, ring, ring_period_m, start_heights
+from fab.errors import InputError
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+from sim.hankel import ring_count
+from sim.material import full_wave_height_m
+from sim.metrics import energy_within, radius_map_m, spot_radius_m, zeroth_order
+from sim.psf import psf_bank
+
+GREEN = 550e-9
+CAMERA = Camera(
+    Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201
+)
+
+
+@pytest.mark.parametrize("far_energy", [0.0, 0.25, 0.6, 1.0])
+def test_ring_keeps_the_asked_share_in_the_0th_order(far_energy: float) -> None:
+    height = ring(CAMERA, False, GREEN, far_energy, 16e-6)
+    # Eight cells per period: the raster's area shares differ from one half by about 1 %.
+    assert zeroth_order(CAMERA, height, GREEN) == pytest.approx(far_energy, abs=0.01)
+
+
+def test_ring_has_the_radius_of_its_grating_order() -> None:
+    period = 16e-6
+    height = ring(CAMERA, False, GREEN, 0.0, period)
+    psf = psf_bank(CAMERA, height, [np.inf]).energy[0, 0]
+    radius = radius_map_m(psf.shape, CAMERA.pixel_m)
+    profile = [psf[(radius >= r) & (radius < r + 4e-6)].sum() for r in np.arange(0, 240e-6, 4e-6)]
+    # lambda f / period = 137.5 um; bins of one pixel.
+    assert np.arange(0, 240e-6, 4e-6)[int(np.argmax(profile))] == pytest.approx(GREEN * 4e-3 / period, abs=6e-6)
+
+
+def test_ring_period_fits_every_colour_in_the_window() -> None:
+    reach = CAMERA.window * CAMERA.pixel_m / 2
+    assert GREEN * CAMERA.focal_length_m / ring_period_m(CAMERA) < reach
+
+
+def test_lens_moves_the_focus() -> None:
+    # A plate of power 1/z images a source at depth z onto the sensor: its near PSF is then the far PSF of a flat one.
+    depth = 0.2
+    height = lens(CAMERA, False, GREEN, 1 / depth)
+    passed = CAMERA.transmission(GREEN)
+    spot = spot_radius_m(CAMERA, GREEN)
+    sharp = energy_within(psf_bank(CAMERA, height, [depth]).energy[0, 0], CAMERA.pixel_m, spot)
+    ideal = energy_within(psf_bank(CAMERA, flat(CAMERA, False), [np.inf]).energy[0, 0], CAMERA.pixel_m, spot)
+    # The plate is continuous, so only the curvature beyond the paraxial sphere and the cells' sinc² cost light.
+    assert sharp / passed > 0.97 * ideal / passed
+
+
+def test_random_is_seeded_and_uniform_over_one_wave() -> None:
+    height = random(CAMERA, False, GREEN, 3, 4e-6)
+    assert np.array_equal(height, random(CAMERA, False, GREEN, 3, 4e-6))
+    assert np.array_equal(height[::2, ::2], height[1::2, 1::2])
+    wave = full_wave_height_m("fused_silica", GREEN)
+    # 40 000 independent squares: the mean of a uniform distribution is known to 0.3 / sqrt(40000) = 0.15 %.
+    assert height.mean() / wave == pytest.approx(0.5, abs=0.006)
+
+
+def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
+    depth = 0.2
+
+    def judge(height: np.ndarray) -> float:
+        psf = psf_bank(CAMERA, height, [depth], sampling=1.0).energy[0, 0]
+        return -energy_within(psf, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
+
+    options = {"evaluations": 45}
+    found = start_heights(
+        "fresnel", options, CAMERA, radial=False, wavelength_m=GREEN, seed=0, judge=judge
+    )
+    ideal = lens(CAMERA, False, GREEN, 1 / depth)
+    # Half of the best possible spot energy is inside the main lobe of the search landscape.
+    assert judge(found) < 0.9 * judge(ideal) < 0
+
+
+@pytest.mark.parametrize("name", ["flat", "random", "ring"])
+def test_radial_starts_are_profiles(name: str) -> None:
+    found = start_heights(name, {}, CAMERA, radial=True, wavelength_m=GREEN, seed=1, judge=lambda _: 0.0)
+    assert found.shape == (ring_count(CAMERA),)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("flat", {"period": "5 um"}, "none"),
+        ("ring", {"far_energy": 1.5}, "from 0 to 1"),
+        ("ring", {"period": "five"}, "must be a length"),
+        ("random", {"feature": "-1 um"}, "must be positive"),
+    ],
+)
+def test_wrong_options_are_named(name: str, options: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        start_heights(name, options, CAMERA, radial=False, wavelength_m=GREEN, seed=1, judge=lambda _: 0.0)

@@ -1,0 +1,43 @@
+"""One small mask order, written once and copied where a test wants to damage it."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fab.grid import Grid
+from fab.levels import Levels
+from fab.order import write_order
+from fab.units import NM, UM
+
+# Odd and even sides, and a pitch whose half is a whole number of nanometres, as in the automotive design.
+SHAPE = (21, 16)
+
+
+@pytest.fixture(scope="session")
+def levels() -> Levels:
+    return Levels(16, 75 * NM)
+
+
+@pytest.fixture(scope="session")
+def grid() -> Grid:
+    return Grid(SHAPE, 1.85 * UM)
+
+
+@pytest.fixture(scope="session")
+def level_map() -> np.ndarray:
+    return np.random.default_rng(7).integers(0, 16, SHAPE).astype(np.uint8)
+
+
+@pytest.fixture(scope="session")
+def written_order(tmp_path_factory, level_map, levels, grid) -> Path:
+    folder = tmp_path_factory.mktemp("orders") / "small"
+    write_order(folder, level_map, levels, grid, grid.extent_m[1], "small", {"height_map": "a test"})
+    return folder
+
+
+@pytest.fixture
+def order_folder(written_order, tmp_path) -> Path:
+    """A copy of the order that a test may damage."""
+    return Path(shutil.copytree(written_order, tmp_path / "order"))

@@ -1,0 +1,203 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fab.errors import CheckFailed, InputError
+from fab.files import (
+    atomic_folder,
+    canonical_json,
+    read_json,
+    read_npy,
+    sha256_bytes,
+    sha256_file,
+    write_atomic,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_input_error_names_place_rule_value_and_cure():
+    error = InputError("spec.toml: levels", "must be a power of two", 12, "Choose 8 or 16.")
+    assert str(error) == "spec.toml: levels: must be a power of two, but got 12. Choose 8 or 16."
+    assert isinstance(error, ValueError)
+
+
+def test_check_failed_lists_its_differences():
+    error = CheckFailed(["a.gds: one", "b.gds: two"])
+    assert error.differences == ("a.gds: one", "b.gds: two")
+    assert str(error) == "a.gds: one\nb.gds: two"
+
+
+def test_write_atomic_replaces_the_file_and_leaves_nothing_else(tmp_path):
+    path = tmp_path / "deep" / "file.bin"
+    write_atomic(path, b"old")
+    write_atomic(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert [p.name for p in path.parent.iterdir()] == ["file.bin"]
+
+
+def test_write_atomic_keeps_the_old_content_when_the_new_cannot_be_written(tmp_path, monkeypatch):
+    path = tmp_path / "file.bin"
+    write_atomic(path, b"old")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="must have room"):
+        write_atomic(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file.bin"]
+
+
+def test_a_path_under_a_file_is_refused_by_name(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"file/out"):
+        write_atomic(tmp_path / "file" / "out.bin", b"")
+    with pytest.raises(InputError, match=r"file/out"), atomic_folder(tmp_path / "file" / "out"):
+        pass
+
+
+def test_a_folder_that_may_not_be_written_is_refused(tmp_path):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match="must be writable"), atomic_folder(tmp_path / "out"):
+        pass
+
+
+def test_a_folder_appears_whole(tmp_path):
+    path = tmp_path / "a" / "out"
+    with atomic_folder(path) as fresh:
+        (fresh / "x.txt").write_text("1")
+        (fresh / "sub").mkdir()
+        (fresh / "sub" / "y.txt").write_text("2")
+        assert not path.exists()
+    assert (path / "sub" / "y.txt").read_text() == "2"
+    assert [p.name for p in path.parent.iterdir()] == ["out"]
+
+
+def test_an_exception_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "out") as fresh:
+        (fresh / "x.txt").write_text("1")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_earlier_result_is_replaced_only_at_the_end(tmp_path):
+    path = tmp_path / "out"
+    with atomic_folder(path) as fresh:
+        (fresh / "manifest.json").write_text("{}")
+        (fresh / "old.txt").write_text("old")
+    with pytest.raises(RuntimeError), atomic_folder(path) as fresh:
+        (fresh / "new.txt").write_text("new")
+        raise RuntimeError
+    assert (path / "old.txt").exists()
+    with atomic_folder(path) as fresh:
+        (fresh / "new.txt").write_text("new")
+    assert [p.name for p in path.iterdir()] == ["new.txt"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_foreign_content_is_refused_and_kept(tmp_path):
+    path = tmp_path / "out"
+    path.mkdir()
+    (path / "thesis.tex").write_text("precious")
+    with pytest.raises(InputError, match=r"thesis\.tex"), atomic_folder(path):
+        pass
+    assert (path / "thesis.tex").read_text() == "precious"
+    with pytest.raises(InputError, match="must be a folder"), atomic_folder(path / "thesis.tex"):
+        pass
+
+
+def test_an_empty_folder_may_be_filled(tmp_path):
+    (tmp_path / "out").mkdir()
+    with atomic_folder(tmp_path / "out") as fresh:
+        (fresh / "x").write_text("1")
+    assert (tmp_path / "out" / "x").exists()
+
+
+def test_a_kill_in_the_middle_leaves_nothing_at_the_final_path(tmp_path):
+    code = f"""
+        import os, signal
+        from fab.files import atomic_folder
+        with atomic_folder({str(tmp_path / "out")!r}) as fresh:
+            (fresh / "x.txt").write_text("1")
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "out").exists()
+
+
+def test_digests_agree(tmp_path):
+    (tmp_path / "x").write_bytes(b"abc")
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert sha256_file(tmp_path / "x") == sha256_bytes(b"abc") == known
+    with pytest.raises(InputError, match="must exist"):
+        sha256_file(tmp_path / "missing")
+
+
+def test_canonical_json_depends_on_the_value_alone():
+    data = canonical_json({"b": 1, "a": [1.5, None, "µ"]})
+    assert data == canonical_json({"a": [1.5, None, "µ"], "b": 1})
+    assert data.endswith(b"\n")
+    assert json.loads(data) == {"a": [1.5, None, "µ"], "b": 1}
+    with pytest.raises(ValueError, match="JSON"):
+        canonical_json({"x": float("nan")})
+
+
+@pytest.mark.parametrize("content", [b"{", b"[1]", b"\xff\xfe", b""])
+def test_read_json_refuses_what_is_no_object(tmp_path, content):
+    path = tmp_path / "manifest.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        read_json(path)
+    with pytest.raises(InputError, match="must exist"):
+        read_json(tmp_path / "missing.json")
+
+
+def test_read_npy_round_trip(tmp_path):
+    values = np.arange(6, dtype=np.float32).reshape(2, 3)
+    np.save(tmp_path / "a.npy", values)
+    assert np.array_equal(read_npy(tmp_path / "a.npy"), values)
+    with pytest.raises(InputError, match="plain numbers"):
+        read_npy(tmp_path / "a.npy", most=5)
+
+
+def test_read_npy_loads_no_pickle(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([print, None], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match=r"a\.npy"):
+        read_npy(tmp_path / "a.npy")
+
+
+def test_read_npy_refuses_archives_and_ruins(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    np.save(tmp_path / "b.npy", np.zeros((4, 4)))
+    whole = (tmp_path / "b.npy").read_bytes()
+    (tmp_path / "cut.npy").write_bytes(whole[:-1])
+    (tmp_path / "empty.npy").write_bytes(b"")
+    (tmp_path / "huge.npy").write_bytes(whole.replace(b"(4, 4)", b"(9999999999, 9999999999)").replace(b" " * 20, b"", 1))
+    for name in ("a.npz", "cut.npy", "empty.npy", "huge.npy", "missing.npy"):
+        with pytest.raises(InputError, match=name):
+            read_npy(tmp_path / name)
+
+
+def test_read_npy_survives_any_flipped_header_byte(tmp_path):
+    np.save(tmp_path / "b.npy", np.zeros((4, 4)))
+    whole = (tmp_path / "b.npy").read_bytes()
+    for position in range(128):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0x08
+        (tmp_path / "d.npy").write_bytes(damaged)
+        try:
+            read_npy(tmp_path / "d.npy")
+        except InputError as error:
+            assert "d.npy" in str(error)

@@ -1,0 +1,64 @@
+import json
+
+import pytest
+
+from fab.errors import InputError
+from fab.files import canonical_json, sha256_bytes
+from fab.manifest import read_manifest
+
+
+def rewrite(folder, change):
+    """Change the manifest and sign it again, as a careless tool would."""
+    path = folder / "manifest.json"
+    data = json.loads(path.read_bytes())
+    del data["sha256"]
+    change(data)
+    path.write_bytes(canonical_json({**data, "sha256": sha256_bytes(canonical_json(data))}))
+
+
+def test_it_reads_back_to_the_same_bytes(written_order):
+    assert read_manifest(written_order).to_json() == (written_order / "manifest.json").read_bytes()
+
+
+def test_it_knows_its_staircase_raster_and_aperture(written_order, levels, grid):
+    manifest = read_manifest(written_order)
+    assert manifest.staircase() == levels
+    assert manifest.grid() == grid
+    assert manifest.aperture_m == pytest.approx(grid.extent_m[1], rel=1e-12)
+    assert manifest.source == {"height_map": "a test"}
+
+
+def test_any_change_by_hand_is_noticed(order_folder):
+    path = order_folder / "manifest.json"
+    path.write_text(path.read_text().replace('"depth_nm": 600.0', '"depth_nm": 900.0'))
+    with pytest.raises(InputError, match="digest that it states"):
+        read_manifest(order_folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(format="other"), 'the format must be "doedesign mask order 1"'),
+        (lambda d: d.pop("chrome"), "'chrome'"),
+        (lambda d: d.update(extra=1), "'extra'"),
+        (lambda d: d["masks"][1].pop("bit"), r"masks\[1\].*'bit'"),
+        (lambda d: d.update(pitch_um="1.85"), "pitch_um"),
+        (lambda d: d.update(levels=True), "levels"),
+        (lambda d: d.update(levels=12), "power of two"),
+        (lambda d: d.update(levels=8), "fit the levels"),
+        (lambda d: d.update(shape=[3]), "fit the levels"),
+        (lambda d: d.update(shape=[0, 3]), "grid"),
+        (lambda d: d.update(masks={}), "masks"),
+        (lambda d: d.update(preview="../../etc/passwd"), "plain name"),
+        (lambda d: d.update(preview="unlisted.png"), "plain name"),
+    ],
+)
+def test_what_is_no_manifest_of_an_order_is_refused(order_folder, change, message):
+    rewrite(order_folder, change)
+    with pytest.raises(InputError, match=message):
+        read_manifest(order_folder)
+
+
+def test_a_missing_manifest_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"manifest\.json: the file must exist"):
+        read_manifest(tmp_path)

@@ -1,0 +1,98 @@
+import gdstk
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fab.grid import Grid
+from fab.layout import Layer, Layout, Shapes, mask_layout, pixel_edges
+from fab.polygons import rectangles
+from fab.readback import read_gds_again, read_oasis_again
+from fab.stream import write_gds, write_oasis
+from fab.units import NM, UM
+
+TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
+
+
+def written(folder, edges, **planes):
+    """Write planes to layers 1, 2, ... as GDSII and OASIS."""
+    shapes = {
+        Layer(number): Shapes(rectangles(plane, edges.x, edges.y), (TRIANGLE,))
+        for number, plane in enumerate(planes.values(), 1)
+    }
+    write_gds(folder / "a.gds", Layout("TOP", edges.dbu_m, shapes))
+    write_oasis(folder / "a.oas", folder / "a.gds", shapes)
+    return {layer: len(drawn) for layer, drawn in shapes.items()}
+
+
+PLANE = hnp.arrays(np.uint8, (7, 10), elements=st.integers(0, 1))
+
+
+@pytest.mark.parametrize("pitch_m", [1.85 * UM, UM / 3, 1.0005 * UM])
+@given(one=PLANE, two=PLANE)
+def test_the_other_library_counts_every_pixel_once(tmp_path_factory, pitch_m, one, two):
+    folder = tmp_path_factory.mktemp("again")
+    edges = pixel_edges(Grid((7, 10), pitch_m))
+    layers = written(folder, edges, one=one, two=two)
+    from_oasis, problems = read_oasis_again(folder / "a.oas", list(layers), edges)
+    assert problems == []
+    for readings in (list(read_gds_again(folder / "a.gds", layers, edges)), from_oasis):
+        assert [reading.layer for reading in readings] == list(layers)
+        for reading, plane in zip(readings, (one, two), strict=True):
+            assert np.array_equal(reading.winding, plane)
+            assert reading.strays == 0
+            assert [sorted(map(tuple, p.tolist())) for p in reading.polygons] == [sorted(map(tuple, TRIANGLE.tolist()))]
+
+
+def test_repetitions_of_oasis_are_unfolded(tmp_path):
+    # A regular pattern folds: the library then holds far fewer polygons than are drawn.
+    plane = np.zeros((40, 40), dtype=np.uint8)
+    plane[::2, ::2] = 1
+    edges = pixel_edges(Grid(plane.shape, UM))
+    layers = written(tmp_path, edges, plane=plane)
+    folded = gdstk.read_oas(str(tmp_path / "a.oas")).cells[0].polygons
+    assert len(folded) < 10
+    (reading,), _ = read_oasis_again(tmp_path / "a.oas", list(layers), edges)
+    assert np.array_equal(reading.winding, plane)
+
+
+def test_overlaps_and_strays_are_seen(tmp_path):
+    edges = pixel_edges(Grid((4, 4), UM))
+    rects = np.array([[-2000, -2000, 0, 0], [-1000, -1000, 1000, 1000], [0, 0, 1001, 1000], [0, 0, 3000, 1000]])
+    slanted = np.array([[0, 0], [1000, 0], [1000, 1000], [1, 1000]], dtype=np.int32)
+    shapes = {Layer(1): Shapes(rects.astype(np.int32), (slanted,))}
+    write_gds(tmp_path / "a.gds", Layout("TOP", NM, shapes))
+    (reading,) = read_gds_again(tmp_path / "a.gds", {Layer(1): 5}, edges)
+    assert reading.strays == 3
+    assert reading.winding.tolist() == [[1, 1, 0, 0], [1, 2, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
+
+
+def test_layers_are_read_in_as_many_passes_as_memory_asks_for(tmp_path, monkeypatch, level_map, levels, grid):
+    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "TOP")
+    write_gds(tmp_path / "a.gds", layout)
+    passes = []
+    read = gdstk.read_gds
+
+    def counted(path, **options):
+        passes.append(options["filter"])
+        return read(path, **options)
+
+    monkeypatch.setattr("fab.readback.gdstk.read_gds", counted)
+    edges = pixel_edges(grid)
+    together = [r.winding for r in read_gds_again(tmp_path / "a.gds", {Layer(n): 1 for n in (1, 2, 3)}, edges)]
+    assert len(passes) == 1
+    apart = [r.winding for r in read_gds_again(tmp_path / "a.gds", {Layer(n): 2_000_000 for n in (1, 2, 3)}, edges)]
+    assert passes[1:] == [{(1, 0)}, {(2, 0)}, {(3, 0)}]
+    assert np.array_equal(together, apart)
+
+
+def test_what_does_not_belong_in_an_oasis_file_is_told(tmp_path):
+    library = gdstk.Library()
+    cell = library.new_cell("TOP")
+    cell.add(gdstk.rectangle((0, 0), (1, 1), layer=9), gdstk.Label("text", (0, 0)))
+    library.new_cell("OTHER")
+    library.write_oas(str(tmp_path / "a.oas"))
+    (reading,), problems = read_oasis_again(tmp_path / "a.oas", [Layer(1)], pixel_edges(Grid((2, 2), UM)))
+    assert not reading.winding.any()
+    assert [any(word in problem for problem in problems) for word in ("2 cells", "labels", "9/0")] == [True] * 3

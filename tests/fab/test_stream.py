@@ -1,0 +1,196 @@
+import struct
+from itertools import pairwise
+
+import gdstk
+import klayout.db as kdb
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fab.errors import InputError
+from fab.files import sha256_file
+from fab.grid import Grid
+from fab.layout import Chrome, Layer, Layout, Shapes, mask_layout
+from fab.levels import Levels
+from fab.polygons import rectangles
+from fab.stream import oasis_to_gds, write_gds, write_oasis
+from fab.units import NM, UM
+from fab.walker import read_gds
+
+FAR = 2**31 - 1
+TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
+
+
+def one_layer(rects, *polygons, cell="TOP", dbu_m=NM, layer=Layer(1)):
+    return Layout(cell, dbu_m, {layer: Shapes(np.array(rects, dtype=np.int32).reshape(-1, 4), polygons)})
+
+
+def records(path):
+    data, offset, found = path.read_bytes(), 0, []
+    while offset < len(data):
+        length, kind = struct.unpack(">HH", data[offset : offset + 4])
+        found.append((kind, data[offset + 4 : offset + length]))
+        offset += length
+    return found
+
+
+@pytest.fixture
+def gds(tmp_path):
+    return tmp_path / "a.gds"
+
+
+def test_a_rectangle_is_one_boundary_of_sixty_four_bytes(gds):
+    write_gds(gds, one_layer([]))
+    empty = gds.stat().st_size
+    write_gds(gds, one_layer([[1, 2, 3, 5], [-FAR, -FAR, FAR, FAR]]))
+    assert gds.stat().st_size == empty + 128
+    kinds = [kind for kind, _ in records(gds)]
+    assert kinds == [0x0002, 0x0102, 0x0206, 0x0305, 0x0502, 0x0606] + 2 * [0x0800, 0x0D02, 0x0E02, 0x1003, 0x1100] + [
+        0x0700,
+        0x0400,
+    ]
+    # Closed, counter-clockwise, big-endian: a writer that dropped the byte order would give zero area.
+    points = [struct.unpack(">10i", data) for kind, data in records(gds) if kind == 0x1003]
+    assert points[0] == (1, 2, 3, 2, 3, 5, 1, 5, 1, 2)
+    assert points[1][:4] == (-FAR, -FAR, FAR, -FAR)
+
+
+def test_the_area_survives_many_batches(gds):
+    # Two batches and a part of a third.
+    x = np.arange(70_000, dtype=np.int32)[:, None] * 10
+    rects = np.hstack([x, x, x + 7, x + 3])
+    write_gds(gds, one_layer(rects))
+    cell = gdstk.read_gds(str(gds)).cells[0]
+    # Twenty-one square nanometres each, added up in square micrometres.
+    assert sum(polygon.area() for polygon in cell.polygons) == pytest.approx(70_000 * 21e-6, rel=1e-9)
+    assert np.array_equal(read_gds(gds).shapes[Layer(1)].rectangles, rects)
+
+
+def test_names_and_times_are_fixed(gds):
+    write_gds(gds, one_layer([[0, 0, 1, 1]], cell="DOE_X"))
+    content = dict(records(gds))
+    assert content[0x0606].rstrip(b"\0") == b"DOE_X"
+    assert content[0x0102] == content[0x0502] == struct.pack(">12H", *(2000, 1, 1, 0, 0, 0) * 2)
+    with pytest.raises(InputError, match="mask name"):
+        write_gds(gds, one_layer([], cell="main"))
+
+
+@pytest.mark.parametrize("dbu_nm", [1.0, 0.5, 0.25, 0.1])
+def test_both_libraries_read_the_database_unit(gds, dbu_nm):
+    write_gds(gds, one_layer([[0, 0, 4000, 2000]], dbu_m=dbu_nm * NM))
+    library = gdstk.read_gds(str(gds))
+    # The eight-byte real has 53 or more bits of fraction, so only float64 rounds.
+    assert library.unit == pytest.approx(1e-6, rel=1e-15)
+    assert library.precision == pytest.approx(dbu_nm * NM, rel=1e-14)
+    layout = kdb.Layout()
+    layout.read(str(gds))
+    assert layout.dbu == pytest.approx(dbu_nm / 1000, rel=1e-14)
+    assert layout.top_cell().dbbox().width() == pytest.approx(4 * dbu_nm, rel=1e-12)
+    assert read_gds(gds).dbu_m == pytest.approx(dbu_nm * NM, rel=1e-14)
+
+
+def plane_region(plane):
+    region = kdb.Region()
+    for y, x in np.argwhere(plane).tolist():
+        region.insert(kdb.Box(x, y, x + 1, y + 1))
+    return region
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+@given(plane=hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 1)))
+def test_klayout_sees_exactly_the_pixels(tmp_path_factory, suffix, plane):
+    folder = tmp_path_factory.mktemp("xor")
+    write_gds(folder / "a.gds", one_layer(rectangles(plane)))
+    if suffix == "oas":
+        write_oasis(folder / "a.oas", folder / "a.gds", [Layer(1)])
+    layout = kdb.Layout()
+    layout.read(str(folder / f"a.{suffix}"))
+    index = layout.find_layer(1, 0)
+    drawn = kdb.Region() if index is None else kdb.Region(layout.top_cell().begin_shapes_rec(index))
+    assert (drawn ^ plane_region(plane)).is_empty()
+    assert drawn.area() == np.count_nonzero(plane)
+    assert drawn.merged(2).is_empty()  # nothing is covered twice
+
+
+@given(plane=hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 1)))
+def test_gdstk_sees_exactly_the_pixels(tmp_path_factory, plane):
+    folder = tmp_path_factory.mktemp("xor")
+    write_gds(folder / "a.gds", one_layer(rectangles(plane)))
+    drawn = gdstk.read_gds(str(folder / "a.gds")).cells[0].polygons
+    pixels = [gdstk.rectangle((x / 1000, y / 1000), ((x + 1) / 1000, (y + 1) / 1000)) for y, x in np.argwhere(plane)]
+    assert gdstk.boolean(drawn, pixels, "xor", precision=1e-6) == []
+
+
+def test_oasis_keeps_names_repeats_and_polygons(tmp_path, level_map, levels, grid):
+    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+    write_gds(tmp_path / "a.gds", layout)
+    write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", layout.shapes)
+    again = kdb.Layout()
+    again.read(str(tmp_path / "a.oas"))
+    names = [(info.layer, info.datatype, info.name) for info in again.layer_infos()]
+    assert names == [(layer.number, layer.datatype, layer.name) for layer in layout.shapes]
+    for layer, shapes in layout.shapes.items():
+        region = kdb.Region(again.top_cell().begin_shapes_rec(again.find_layer(layer.number, layer.datatype)))
+        assert 2 * region.area() == shapes.doubled_area
+    assert (tmp_path / "a.oas").stat().st_size < (tmp_path / "a.gds").stat().st_size / 2
+
+
+def test_the_same_layout_gives_the_same_bytes(tmp_path, level_map, levels, grid):
+    digests = []
+    for name in ("one", "two"):
+        gds, oasis = tmp_path / f"{name}.gds", tmp_path / f"{name}.oas"
+        layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+        write_gds(gds, layout)
+        write_oasis(oasis, gds, layout.shapes)
+        digests.append((sha256_file(gds), sha256_file(oasis)))
+    assert digests[0] == digests[1]
+
+
+def test_layers_can_be_written_one_by_one(tmp_path, level_map, levels, grid):
+    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+    write_gds(tmp_path / "all.gds", layout)
+    pieces = []
+    for layer in layout.shapes:
+        write_gds(tmp_path / "one.gds", layout, [layer])
+        pieces.append((tmp_path / "one.gds").read_bytes())
+        assert list(read_gds(tmp_path / "one.gds").shapes) == [layer]
+    # The elements of the whole are those of the parts: same opening, same end.
+    opening = next(i for i, (a, b) in enumerate(zip(pieces[0], pieces[1], strict=False)) if a != b) - 9
+    bodies = b"".join(piece[opening:-8] for piece in pieces)
+    assert (tmp_path / "all.gds").read_bytes() == pieces[0][:opening] + bodies + pieces[0][-8:]
+
+
+def test_a_path_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"file/a\.gds"):
+        write_gds(tmp_path / "file" / "a.gds", one_layer([]))
+    write_gds(tmp_path / "a.gds", one_layer([[0, 0, 1, 1]]))
+    with pytest.raises(InputError, match=r"a\.oas"):
+        write_oasis(tmp_path / "file" / "a.oas", tmp_path / "a.gds", [])
+
+
+def test_oasis_back_to_gds_refuses_ruins_and_floods(tmp_path):
+    write_gds(tmp_path / "a.gds", one_layer([[i * 3, 0, i * 3 + 1, 1] for i in range(50)], TRIANGLE))
+    write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", [])
+    oasis_to_gds(tmp_path / "a.oas", tmp_path / "b.gds", 51)
+    again = read_gds(tmp_path / "b.gds").shapes[Layer(1)]
+    assert (len(again.rectangles), len(again.polygons)) == (50, 1)
+    with pytest.raises(InputError, match="51 shapes"):
+        oasis_to_gds(tmp_path / "a.oas", tmp_path / "b.gds", 50)
+    (tmp_path / "cut.oas").write_bytes((tmp_path / "a.oas").read_bytes()[:60])
+    with pytest.raises(InputError, match=r"cut\.oas"):
+        oasis_to_gds(tmp_path / "cut.oas", tmp_path / "b.gds", 50)
+
+
+def test_odd_grids_are_drawn_without_gap_or_overlap(tmp_path):
+    # A third of a micrometre fits no unit: neighbours must share the rounded edge.
+    levels, grid = Levels(2, 75 * NM), Grid((5, 7), UM / 3)
+    layout = mask_layout(np.zeros((5, 7), dtype=np.uint8), levels, grid, 7 * UM / 3, "DOE", Chrome(overlap_m=0))
+    rects = layout.shapes[Layer(1)].rectangles
+    assert len(rects) > 1
+    region = kdb.Region([kdb.Box(*map(int, rect)) for rect in rects])
+    assert region.merged().area() == sum(kdb.Box(*map(int, rect)).area() for rect in rects)
+    assert region.merged().count() == 1
+    assert all(a[1] <= b[1] for a, b in pairwise(rects.tolist()))

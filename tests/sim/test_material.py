@@ -1,0 +1,111 @@
+"""Refractive indices against published values and, where it is present, against the public database's own records."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from fab.errors import InputError
+from sim.material import (
+    MATERIALS,
+    fresnel_transmission,
+    full_wave_height_m,
+    full_wave_wavelength_m,
+    material,
+    refractive_index,
+)
+
+DATABASE = Path(__file__).parents[2].parent / "shared" / "data" / "optics_reference" / "refractive_index"
+RECORDS = {
+    "fused_silica": "SiO2_Malitson.yml",
+    "n_bk7": "schott_N-BK7.yml",
+    "p_bk7": "schott_P-BK7.yml",
+    "pmma": "PMMA_Sultanova.yml",
+    "pmma_resist": "resist_Microchem_950_specs.yml",
+    "su8": "resist_Microchem_SU-8_2000_specs.yml",
+}
+
+
+@pytest.mark.parametrize(
+    ("wavelength_nm", "index"), [(656, 1.45637), (589, 1.45841), (550, 1.45991), (520, 1.46128), (486, 1.46313)]
+)
+def test_fused_silica_at_the_papers_wavelengths(wavelength_nm: int, index: float):
+    # Malitson's table is given to 1e-5, so half of that is all a comparison can show.
+    assert refractive_index("fused_silica", wavelength_nm * 1e-9) == pytest.approx(index, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength_nm", "index"),
+    [("n_bk7", 587.5618, 1.51680), ("p_bk7", 587.5618, 1.51640)],
+)
+def test_catalogue_values(name: str, wavelength_nm: float, index: float):
+    assert refractive_index(name, wavelength_nm * 1e-9) == pytest.approx(index, abs=1e-4)
+
+
+def record(path: Path) -> tuple[int, list[float], tuple[float, float]]:
+    """Formula number, coefficients and range (micrometres) of a database record."""
+    lines = [line.strip().removeprefix("- ") for line in path.read_text("utf-8").splitlines()]
+    start = next(i for i, line in enumerate(lines) if line.startswith("type: formula"))
+    values = dict(line.split(": ", 1) for line in lines[start : start + 3] if ": " in line)
+    low, high = (float(text) for text in values["wavelength_range"].split())
+    return int(values["type"].split()[-1]), [float(text) for text in values["coefficients"].split()], (low, high)
+
+
+def index_of_record(formula: int, c: list[float], wavelength_um: float) -> float:
+    pairs = list(zip(c[1::2], c[2::2], strict=True))
+    if formula == 1:
+        return math.sqrt(1 + c[0] + sum(b * wavelength_um**2 / (wavelength_um**2 - x**2) for b, x in pairs))
+    if formula == 2:
+        return math.sqrt(1 + c[0] + sum(b * wavelength_um**2 / (wavelength_um**2 - x) for b, x in pairs))
+    assert formula == 5, formula
+    return c[0] + sum(a * wavelength_um**p for a, p in pairs)
+
+
+@pytest.mark.parametrize("name", sorted(MATERIALS))
+def test_formula_and_range_agree_with_the_database(name: str):
+    path = DATABASE / RECORDS[name]
+    if not path.is_file():
+        pytest.skip("the refractive-index records are not beside this checkout")
+    formula, coefficients, (low, high) = record(path)
+    entry = material(name)
+    # A range may be narrower than the record's, never wider.
+    assert entry.range_m[0] >= low * 1e-6 * (1 - 1e-12)
+    assert entry.range_m[1] <= high * 1e-6 * (1 + 1e-12)
+    for part in (0.0, 0.1, 0.4, 0.9, 1.0):
+        wavelength_m = entry.range_m[0] + part * (entry.range_m[1] - entry.range_m[0])
+        # The same coefficients, so only rounding separates the two.
+        assert entry.index(wavelength_m) == pytest.approx(
+            index_of_record(formula, coefficients, wavelength_m * 1e6), rel=1e-9
+        )
+
+
+@pytest.mark.parametrize("name", sorted(MATERIALS))
+def test_dispersion_is_normal_in_the_visible_and_nothing_is_extrapolated(name: str):
+    low, high = material(name).range_m
+    assert refractive_index(name, 486e-9) > refractive_index(name, 589e-9) > refractive_index(name, 656e-9) > 1.4
+    for outside in (low * 0.999, high * 1.001, -1.0, float("nan")):
+        with pytest.raises(InputError, match=f"material {name}: the wavelength must lie in"):
+            refractive_index(name, outside)
+
+
+def test_unknown_material_lists_the_known_ones():
+    with pytest.raises(InputError, match="fused_silica, n_bk7"):
+        refractive_index("glass", 5e-7)
+
+
+def test_sixteen_levels_of_75_nm_are_one_wave_at_552_nm():
+    wavelength_m = full_wave_wavelength_m("fused_silica", 16 * 75e-9)
+    assert wavelength_m == pytest.approx(552e-9, abs=0.5e-9)
+    assert full_wave_height_m("fused_silica", wavelength_m) == pytest.approx(1.2e-6, rel=1e-9)
+
+
+@pytest.mark.parametrize("height_m", [1e-9, 1e-3])
+def test_a_height_of_no_wave_is_refused(height_m: float):
+    with pytest.raises(InputError, match="a height of one wave must lie in"):
+        full_wave_wavelength_m("fused_silica", height_m)
+
+
+def test_two_faces_of_fused_silica_reflect_seven_percent():
+    # ((n - 1) / (n + 1))^2 = 3.4705 % per face at n = 1.45841.
+    assert fresnel_transmission(1.45841) == pytest.approx((1 - 0.034770) ** 2, abs=1e-4)
+    assert fresnel_transmission(1.0) == 1.0

@@ -1,0 +1,128 @@
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bench.reference import YELLOW_M, make_camera, wrapped_map
+from sim.camera import Colour
+from sim.metrics import (
+    airy_radius_m,
+    disc_weights,
+    encircled_energy,
+    energy_budget,
+    energy_within,
+    mean_wavelength_m,
+    mtf,
+    participation,
+    radius_map_m,
+    ring_to_disc,
+    spot_radius_m,
+    zeroth_order,
+)
+from sim.psf import psf_bank
+
+CAMERA = make_camera(256, 0.6e-3, 1.08e-3, 1.85e-6, 64)
+
+
+@pytest.mark.parametrize("shape", [(40, 40), (41, 40), (41, 41)])
+def test_disc_weights_hold_the_discs_area(shape: tuple[int, int]):
+    weights = disc_weights(shape, 2e-6, 25e-6)
+    # 8 x 8 points per pixel on the rim of a disc 25 pixels wide.
+    assert weights.sum() * 4e-12 == pytest.approx(np.pi * 25e-6**2, rel=3e-3)
+    assert weights[shape[0] // 2, shape[1] // 2] == 1
+    assert weights[0, 0] == 0
+    np.testing.assert_array_equal(weights, weights[::-1, ::-1])
+
+
+def test_radii_are_measured_from_the_middle_of_the_window():
+    assert radius_map_m((3, 3), 2.0)[1, 1] == 0
+    assert radius_map_m((4, 4), 2.0)[1, 2] == pytest.approx(np.sqrt(2))
+
+
+def test_encircled_energy_grows_to_the_windows_total(rng: np.random.Generator):
+    psf = rng.uniform(size=(20, 20)).astype(np.float32)
+    energies = encircled_energy(psf, 1e-6, np.linspace(0, 15e-6, 16))
+    assert energies[0] == 0
+    assert all(np.diff(energies) >= 0)
+    assert energies[-1] == pytest.approx(psf.sum(dtype=np.float64), rel=1e-6)  # 15 um reach the corners
+    assert energies[7] == energy_within(psf, 1e-6, 7e-6)
+
+
+def test_radii_of_the_far_spot():
+    assert airy_radius_m(CAMERA, 550e-9) == pytest.approx(1.22 * 550e-9 * 1.08e-3 / 0.6e-3, rel=1e-3)
+    assert spot_radius_m(CAMERA, 550e-9) == airy_radius_m(CAMERA, 550e-9) + 1.85e-6
+    assert mean_wavelength_m(Colour("c", (4e-7, 6e-7), (0.25, 0.75))) == pytest.approx(5.5e-7)
+
+
+def test_ring_and_disc_share_the_window():
+    uniform = np.full((64, 64), 1.0, np.float32)
+    depth = 0.6e-3 * 1.08e-3 / (40 * 1.85e-6)  # a blur disc 40 pixels wide
+    parts = ring_to_disc(uniform, CAMERA, depth)
+    assert parts.disc_radius_m == pytest.approx(21 * 1.85e-6)  # widened by one pixel
+    assert parts.window_half_m == pytest.approx(32 * 1.85e-6)
+    assert parts.disc == pytest.approx(np.pi * 21**2, rel=3e-3)  # as in the test of the area
+    assert parts.ring + parts.disc == pytest.approx(64**2)
+    assert parts.ratio == parts.ring / parts.disc
+    dark = np.zeros((64, 64), np.float32)
+    dark[0, 0] = 1
+    assert ring_to_disc(dark, CAMERA, depth).ratio == np.inf
+
+
+def test_participation_of_equal_pixels():
+    image = jnp.zeros((2, 8, 8)).at[0, 1:3, 1:3].set(0.25).at[1, 0, 0].set(1.0)
+    np.testing.assert_allclose(participation(image), [0.25, 1.0])
+
+
+def test_mtf_of_known_lines():
+    point = np.zeros((9, 32), np.float32)
+    point[4, 16] = 0.3
+    frequency, transfer = mtf(point, 2e-6)
+    assert frequency[-1] == pytest.approx(1 / 4e-6)
+    np.testing.assert_allclose(transfer, 1.0)
+    point[2, 20] = 0.3  # two points 4 pixels apart: |cos(pi nu 4)|
+    np.testing.assert_allclose(mtf(point, 2e-6)[1], np.abs(np.cos(np.pi * frequency * 8e-6)), atol=1e-7)
+
+
+@pytest.mark.parametrize("cells", [100, 257])
+def test_a_flat_plate_is_all_zeroth_order(cells: int):
+    camera = make_camera(cells, 0.6e-3, 1.08e-3, 1.85e-6, 16)
+    # The clear area in cells is right to 1e-5 at a hundred cells, and `cis` is good to 4e-6.
+    assert zeroth_order(camera, np.full((cells, cells), 3e-7), YELLOW_M) == pytest.approx(1, abs=3e-5)
+
+
+def test_zeroth_order_is_a_property_of_the_plate_not_of_the_focus():
+    moved = dataclasses.replace(CAMERA, defocus_m=1e-4)
+    height = wrapped_map(256)
+    assert zeroth_order(moved, height, YELLOW_M) == pytest.approx(zeroth_order(CAMERA, height, YELLOW_M), rel=1e-5)
+
+
+@pytest.mark.parametrize("depth_m", [np.inf, 0.02])
+@pytest.mark.parametrize("fill", [1.0, 0.7])
+@pytest.mark.parametrize("plate", ["flat", "wrapped", "rough"])
+def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np.random.Generator):
+    camera = dataclasses.replace(CAMERA, fill=fill)
+    height = {"flat": np.zeros((256, 256)), "wrapped": wrapped_map(256), "rough": rng.uniform(0, 1.2e-6, (256, 256))}[plate]
+    psf = psf_bank(camera, height, [depth_m]).energy[0, 0]
+    budget = energy_budget(camera, height, psf, depth_m, camera.colours[0])
+    assert sum(budget) == pytest.approx(1, abs=1e-9)
+    assert budget.reflected == pytest.approx(0.0684, abs=1e-3)
+    assert budget.spot > 0
+    assert budget.window > 0
+    # Made from two independent transforms, each good to about 1e-4; a negative share would be energy from nowhere.
+    assert budget.uncollected > -1e-3
+    assert budget.higher_orders > -1e-3
+    # White noise of one cell spreads as sinc² x sinc², of which the band |nu| < 1/2 holds (0.774)^2 = 0.599.
+    if plate == "rough":
+        assert budget.higher_orders == pytest.approx((1 - budget.reflected) * (1 - 0.599), rel=0.05)
+
+
+def test_the_budget_of_a_colour_is_that_of_its_wavelengths():
+    waves, weights = (5e-7, 6e-7), (0.25, 0.75)
+    camera = dataclasses.replace(CAMERA, colours=(Colour("mixed", waves, weights),))
+    height = wrapped_map(256)
+    psf = psf_bank(camera, height, [0.02]).energy[0, 0]
+    mixed = energy_budget(camera, height, psf, 0.02, camera.colours[0])
+    parts = [energy_budget(camera, height, psf, 0.02, Colour("one", (w,), (1.0,))) for w in waves]
+    assert mixed.higher_orders == pytest.approx(np.dot(weights, [p.higher_orders for p in parts]), abs=1e-9)
+    assert mixed.reflected == pytest.approx(np.dot(weights, [p.reflected for p in parts]), abs=1e-12)
