@@ -1,7 +1,7 @@
 """What PSFs are judged by: a plain float64 evaluation with sixteen samples per pixel and axis, and the maps to try.
 
-Nothing here shares code with `sim.farfield` or `sim.pixel`: the field is summed at the sample positions themselves and the
-pixel integral is the midpoint rule, whose error at sixteen samples is about 2e-4 for speckle.
+Nothing here shares code with `sim.farfield` or `sim.pixel`: the field is summed at the sample positions themselves
+and the pixel integral is the midpoint rule, whose error at sixteen samples is about 2e-4 for speckle.
 """
 
 import numpy as np

@@ -45,7 +45,9 @@ def main(rounds: int = 9) -> None:
     ratio = float(np.median(ratios))
     print("Optimisation step, automotive, N = 2400, 3 colours x near and far, 16 levels, with gradient and Adam")
     print(f"  step {np.median(step_s) * 1e3:8.0f} ms    12 bare FFTs {np.median(floor_s) * 1e3:8.0f} ms")
-    print(f"  ratio {ratio:6.2f}   (target <= 2: {'ok' if ratio <= 2 else 'missed'}; {min(ratios):.2f}-{max(ratios):.2f})")
+    print(
+        f"  ratio {ratio:6.2f}   (target <= 2: {'ok' if ratio <= 2 else 'missed'}; {min(ratios):.2f}-{max(ratios):.2f})"
+    )
     print(f"  peak {peak:6.2f} GB  (target < 3: {'ok' if peak < 3 else 'missed'})")
 
 

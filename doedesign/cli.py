@@ -21,7 +21,9 @@ app = App(
     version=__version__,
 )
 
-Overrides = Annotated[tuple[str, ...], Parameter(name="--set", negative="", help="Change one value of the spec, KEY=VALUE.")]
+Overrides = Annotated[
+    tuple[str, ...], Parameter(name="--set", negative="", help="Change one value of the spec, KEY=VALUE.")
+]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON instead of paths.")]
 
 

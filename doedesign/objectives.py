@@ -10,10 +10,11 @@ Energies are per unit power incident on the clear aperture, so light that is los
 """
 
 import importlib
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -58,10 +59,7 @@ def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
     """For every colour, the share of each pixel inside the far spot (`sim.metrics.spot_radius_m`)."""
     shape = (camera.window, camera.window)
     return np.stack(
-        [
-            disc_weights(shape, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(c)))
-            for c in camera.colours
-        ]
+        [disc_weights(shape, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(c))) for c in camera.colours]
     )
 
 
@@ -132,7 +130,7 @@ def _imported(name: str, where: str) -> Callable[..., Array]:
         ) from error
     if not callable(function):
         raise InputError(where, "a user's objective must be a function", f'"{name}"', "Name a function.")
-    return function
+    return cast("Callable[..., Array]", function)
 
 
 def terms_of(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
@@ -151,8 +149,10 @@ def terms_of(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Ter
         where = f"objective[{i}] {objective.name}"
         options: dict[str, Any] = dict(objective.options)
         if objective.name == "target_pattern":
-            options = {"target": target_pattern_image(camera, options, files.get(f"objective[{i}].options.image"), where)}
-        function = _BUILT_IN.get(objective.name) or _imported(objective.name, where)
+            options = {
+                "target": target_pattern_image(camera, options, files.get(f"objective[{i}].options.image"), where)
+            }
+        function = _BUILT_IN[objective.name] if objective.name in _BUILT_IN else _imported(objective.name, where)
         bound = partial(function, **options)
         _require_options(bound, where)
         terms.append(Term(objective.name, objective.weight, bound))
@@ -161,8 +161,6 @@ def terms_of(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Ter
 
 def _require_options(function: partial[Array], where: str) -> None:
     """Check before a long run that the function takes one view and the given options."""
-    import inspect
-
     try:
         inspect.signature(function.func).bind(None, **function.keywords)
     except TypeError as error:

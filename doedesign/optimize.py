@@ -115,7 +115,10 @@ Update = Callable[[Constants, tuple[Array, optax.OptState]], tuple[tuple[Array, 
 
 
 def make_update(spec: Spec) -> Update:
-    """The compiled update (constants, (radians, adam)) -> ((radians, adam), loss, terms); it reuses the state's memory."""
+    """The compiled update (constants, (radians, adam)) -> ((radians, adam), loss, terms).
+
+    It reuses the memory of the state it is given.
+    """
     optimiser = optimiser_of(spec)
 
     def update(constants: Constants, state: tuple[Array, optax.OptState]) -> Any:
@@ -124,7 +127,8 @@ def make_update(spec: Spec) -> Update:
         updates, adam = optimiser.update(gradient, adam)
         return (optax.apply_updates(radians, updates), adam), loss, terms
 
-    return eqx.filter_jit(update, donate="all-except-first", compiler_options=compiler_options())
+    # The overloads do not list jit's own options, which are passed on.
+    return eqx.filter_jit(update, donate="all-except-first", compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
 
 
 def constants_at(spec: Spec, problem: Problem, scene: Scene, step: int) -> Constants:

@@ -1,13 +1,13 @@
 """From free parameters to a height map that can be drawn.
 
-The parameters are phases at the design wavelength in radians, one per cell (free-form) or per ring (radial), unbounded. Their
-height is taken modulo the full staircase, L steps, which is close to one wave there. Every colour sees that same
-height, so a wrap is a real step for the others, and the optimiser pays for it.
+The parameters are phases at the design wavelength in radians, one per cell (free-form) or per ring (radial),
+unbounded. Their height is taken modulo the full staircase, L steps, which is close to one wave there. Every colour
+sees that same height, so a wrap is a real step for the others, and the optimiser pays for it.
 
 Quantisation in the loop. The forward value is a height the process can make, so what is optimised is what is drawn.
-"straight_through" passes the gradient as if there were no rounding (Y. Bengio et al., arXiv:1308.3432). "annealed" blends
-from the continuous to the quantised height while the cubic schedule of L. Li et al., CVPR 2022 (quantisation-aware
-deep optics), runs from a tenth to nine tenths of the steps. "none" leaves heights continuous.
+"straight_through" passes the gradient as if there were no rounding (Y. Bengio et al., arXiv:1308.3432). "annealed"
+blends from the continuous to the quantised height while the cubic schedule of L. Li et al., CVPR 2022
+(quantisation-aware deep optics), runs from a tenth to nine tenths of the steps. "none" leaves heights continuous.
 """
 
 from typing import Literal

@@ -18,7 +18,9 @@ def _length(options: dict[str, Any], key: str, where: str) -> float:
     try:
         length = parse_length(str(text))
     except ValueError as error:
-        raise InputError(f"{where}: {key}", "must be a length with a unit", f"{text!r}", f'For example {key} = "250 um".') from error
+        raise InputError(
+            f"{where}: {key}", "must be a length with a unit", f"{text!r}", f'For example {key} = "250 um".'
+        ) from error
     if length <= 0:
         raise InputError(f"{where}: {key}", "must be positive", f"{text!r}", f'For example {key} = "250 um".')
     return length
@@ -36,7 +38,9 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Float[np.ndar
 
     count = options.get("count")
     if not (isinstance(count, tuple) and len(count) == 2 and all(isinstance(n, int) and n > 0 for n in count)):
-        raise InputError(f"{where}: count", "must be two positive whole numbers", repr(count), "For example count = [5, 5].")
+        raise InputError(
+            f"{where}: count", "must be two positive whole numbers", repr(count), "For example count = [5, 5]."
+        )
     centres = spot_centres_m(count, _length(options, "spacing", where))
     axis = camera.axis_m()
     if np.abs(centres).max() > axis[-1]:
@@ -81,11 +85,13 @@ def _picture(camera: Camera, path: Path) -> Float[np.ndarray, "y x"]:
     try:
         image = np.asarray(imread(path))
     except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(str(path), "must be a picture (PNG, TIFF, JPEG)", f'"{error}"', "Save it again as PNG.") from error
+        raise InputError(
+            str(path), "must be a picture (PNG, TIFF, JPEG)", f'"{error}"', "Save it again as PNG."
+        ) from error
     image = image.astype(np.float64) / (np.iinfo(image.dtype).max if image.dtype.kind in "ui" else 1.0)
     linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
     gray = rgb2gray(linear[..., :3]) if linear.ndim == 3 else linear
-    return np.flipud(resize(gray, (camera.window, camera.window), anti_aliasing=True))
+    return np.asarray(resize(gray, (camera.window, camera.window), anti_aliasing=True))[::-1]
 
 
 def target_pattern_image(

@@ -177,6 +177,7 @@ def _line_energy(problem: Problem, line: Line, height_m: Array, source: Array, o
         return line.factor * plan.energy(height_m, source, line.rate)
     if offset_m is not None and isinstance(plan, FarField):
         plan = displaced(plan, offset_m)
+    assert problem.coverage is not None  # only rings go without
     return line.factor * plan.energy(phase_pupil, PhaseRows(height_m, source, problem.coverage), line.rate)
 
 

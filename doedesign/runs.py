@@ -10,8 +10,8 @@
         metrics.json            the table of `doedesign.evaluate`
         *.png                   pictures
 
-Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the disk,
-so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes.
+Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
+disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes.
 """
 
 import io
@@ -155,7 +155,7 @@ def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: 
     text = np.frombuffer(json.dumps(list(history)).encode(), np.uint8)
     digest = np.frombuffer(spec_digest(run.spec).encode(), np.uint8)
     np.savez(buffer, step=np.int64(step), history=text, spec=digest, **named)
-    write_atomic(run.path(CHECKPOINT), buffer.getbuffer())
+    write_atomic(run.path(CHECKPOINT), buffer.getvalue())
 
 
 def load_checkpoint(

@@ -28,7 +28,9 @@ def _radii_m(camera: Camera, radial: bool) -> Heights:
 def _number(options: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
     value = options.get(key, default)
     if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
-        raise InputError(f"optimize.start_options.{key}", f"must be a number from {low:g} to {high:g}", repr(value), "Correct it.")
+        raise InputError(
+            f"optimize.start_options.{key}", f"must be a number from {low:g} to {high:g}", repr(value), "Correct it."
+        )
     return float(value)
 
 
@@ -38,7 +40,9 @@ def _length(options: Mapping[str, Any], key: str, default_m: float) -> float:
     try:
         length = parse_length(str(options[key]))
     except ValueError as error:
-        raise InputError(f"optimize.start_options.{key}", "must be a length", repr(options[key]), 'Such as "5.6 um".') from error
+        raise InputError(
+            f"optimize.start_options.{key}", "must be a length", repr(options[key]), 'Such as "5.6 um".'
+        ) from error
     if not length > 0:
         raise InputError(f"optimize.start_options.{key}", "must be positive", repr(options[key]), 'Such as "5.6 um".')
     return length
@@ -145,7 +149,9 @@ def start_heights(
     unknown = [key for key in options if key not in _OPTIONS[name]]
     if unknown:
         known = ", ".join(_OPTIONS[name]) or "none"
-        raise InputError("optimize.start_options", f'options of start "{name}" are: {known}', unknown[0], "Remove or rename it.")
+        raise InputError(
+            "optimize.start_options", f'options of start "{name}" are: {known}', unknown[0], "Remove or rename it."
+        )
     if name == "flat":
         return flat(camera, radial)
     if name == "random":

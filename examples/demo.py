@@ -76,7 +76,8 @@ def summary(run_folder: Path, order: Path, light: Path, checks: int) -> str:
         near = ""
         if "concentration" in row:
             ratio = row["ring_to_disc"]
-            near = f"{'-' if ratio is None else f'{ratio:.2f}':>9}  {row['concentration']:.4f} ({row['concentration_bound']:.4f})"
+            shown = "-" if ratio is None else f"{ratio:.2f}"
+            near = f"{shown:>9}  {row['concentration']:.4f} ({row['concentration_bound']:.4f})"
         lines.append(f"{row['colour']:<7} {depth:>7} {row['in_window']:10.3f}  {far}  {near}")
     lines += ["", f"{checks} checks of the mask order passed: every pixel of every file is as designed.", ""]
     lines += [f"run       {run_folder}", f"masks     {order}", f"PSFs      {light}", "pictures"]
@@ -85,7 +86,7 @@ def summary(run_folder: Path, order: Path, light: Path, checks: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("spec", nargs="?", type=Path, default=HERE / "automotive.toml")
     given = parser.parse_args()
     sys.exit(exit_code(lambda: print(demo(given.spec))))

@@ -71,7 +71,7 @@ def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where
         row, column = (int(i) for i in np.unravel_index(int(np.argmax(wrong)), wrong.shape))
         value = float(height_m[row, column])
         shown = format_length(value) if np.isfinite(value) else str(value)
-        pixels = "1 pixel does not" if count == 1 else f"{count} pixels do not"
+        pixels = "1 wrong pixel" if count == 1 else f"{count} wrong pixels"
         raise InputError(where, rule, f"{pixels}, the first at row {row}, column {column} ({shown})", cure)
 
 

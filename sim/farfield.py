@@ -18,11 +18,12 @@ it to a pupil given as a function of blocks of rows (`sim.pupil`), so a phase-on
 gradient is written out here (one adjoint transform) and checked against finite differences.
 
 Sampling. `sampling` counts samples per lambda d / D: 2 is the Nyquist rate of the intensity, and the default adds as
-much as a short integration rule needs for a predicted error of 2e-3. At `sampling=1` the transform is the bare FFT of the pupil: a quarter of the
-work, enough to estimate energies when the image moves by a fraction of a pixel from call to call (`displaced`).
+much as a short integration rule needs for a predicted error of 2e-3. At `sampling=1` the transform is the bare FFT of
+the pupil: a quarter of the work, enough to estimate energies when the image moves by a fraction of a pixel from call
+to call (`displaced`).
 """
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -119,7 +120,8 @@ def plan_far_field(
     if sampling < 1:
         raise ValueError(f"`sampling` must be at least 1, but got {sampling}")
     pitch = camera.grid.pitch_m
-    length = int(next_fast_len(max(nx, int(np.ceil(sampling * camera.aperture_m / pitch - 1e-9))), real=True))
+    needed = max(nx, int(np.ceil(sampling * camera.aperture_m / pitch - 1e-9)))
+    length = cast(int, next_fast_len(needed, real=True))
     spacing = wavelength_m * camera.sensor_distance_m / (length * pitch)
     width = camera.pixel_m * camera.fill / spacing
     half = camera.window * camera.pixel_m / 2 / spacing + width + 8

@@ -1,13 +1,14 @@
 """The direct path (paper eq. 5): lens and propagation kernel written out, with no cancellation assumed.
 
-It needs the lens's quadratic phase sampled on the DOE grid, so eq. 6, N pitch^2 / lambda <= f, must hold; at the paper's
-sizes that means cells below a micrometre, which is why `sim.farfield` is the default. Here it serves as a reference
-and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda d nu^2) and the
-`"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T. Shimobaba, Opt.
-Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded grid is dropped.
+It needs the lens's quadratic phase sampled on the DOE grid, so eq. 6, N pitch^2 / lambda <= f, must hold; at the
+paper's sizes that means cells below a micrometre, which is why `sim.farfield` is the default. Here it serves as a
+reference and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda d nu^2)
+and the `"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T.
+Shimobaba, Opt. Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded
+grid is dropped.
 """
 
-from typing import Literal
+from typing import Literal, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -78,7 +79,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
             f'Use propagation = "far_field", or a pitch of at most {limit * 1e6:.3g} um '
             f"(N = {int(np.ceil(camera.aperture_m / limit))}) for this aperture.",
         )
-    padded = int(next_fast_len(3 * cells))
+    padded = cast(int, next_fast_len(3 * cells))
     half = camera.window * camera.pixel_m / 2 / pitch
     width = camera.pixel_m * camera.fill / pitch
     kept = 2 * int(np.ceil(half + width + 8))

@@ -2,12 +2,13 @@
 
 The profile is a height per ring; a ring is as wide as a cell. Within a ring the DOE is constant, so its share of the
 field, 2 pi / (lambda d) ∫ J0(2 pi r rho / lambda d) r dr, is known exactly through J1; the source wave varies slowly
-and is sampled at a few sub-rings. Unlike a raster, rings have no staircase: this is the PSF of rings drawn as rings. What
-a raster of square cells makes of the same profile is the business of `sim.farfield`, and tests state the difference.
+and is sampled at a few sub-rings. Unlike a raster, rings have no staircase: this is the PSF of rings drawn as rings.
+What a raster of square cells makes of the same profile is the business of `sim.farfield`, and tests state the
+difference.
 
 From profile to pixels in three steps: field on radii at a little more than its Nyquist rate (one matrix product);
-band-limited interpolation of the complex field to eight times finer radii; integration over pixels with weights that hold
-each pixel's area as a function of radius. Only one octant of the window is distinct.
+band-limited interpolation of the complex field to eight times finer radii; integration over pixels with weights that
+hold each pixel's area as a function of radius. Only one octant of the window is distinct.
 """
 
 import equinox as eqx
@@ -48,7 +49,10 @@ class Hankel(eqx.Module):
     subrings: int = eqx.field(static=True)
 
     def energy(
-        self, profile_m: Float[Array, " ring"], source_waves: Float[Array, " subring"], waves_per_metre: Float[Array, ""]
+        self,
+        profile_m: Float[Array, " ring"],
+        source_waves: Float[Array, " subring"],
+        waves_per_metre: Float[Array, ""],
     ) -> Float[Array, "y x"]:
         """Energy in every pixel, per unit power incident on the clear aperture.
 
@@ -99,7 +103,9 @@ def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray,
     keys, distinct = np.unique(high * (n + 1) + low, return_inverse=True)
     far, near = (keys // (n + 1)) * camera.pixel_m / 2, (keys % (n + 1)) * camera.pixel_m / 2
     offsets = Grid((_POINTS, _POINTS), camera.pixel_m * camera.fill / _POINTS).axis_m("x")
-    radius = np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1) / fine_m
+    radius = (
+        np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1) / fine_m
+    )
     index = np.floor(radius).astype(np.int64)
     first = index.min(axis=1)
     width = int((index.max(axis=1) - first).max()) + 2

@@ -7,6 +7,8 @@ outside the range is refused, never extrapolated.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from fab.errors import InputError
 
 
@@ -152,10 +154,11 @@ def full_wave_wavelength_m(name: str, height_m: float) -> float:
         return full_wave_height_m(name, wavelength_m) - height_m
 
     if excess(low) > 0 or excess(high) < 0:
+        least, most = full_wave_height_m(name, low), full_wave_height_m(name, high)
         raise InputError(
             f"material {name}",
-            f"a height of one wave must lie in {full_wave_height_m(name, low):.3g}-{full_wave_height_m(name, high):.3g} m",
+            f"a height of one wave must lie in {least:.3g}-{most:.3g} m",
             f"{height_m:.4g} m",
             "Change process.levels or process.level_step.",
         )
-    return float(brentq(excess, low, high, xtol=1e-15))
+    return float(np.asarray(brentq(excess, low, high, xtol=1e-15)))

@@ -35,8 +35,9 @@ def mean_wavelength_m(colour: Colour) -> float:
 
 
 def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
-    """Radius that counts as the far spot: the first dark ring plus one pixel, so the spot is caught wherever it
-    falls on the pixel grid.
+    """Radius that counts as the far spot: the first dark ring plus one pixel.
+
+    The pixel is there so that the spot is caught wherever it falls on the pixel grid.
     """
     return airy_radius_m(camera, wavelength_m) + camera.pixel_m
 
@@ -85,15 +86,13 @@ def mtf(psf: Float[np.ndarray, "y x"], pixel_m: float) -> tuple[np.ndarray, np.n
     The pixel's own transfer is in it, because the PSF is integrated over pixels. Light outside the window acts as
     veiling glare and is not in it.
     """
-    line = np.sum(psf, axis=0, dtype=np.float64)
+    line = np.asarray(np.sum(psf, axis=0, dtype=np.float64))
     transfer = np.abs(np.fft.rfft(line))
     return np.fft.rfftfreq(len(line), pixel_m), transfer / transfer[0]
 
 
 def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:
-    """Fraction |<t>|^2 of the light that passes as if the plate were flat (design.md §4), t = exp(i phi) over the
-    clear aperture.
-    """
+    """Fraction |<t>|^2 of the light that passes as if the plate were flat, t = exp(i phi) over the clear aperture."""
     # A star in focus is a plane wave; out of focus, a phase that is not the plate's would be added.
     field = pupil_field(replace(camera, defocus_m=0.0), height_m, np.inf, wavelength_m)
     cells = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
@@ -141,8 +140,8 @@ def energy_budget(
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        spectrum = fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1)
-        power = (spectrum.real**2 + spectrum.imag**2).astype(np.float64)
+        spectrum = np.asarray(fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1))
+        power = np.square(np.abs(spectrum), dtype=np.float64)
         share = weight * camera.transmission(wavelength)
         passed += share
         band += share * float(envelope @ power @ envelope) / scale

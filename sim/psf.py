@@ -137,6 +137,8 @@ def radial_psf_bank(
             rate = jnp.float32(camera.waves_per_metre(wavelength))
             for d, depth in enumerate(depths_m):
                 source = jnp.asarray(ring_source_waves(camera, depth, wavelength))
-                energy[c, d] += weight * camera.transmission(wavelength) * np.asarray(plan.energy(profile, source, rate))
+                energy[c, d] += (
+                    weight * camera.transmission(wavelength) * np.asarray(plan.energy(profile, source, rate))
+                )
                 on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m)

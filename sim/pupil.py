@@ -50,5 +50,5 @@ class PhaseRows(eqx.Module):
 
 
 def phase_pupil(rows: PhaseRows, waves_per_metre: Float[Array, ""]) -> Complex[Array, "y x"]:
-    """coverage * exp(2 pi i (height * waves_per_metre + source)): eqs. 1, 2 and 4 without the lens."""
+    """Field coverage * exp(2 pi i (height * waves_per_metre + source)): eqs. 1, 2 and 4 without the lens."""
     return rows.coverage * cis(rows.height_m * waves_per_metre + rows.source_waves)

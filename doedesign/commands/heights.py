@@ -85,10 +85,15 @@ def level_map_from(
     if not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
     if source.is_dir():
-        given = [f for f, v in (("step", step_m), ("pitch-um", pitch_m), ("scale", scale_m), ("aperture", aperture_m)) if v]
+        given = [
+            f for f, v in (("step", step_m), ("pitch-um", pitch_m), ("scale", scale_m), ("aperture", aperture_m)) if v
+        ]
         if given:
             raise InputError(
-                f"--{given[0]}", "a run brings its own geometry", "a value", "Leave the option out, or give a height map."
+                f"--{given[0]}",
+                "a run brings its own geometry",
+                "a value",
+                "Leave the option out, or give a height map.",
             )
         return levels_of_run(open_run(source), count)
     if count is None or step_m is None:

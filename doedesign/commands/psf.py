@@ -46,7 +46,9 @@ def drawn_in_masks(folder: Path, camera: Camera) -> np.ndarray:
 
 
 def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[str, np.ndarray]:
-    """Height maps by name: "continuous", "quantised", and "from_masks" where a mask order is given or lies in masks/NAME.
+    """Height maps by name: "continuous", "quantised", and "from_masks" if there is a mask order.
+
+    The order is the one given, or the one in masks/NAME.
 
     Raises:
         InputError: a file that cannot be read.
@@ -65,9 +67,8 @@ def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[
     different = (rebuilt != quantised) & inside
     if different.any():
         y, x = (int(i) for i in np.argwhere(different)[0])
-        raise CheckFailed(
-            [f"{folder}: {int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"]
-        )
+        where = f"{int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"
+        raise CheckFailed([f"{folder}: {where}"])
     return designs | {"from_masks": rebuilt}
 
 
@@ -137,7 +138,9 @@ def _write(
             draw_psfs(fresh / f"{name}_psf.png", camera, bank, near, far)
             draw_mtf(fresh / f"{name}_mtf.png", camera, bank, near, far, lens)
             metrics[name] = design_metrics(camera, designs[name], bank, near)
-        draw_height(fresh / "continuous_height.png", designs["continuous"], None, camera, f"{run.spec.name}, continuous")
+        draw_height(
+            fresh / "continuous_height.png", designs["continuous"], None, camera, f"{run.spec.name}, continuous"
+        )
         draw_encircled(fresh / "quantised_encircled.png", camera, banks["quantised"], near, far, lens)
         (fresh / "metrics.json").write_bytes(canonical_json(metrics))
         digests = {path.name: sha256_file(path) for path in sorted(fresh.iterdir())}

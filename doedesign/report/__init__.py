@@ -2,7 +2,8 @@
 
 Reading order, from what they share to the single picture:
 
-    pictures    the house look: a figure that becomes a PNG file, scale bars, colours, shrinking of large maps
+    pictures    every `draw_...` by name; the door to the files below
+    canvas      the house look: a figure that becomes a PNG file, scale bars, colours, shrinking of large maps
     height      the plate: whole map, two windows of single cells, share of area per height
     psfs        point spread functions of every colour and depth
     curves      MTF and encircled energy over colours and depths, and the history of an optimisation

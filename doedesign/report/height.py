@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from doedesign.report.pictures import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, picture, place, scale_bar, shrunk
+from doedesign.report.canvas import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, picture, place, scale_bar, shrunk
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.units import MM, NM

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.pictures import (
+from doedesign.report.canvas import (
     DPI,
     LIGHT,
     SMALL,
@@ -87,14 +87,14 @@ def draw_psfs(
     side = round(DPI * min(max(10.0 / columns, 1.6), 3.2)) / DPI
     groups = [_group(bank, name, depths, round(DPI * side)) for name, depths in shown.items() if depths]
     width = max(_LEFT + columns * (side + _GAP) + _BETWEEN * (len(groups) - 1) + 0.1, 4.5)
-    words = wrapped(_notes(camera, bank, bool(shown["far"]), len(camera.colours) == 3), width - 0.3)
-    below = 1.15 + 0.15 * (words.count("\n") + 1)
+    words = wrapped(_notes(camera, bank, shown), width - 0.3)
+    below = 1.25 + 0.15 * (words.count("\n") + 1)
     with picture(path, (width, below + len(rows) * (side + _GAP) + _ABOVE)) as figure:
         left = _LEFT
         for group in groups:
             _draw_group(figure, (left, below, side), camera, bank, group, rows)
             across = len(group.depths) * (side + _GAP)
-            _colour_bar(figure, group, (left, below - 0.65, min(across - _GAP, 5.0)))
+            _colour_bar(figure, group, (left, below - 0.62, min(across - _GAP, 5.0)))
             left += across + _BETWEEN
         note(figure, 0.15, 0.1, words)
 
@@ -126,14 +126,14 @@ def _shade(images: Float[np.ndarray, "w v u"], group: _Group) -> np.ndarray:
     """Colours `[v, u, rgba]` of one energy map, or of three as red, green and blue.
 
     Three keep the proportions of their energies as their hue, and the strongest sets the brightness, as R. Lupton et
-    al. (PASP 2004) do for stars; its square root makes up for the darkness of pure colours.
+    al. (PASP 2004) do for stars; a power below one makes up for the darkness of pure colours.
     """
     from matplotlib import colormaps
 
     if len(images) == 1:
         return colormaps[LIGHT](group.norm(images[0]))
     strongest = images.max(axis=0)
-    brightness = np.sqrt(np.clip(group.norm(strongest), 0.0, 1.0))
+    brightness = np.clip(group.norm(strongest), 0.0, 1.0) ** 0.7
     # Dark pixels may lie a rounding error below zero.
     hue = np.clip(images / np.maximum(strongest, np.finfo(np.float32).tiny), 0.0, 1.0)
     return np.moveaxis(hue * brightness, 0, -1)
@@ -178,7 +178,7 @@ def _draw_panel(
     _show(axes, _shade(group.images[picked, column], group), half_um)
     depth = group.depths[column]
     disc_m = camera.defocus_radius_m(bank.depths_m[depth])
-    if disc_m / UM > half_um / 40:
+    if disc_m > _least_disc_m(bank):
         _circle(axes, disc_m, "--")
     shares = {"window": float(bank.energy[picked[0], depth].sum(dtype=np.float64))}
     if group.name == "far":
@@ -262,12 +262,21 @@ def _colour_bar(figure: "Figure", group: _Group, box_in: tuple[float, float, flo
     bar.ax.minorticks_off()
 
 
-def _notes(camera: Camera, bank: "PsfBank", has_far: bool, has_composite: bool) -> str:
-    words = ["dashed: geometric defocus disc"]
-    if has_far:
+def _least_disc_m(bank: "PsfBank") -> float:
+    """Radius below which a circle would hide what it surrounds, or not be seen at all."""
+    return bank.energy.shape[-1] * bank.pixel_m / 80
+
+
+def _notes(camera: Camera, bank: "PsfBank", shown: dict[str, list[int]]) -> str:
+    """What the marks in the panels mean."""
+    words = []
+    depths = [bank.depths_m[i] for positions in shown.values() for i in positions]
+    if any(camera.defocus_radius_m(depth) > _least_disc_m(bank) for depth in depths):
+        words.append("dashed: geometric defocus disc")
+    if shown["far"]:
         width = 2 * _inset_pixels(camera, bank) + bank.energy.shape[-1] % 2
-        spot = "dotted: far spot (first dark ring + 1 pixel)"
-        words.append(f"inset: central {length_text(width * bank.pixel_m)}, {spot}")
-    if has_composite:
+        words.append(f"inset: central {length_text(width * bank.pixel_m)}")
+        words.append("dotted: far spot (first dark ring + 1 pixel)")
+    if len(camera.colours) == 3:
         words.append("together: all three as red, green, blue")
     return "; ".join(words)

@@ -18,9 +18,7 @@ from sim.metrics import participation
 from sim.psf import psf_bank
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-CAMERA = Camera(
-    Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64
-)
+CAMERA = Camera(Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64)
 
 
 def view(near: np.ndarray, far: np.ndarray, lens: float = 1.0) -> View:

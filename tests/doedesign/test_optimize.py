@@ -23,9 +23,9 @@ def unread(path: Path) -> np.ndarray:
 
 def run(spec: Spec, start: State | None = None, stop: int | None = None) -> tuple[State, list[float]]:
     problem, scene = problem_of(spec, {})
-    state = start or initial_state(spec, problem, scene, {}, unread)
-    history = []
-    for state, record in steps(spec, problem, scene, state):
+    begun = start or initial_state(spec, problem, scene, {}, unread)
+    state, history = begun, []
+    for state, record in steps(spec, problem, scene, begun):
         history.append(record.loss)
         if state.step == stop:
             break

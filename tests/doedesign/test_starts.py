@@ -13,9 +13,7 @@ from sim.metrics import energy_within, radius_map_m, spot_radius_m, zeroth_order
 from sim.psf import psf_bank
 
 GREEN = 550e-9
-CAMERA = Camera(
-    Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201
-)
+CAMERA = Camera(Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201)
 
 
 @pytest.mark.parametrize("far_energy", [0.0, 0.25, 0.6, 1.0])
@@ -69,9 +67,7 @@ def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
         return -energy_within(psf, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
 
     options = {"evaluations": 45}
-    found = start_heights(
-        "fresnel", options, CAMERA, radial=False, wavelength_m=GREEN, seed=0, judge=judge
-    )
+    found = start_heights("fresnel", options, CAMERA, radial=False, wavelength_m=GREEN, seed=0, judge=judge)
     ideal = lens(CAMERA, False, GREEN, 1 / depth)
     # Half of the best possible spot energy is inside the main lobe of the search landscape.
     assert judge(found) < 0.9 * judge(ideal) < 0

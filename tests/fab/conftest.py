@@ -9,7 +9,6 @@ import pytest
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.order import write_order
-from fab.units import NM, UM
 
 # Odd and even sides, and a pitch whose half is a whole number of nanometres, as in the automotive design.
 SHAPE = (21, 16)
@@ -17,12 +16,12 @@ SHAPE = (21, 16)
 
 @pytest.fixture(scope="session")
 def levels() -> Levels:
-    return Levels(16, 75 * NM)
+    return Levels(16, 75e-9)
 
 
 @pytest.fixture(scope="session")
 def grid() -> Grid:
-    return Grid(SHAPE, 1.85 * UM)
+    return Grid(SHAPE, 1.85e-6)
 
 
 @pytest.fixture(scope="session")

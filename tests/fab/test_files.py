@@ -184,7 +184,9 @@ def test_read_npy_refuses_archives_and_ruins(tmp_path):
     whole = (tmp_path / "b.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(whole[:-1])
     (tmp_path / "empty.npy").write_bytes(b"")
-    (tmp_path / "huge.npy").write_bytes(whole.replace(b"(4, 4)", b"(9999999999, 9999999999)").replace(b" " * 20, b"", 1))
+    (tmp_path / "huge.npy").write_bytes(
+        whole.replace(b"(4, 4)", b"(9999999999, 9999999999)").replace(b" " * 20, b"", 1)
+    )
     for name in ("a.npz", "cut.npy", "empty.npy", "huge.npy", "missing.npy"):
         with pytest.raises(InputError, match=name):
             read_npy(tmp_path / name)

@@ -57,15 +57,15 @@ def test_a_tiff_of_counts_is_scaled(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (np.where(HEIGHTS > 1e-6, np.nan, HEIGHTS), "finite number.*1 pixel does not, the first at row 2, column 3"),
-        (HEIGHTS - 1e-7, "negative.*2 pixels do not, the first at row 0, column 0"),
+        (np.where(HEIGHTS > 1e-6, np.nan, HEIGHTS), "finite number.*2 wrong pixels, the first at row 2, column 2"),
+        (HEIGHTS - 1e-7, "negative.*1 wrong pixel, the first at row 0, column 0"),
         (HEIGHTS.astype(complex), "real numbers"),
         (HEIGHTS > 1e-7, "real numbers"),
         (HEIGHTS[0], "two axes"),
         (HEIGHTS[None], "two axes"),
         (COUNTS, "integers need a scale"),
         (np.array([["a", "b"]]), "real numbers"),
-        (np.zeros((0, 4)), "h.npy"),
+        (np.zeros((0, 4)), "plain numbers"),
     ],
 )
 def test_bad_arrays_are_refused_by_file_rule_and_cure(tmp_path, values, message):

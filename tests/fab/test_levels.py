@@ -35,7 +35,9 @@ def test_impossible_steps_are_refused(step_m):
 @given(COUNTS, st.data())
 def test_quantising_the_height_of_a_level_map_gives_it_back(count, data):
     levels = Levels(count, 75 * NM)
-    level_map = data.draw(hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, count - 1)))
+    level_map = data.draw(
+        hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, count - 1))
+    )
     assert np.array_equal(quantise(height_of(level_map, levels), levels), level_map)
     assert np.array_equal(quantise(height_of(level_map, levels).astype(np.float32), levels), level_map)
 
@@ -56,7 +58,7 @@ def test_halfway_goes_up_and_the_top_level_catches_the_half_step_above():
 def test_more_than_half_a_step_above_the_top_is_refused():
     heights = np.zeros((2, 3))
     heights[1, 2] = 15.6 * 75 * NM
-    with pytest.raises(InputError, match=r"1 pixel does not, the first at row 1, column 2 \(1.17 um\)"):
+    with pytest.raises(InputError, match=r"1 wrong pixel, the first at row 1, column 2 \(1.17 um\)"):
         quantise(heights, SIXTEEN)
 
 
@@ -64,11 +66,13 @@ def test_more_than_half_a_step_above_the_top_is_refused():
 def test_bad_heights_are_counted_and_located(value, rule):
     heights = np.zeros((4, 4), dtype=np.float32)
     heights[2, 1] = heights[3, 3] = value
-    with pytest.raises(InputError, match=rf"{rule}.*2 pixels do not, the first at row 2, column 1"):
+    with pytest.raises(InputError, match=rf"{rule}.*2 wrong pixels, the first at row 2, column 1"):
         quantise(heights, SIXTEEN)
 
 
-@pytest.mark.parametrize("heights", [np.zeros(4), np.zeros((2, 2), dtype=complex), np.zeros((0, 3)), np.zeros((2, 2), int)])
+@pytest.mark.parametrize(
+    "heights", [np.zeros(4), np.zeros((2, 2), dtype=complex), np.zeros((0, 3)), np.zeros((2, 2), int)]
+)
 def test_other_arrays_are_refused(heights):
     with pytest.raises(InputError, match="two-dimensional"):
         quantise(heights, SIXTEEN)

@@ -16,7 +16,9 @@ COUNTS = st.sampled_from([2, 4, 8, 16, 32, 64])
 @given(COUNTS, st.data())
 def test_joining_undoes_splitting(count, data):
     levels = Levels(count, 75 * NM)
-    level_map = data.draw(hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, count - 1)))
+    level_map = data.draw(
+        hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, count - 1))
+    )
     bit_planes = planes(level_map, levels)
     assert bit_planes.shape == (levels.bits, *level_map.shape)
     assert np.array_equal(levels_of(bit_planes, levels), level_map)

@@ -1,0 +1,278 @@
+"""Curves: MTF and encircled energy of a PSF bank beside the plain lens, and the history of an optimisation.
+
+One small panel per depth, far depths above and near ones below, with a line per colour: solid for the plate, dashed
+for the lens alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.report.canvas import (
+    FAINT,
+    INK,
+    SERIES,
+    colour_label,
+    depth_positions,
+    length_text,
+    line_colours,
+    note,
+    picture,
+    place,
+    spread,
+)
+from fab.units import MM, UM
+from sim.camera import Camera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from scipy.sparse import csr_array
+
+    from sim.psf import PsfBank
+
+_MOST_DEPTHS = 3
+_MOST_COLOURS = 6
+_RADII = 96
+_LENS = {"ls": "--", "lw": 0.9}
+# Inches: a panel's height and least width, room at the left, between columns and rows, and for the legend.
+_HIGH, _WIDE, _LEFT, _ASIDE, _APART, _LEGEND = 1.75, 2.6, 0.65, 0.2, 0.7, 0.35
+_FADED = {"alpha": 0.35, "lw": 0.8}
+
+# (panel, position of a depth in the bank, name of its group)
+_DrawPanel = Callable[["Axes", int, str], None]
+
+
+def draw_mtf(
+    path: str | Path,
+    camera: Camera,
+    bank: "PsfBank",
+    near_m: Sequence[float],
+    far_m: Sequence[float],
+    lens_bank: "PsfBank | None" = None,
+) -> None:
+    """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
+
+    Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of more than three near or far depths, and of more than six colours, an even choice is shown. Light outside the
+    window lowers the contrast of a picture further and is not in these curves.
+
+    Args:
+        path: the PNG file.
+        camera: colours.
+        bank: PSFs of the plate.
+        near_m: near depths of the bank, metres; may be empty.
+        far_m: far depths of the bank, metres; may be empty.
+        lens_bank: PSFs of the plain lens at the same depths, dashed.
+
+    Raises:
+        ValueError: no depth is given, or one is not in a bank.
+        InputError: the system refuses the path.
+    """
+    from sim.metrics import mtf
+
+    hues = line_colours(camera.colours)
+
+    def draw(axes: "Axes", depth: int, group: str) -> None:
+        lowest = MM / (bank.energy.shape[-1] * bank.pixel_m)
+        for of, style in _both(bank, lens_bank, bank.depths_m[depth]):
+            for colour in _shown(camera):
+                frequency, transfer = mtf(of[colour], bank.pixel_m)
+                axes.plot(frequency * MM, transfer, color=hues[colour], **style)
+        if group == "near":
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_xlim(lowest if group == "near" else 0, 0.5 * MM / bank.pixel_m)
+
+    words = ("frequency along x (cycles/mm)", "MTF")
+    _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, "")
+
+
+def draw_encircled(
+    path: str | Path,
+    camera: Camera,
+    bank: "PsfBank",
+    near_m: Sequence[float],
+    far_m: Sequence[float],
+    lens_bank: "PsfBank | None" = None,
+) -> None:
+    """Draw the share of the incident light inside centred circles of growing radius.
+
+    Dotted lines stand at the radius of the geometric defocus disc of near depths, and of the far spot of far ones.
+
+    Args:
+        path: the PNG file.
+        camera: optics of the bank.
+        bank: PSFs of the plate.
+        near_m: near depths of the bank, metres; may be empty.
+        far_m: far depths of the bank, metres; may be empty.
+        lens_bank: PSFs of the plain lens at the same depths, dashed.
+
+    Raises:
+        ValueError: no depth is given, or one is not in a bank.
+        InputError: the system refuses the path.
+    """
+    from sim.metrics import mean_wavelength_m, spot_radius_m
+
+    hues = line_colours(camera.colours)
+    size = bank.energy.shape[-1]
+    radii = bank.pixel_m * np.geomspace(0.5, size / np.sqrt(2), _RADII)
+    rings = ring_shares(size, radii / bank.pixel_m)
+
+    def draw(axes: "Axes", depth: int, group: str) -> None:
+        for of, style in _both(bank, lens_bank, bank.depths_m[depth]):
+            for colour in _shown(camera):
+                axes.plot(radii / UM, np.cumsum(rings @ folded(of[colour]).ravel()), color=hues[colour], **style)
+        spots = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
+        disc = [(camera.defocus_radius_m(bank.depths_m[depth]), FAINT)]
+        for radius, hue in spots if group == "far" else disc:
+            axes.axvline(radius / UM, color=hue, ls=":", lw=1.0)
+        axes.set_xscale("log")
+        axes.set_xlim(radii[0] / UM, radii[-1] / UM)
+        axes.xaxis.set_major_formatter("{x:g}")
+
+    words = ("radius (µm)", "encircled energy")
+    marks = "dotted: far spot (far), geometric defocus disc (near)"
+    _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, marks)
+
+
+def folded(psf: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "v u"]:
+    """Sum of the four quadrants of a PSF laid over each other, the centre at the first sample."""
+    out = np.asarray(psf, np.float64)
+    for _ in range(2):
+        middle = len(out) // 2
+        upper = out[middle:].copy()
+        upper[len(out) % 2 :] += out[:middle][::-1]
+        out = upper.T
+    return out
+
+
+def ring_shares(size: int, radii: Float[np.ndarray, " r"]) -> "csr_array":
+    """Share of every pixel of a folded window between one radius and the next, `[radius, pixel]`.
+
+    Args:
+        size: pixels per side of the whole window.
+        radii: increasing radii in pixels; the first ring reaches from the centre to the first one.
+
+    Every pixel counts as 8 x 8 points, as in `sim.metrics.disc_weights`, so the sums are those of `encircled_energy`;
+    here one table serves all PSFs and all radii.
+    """
+    from scipy.sparse import csr_array
+
+    side = (size + 1) // 2
+    # An odd window's first folded pixel is its middle one, and reaches half a pixel to either side of the centre.
+    points = (np.arange(8 * side) + 0.5) / 8 - 0.5 * (size % 2)
+    ring = np.searchsorted(radii, np.hypot(points[:, None], points[None, :]))
+    pixel = np.arange(8 * side) // 8
+    ring *= side**2
+    ring += pixel[:, None] * side + pixel[None, :]
+    counts = np.bincount(ring.reshape(-1), minlength=(len(radii) + 1) * side**2)
+    return csr_array(counts.reshape(-1, side**2)[:-1]) / 64
+
+
+def _shown(camera: Camera) -> list[int]:
+    return spread(len(camera.colours), _MOST_COLOURS)
+
+
+def _both(
+    bank: "PsfBank", lens_bank: "PsfBank | None", depth_m: float
+) -> list[tuple[Float[np.ndarray, "w y x"], dict[str, Any]]]:
+    """PSFs of the lens and of the plate at a depth, and the style of their lines."""
+    curves: list[tuple[np.ndarray, dict[str, Any]]] = []
+    if lens_bank is not None:
+        curves.append((lens_bank.energy[:, depth_positions(lens_bank, [depth_m], 1)[0]], _LENS))
+    curves.append((bank.energy[:, depth_positions(bank, [depth_m], 1)[0]], {"lw": 1.2}))
+    return curves
+
+
+def _draw_panels(
+    path: str | Path,
+    camera: Camera,
+    bank: "PsfBank",
+    depths_m: tuple[Sequence[float], Sequence[float]],
+    draw: _DrawPanel,
+    words: tuple[str, str],
+    with_lens: bool,
+    marks: str,
+) -> None:
+    """Draw a row of panels per group of depths, (near, far), under a legend; `words` name the two axes."""
+    named = {"far": depths_m[1], "near": depths_m[0]}
+    groups = {name: depth_positions(bank, depths, _MOST_DEPTHS) for name, depths in named.items() if depths}
+    if not groups:
+        raise ValueError("`near_m` and `far_m` must hold at least one depth, but both are empty")
+    columns = max(len(depths) for depths in groups.values())
+    width = max(_WIDE, 4.8 / columns - _ASIDE)
+    legend = _LEGEND + (0.2 if marks else 0.0)
+    size = (_LEFT + columns * (width + _ASIDE), len(groups) * (_HIGH + _APART) + legend)
+    with picture(path, size) as figure:
+        for row, (name, depths) in enumerate(reversed(groups.items())):
+            for column, depth in enumerate(depths):
+                at = (_LEFT + column * (width + _ASIDE), 0.5 + row * (_HIGH + _APART))
+                axes = place(figure, *at, width, _HIGH)
+                draw(axes, depth, name)
+                axes.set_ylim(0, 1.02)
+                axes.grid(color=FAINT, lw=0.4, alpha=0.5)
+                axes.set_title(f"{name}, {length_text(bank.depths_m[depth])}")
+                axes.set_xlabel(words[0], labelpad=2)
+                axes.tick_params(labelleft=column == 0, length=2.5)
+                if column == 0:
+                    axes.set_ylabel(words[1])
+        _legend(figure, camera, with_lens)
+        note(figure, _LEFT, size[1] - 0.45, marks)
+
+
+def _legend(figure: "Figure", camera: Camera, with_lens: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    hues = line_colours(camera.colours)
+    lines = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
+    if with_lens:
+        lines.append(Line2D([], [], color=INK, **_LENS, label="lens alone"))
+    across, up = figure.get_size_inches()
+    corner = (_LEFT / across, 1 - 0.08 / up)
+    look = {"loc": "upper left", "borderaxespad": 0.0, "borderpad": 0.0, "columnspacing": 1.2, "handlelength": 2.2}
+    figure.legend(handles=lines, ncols=len(lines), bbox_to_anchor=corner, **look)
+
+
+def draw_history(path: str | Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the loss and its terms over the steps.
+
+    A long history is drawn faintly under its running mean, since every step looks at another depth.
+
+    Args:
+        path: the PNG file.
+        records: one per step with "step", "loss", "terms" (values, not weighted) and "names" (of the terms).
+
+    Raises:
+        ValueError: no records.
+        InputError: the system refuses the path.
+    """
+    if not records:
+        raise ValueError("`records` must hold at least one step, but is empty")
+    steps = np.array([record["step"] for record in records])
+    values = np.array([[record["loss"], *record["terms"]] for record in records], dtype=np.float64)
+    # A user's objective is named "module:function".
+    labels = ["loss", *(name.rpartition(":")[2][:22] for name in records[0]["names"])]
+    window = max(1, len(steps) // 60)
+    with picture(path, (6.6, 3.4)) as figure:
+        axes = place(figure, 0.65, 0.5, 4.4, 2.75)
+        for i, (label, series) in enumerate(zip(labels, values.T, strict=True)):
+            if i > 0 and np.allclose(series, values[:, 0]):
+                continue  # the only term is the loss
+            look = {"color": INK if i == 0 else SERIES[(i - 1) % len(SERIES)], "zorder": 3 if i == 0 else 2}
+            if window > 1:
+                axes.plot(steps, series, **look, **_FADED)
+            middle = slice((window - 1) // 2, len(steps) - window // 2)
+            mean = np.convolve(series, np.full(window, 1 / window), mode="valid")
+            axes.plot(steps[middle], mean, **look, lw=2.0 if i == 0 else 1.4, label=label)
+        if values.min() > 0 and values.max() > 30 * values.min():
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=min(0.0, float(values.min())))
+        axes.set_xlabel("step", labelpad=2)
+        axes.set_ylabel("value, terms without weight" + (f", mean of {window} steps" if window > 1 else ""))
+        axes.grid(color=FAINT, lw=0.4, alpha=0.5)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)

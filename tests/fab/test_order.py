@@ -1,0 +1,180 @@
+import shutil
+
+import numpy as np
+import pytest
+
+from fab.errors import CheckFailed, InputError
+from fab.files import sha256_file
+from fab.grid import Grid
+from fab.layout import Chrome, Layer, pixel_edges
+from fab.levels import Levels
+from fab.manifest import map_digest, read_manifest
+from fab.masks import unetched_outside
+from fab.order import order_id, write_order
+from fab.verify import read_level_map
+from fab.walker import read_gds
+
+NAMES = [
+    "DOE_SMALL_ALL.gds",
+    "DOE_SMALL_ALL.oas",
+    "DOE_SMALL_CHROME.gds",
+    "DOE_SMALL_LEVELS.npy",
+    "DOE_SMALL_M1_B0_75NM.gds",
+    "DOE_SMALL_M2_B1_150NM.gds",
+    "DOE_SMALL_M3_B2_300NM.gds",
+    "DOE_SMALL_M4_B3_600NM.gds",
+    "DOE_SMALL_PREVIEW.png",
+    "manifest.json",
+]
+
+
+def test_the_folder_holds_the_files_of_a_mask_order(written_order):
+    assert sorted(path.name for path in written_order.iterdir()) == NAMES
+    assert [path.name for path in written_order.parent.iterdir()] == ["small"]
+
+
+def test_every_mask_file_holds_its_own_layer_in_a_cell_of_its_own_name(written_order):
+    for bit, depth in enumerate((75, 150, 300, 600)):
+        stem = f"DOE_SMALL_M{bit + 1}_B{bit}_{depth}NM"
+        layout = read_gds(written_order / f"{stem}.gds")
+        assert layout.cell == stem
+        assert list(layout.shapes) == [Layer(bit + 1)]
+    assert list(read_gds(written_order / "DOE_SMALL_CHROME.gds").shapes) == [Layer(5)]
+    assert len(read_gds(written_order / "DOE_SMALL_ALL.gds").shapes) == 5
+
+
+def test_the_level_map_is_stored_and_drawn(written_order, level_map, levels, grid):
+    blank = unetched_outside(level_map, levels, grid, grid.extent_m[1])
+    assert np.array_equal(np.load(written_order / "DOE_SMALL_LEVELS.npy"), blank)
+    drawn = read_level_map(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid))
+    assert np.array_equal(drawn, blank)
+    assert read_manifest(written_order).level_map_sha256 == map_digest(blank)
+
+
+def test_the_manifest_tells_what_each_mask_is(written_order, level_map, levels, grid):
+    manifest = read_manifest(written_order)
+    blank = unetched_outside(level_map, levels, grid, grid.extent_m[1])
+    assert [(m.mask, m.bit, m.layer, m.datatype, m.depth_nm) for m in manifest.masks] == [
+        (1, 0, 1, 0, 75.0),
+        (2, 1, 2, 0, 150.0),
+        (3, 2, 3, 0, 300.0),
+        (4, 3, 4, 0, 600.0),
+    ]
+    assert all("etched here" in mask.polygon_means for mask in manifest.masks)
+    for mask in manifest.masks:
+        pixels = np.count_nonzero((15 - blank) >> mask.bit & 1)
+        # Areas are rounded to 1e-6 square micrometres.
+        assert mask.area_um2 == pytest.approx(pixels * 1.85**2, abs=1e-6)
+        assert mask.smallest_width_um == mask.smallest_space_um == 1.85
+        assert mask.box_um is not None
+        assert mask.box_um[0] >= -16 * 1.85 / 2
+    assert "chrome stays here" in manifest.chrome.polygon_means
+    assert manifest.chrome.opening_diameter_mm == pytest.approx((16 * 1.85 - 10) / 1000)
+    assert manifest.dbu_nm == 1.0
+    assert manifest.pixel_edges == "every pixel edge is a whole number of 1 nm"
+    assert set(manifest.tools) == {"python", "numpy", "numba", "klayout", "gdstk", "matplotlib"}
+    for entry in manifest.files:
+        assert entry.sha256 == sha256_file(written_order / entry.file)
+        assert entry.bytes == (written_order / entry.file).stat().st_size
+
+
+def test_the_same_inputs_give_the_same_bytes_in_every_file(written_order, tmp_path, level_map, levels, grid):
+    again = tmp_path / "elsewhere" / "again"
+    write_order(again, level_map, levels, grid, grid.extent_m[1], "small", {"height_map": "a test"})
+    for name in NAMES:
+        assert (again / name).read_bytes() == (written_order / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("count", "step_nm", "shape", "fill"),
+    [
+        (2, 275.5, (5, 9), None),
+        (64, 17.25, (6, 6), None),
+        (4, 300.0, (8, 3), 3),  # all blank: four empty layers
+        (16, 75.0, (4, 5), 0),  # all etched
+    ],
+)
+def test_orders_of_every_kind_verify(tmp_path, count, step_nm, shape, fill):
+    levels, grid = Levels(count, step_nm * 1e-9), Grid(shape, 6.45e-6)
+    rng = np.random.default_rng(1)
+    level_map = rng.integers(0, count, shape) if fill is None else np.full(shape, fill)
+    said = []
+    report = write_order(
+        tmp_path / "o", level_map, levels, grid, grid.extent_m[0], "kind", {}, chrome=Chrome(1e-6), say=said.append
+    )
+    assert report.passed
+    assert said[0] == "drawing the masks"
+    manifest = read_manifest(tmp_path / "o")
+    assert len(manifest.masks) == levels.bits
+    assert manifest.chrome.layer == max(5, levels.bits + 1)
+
+
+def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
+    grid = Grid((5, 7), 1e-6 / 3)
+    rng = np.random.default_rng(1)
+    report = write_order(
+        tmp_path / "o", rng.integers(0, 16, (5, 7)), levels, grid, 2e-6, "thirds", {}, chrome=Chrome(1e-7)
+    )
+    assert report.passed
+    assert read_manifest(tmp_path / "o").pixel_edges.startswith("each pixel edge is rounded to 1 nm")
+
+
+def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, level_map, levels, grid):
+    def crooked(bitmap, *edges):
+        found = rectangles(bitmap, *edges)
+        return found[:-1]
+
+    from fab.polygons import rectangles
+
+    monkeypatch.setattr("fab.layout.rectangles", crooked)
+    with pytest.raises(CheckFailed, match=r"ALL\.gds: own reader, every pixel: layer 1/0: \d+ pixel"):
+        write_order(tmp_path / "o", level_map, levels, grid, grid.extent_m[1], "bad", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_earlier_order_is_replaced(order_folder, level_map, levels, grid):
+    write_order(order_folder, level_map, levels, grid, grid.extent_m[1], "other", {})
+    assert read_manifest(order_folder).name == "other"
+    assert not (order_folder / "DOE_SMALL_ALL.gds").exists()
+
+
+def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_map, levels, grid):
+    def write(folder):
+        write_order(folder, level_map, levels, grid, grid.extent_m[1], "other", {})
+
+    (order_folder / "notes.txt").write_text("from the lab")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        write(order_folder)
+    assert (order_folder / "DOE_SMALL_ALL.gds").exists()
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "manifest.json").write_text('{"format": "a run"}')
+    with pytest.raises(InputError, match="format"):
+        write(run)
+    shutil.rmtree(order_folder)
+    order_folder.write_text("a file")
+    with pytest.raises(InputError, match="must be a folder"):
+        write(order_folder)
+    with pytest.raises(InputError, match="order/inside"):
+        write(order_folder / "inside")
+
+
+@pytest.mark.parametrize(
+    ("name", "plain"),
+    [
+        ("small", "SMALL"),
+        ("Auto motive-2", "AUTO_MOTIVE_2"),
+        ("exactly13char", "EXACTLY13CHAR"),
+        ("fourteen_chars", "FOURTEEN_AB12"),
+        ("main", "MAIN"),
+        ("größe", "GR_SSE"),
+    ],
+)
+def test_names_become_what_mask_shops_accept(name, plain):
+    assert order_id(name, "ab12cd") == plain
+    assert len(f"DOE_{plain}_M6_B5_1234P5NM") <= 32
+
+
+def test_a_name_of_which_nothing_is_left_is_refused():
+    with pytest.raises(InputError, match="mask order name"):
+        order_id("***", "ab12cd")

@@ -1,0 +1,215 @@
+import shutil
+
+import numpy as np
+import pytest
+
+from fab.errors import CheckFailed, InputError
+from fab.files import sha256_file
+from fab.grid import Grid
+from fab.layout import Layer, Layout, Shapes, pixel_edges
+from fab.levels import Levels
+from fab.manifest import read_manifest
+from fab.stream import write_gds
+from fab.verify import read_level_map, verify_order
+from fab.walker import read_gds
+
+MASKS = [
+    "DOE_SMALL_ALL.gds",
+    "DOE_SMALL_ALL.oas",
+    "DOE_SMALL_CHROME.gds",
+    "DOE_SMALL_M1_B0_75NM.gds",
+    "DOE_SMALL_M2_B1_150NM.gds",
+    "DOE_SMALL_M3_B2_300NM.gds",
+    "DOE_SMALL_M4_B3_600NM.gds",
+]
+
+
+def problems_of(folder, file, question=""):
+    found = [c for c in verify_order(folder).checks if c.file == file and question in c.question]
+    return [problem for check in found for problem in check.problems]
+
+
+def flip(path, place, mask=0x01):
+    data = bytearray(path.read_bytes())
+    data[place] ^= mask
+    path.write_bytes(data)
+
+
+def redraw(folder, file, change):
+    """Write a mask file again with other shapes."""
+    layout = read_gds(folder / file)
+    write_gds(folder / file, Layout(layout.cell, layout.dbu_m, change(layout.shapes)))
+
+
+def test_a_whole_order_passes_every_question(written_order):
+    report = verify_order(written_order)
+    assert report.passed
+    assert report.differences == ()
+    report.require()
+    asked = {(check.file, check.question) for check in report.checks}
+    for file in MASKS:
+        assert (file, "bytes as in the manifest") in asked
+        assert (file, "gdstk, every pixel") in asked
+        assert file.endswith(".oas") or (file, "own reader, every pixel") in asked
+
+
+@pytest.mark.parametrize("file", [*MASKS, "DOE_SMALL_LEVELS.npy", "DOE_SMALL_PREVIEW.png"])
+@pytest.mark.parametrize("where", [0.0, 0.1, 0.37, 0.5, 0.63, 0.9, 0.9999])
+def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
+    path = order_folder / file
+    flip(path, int(where * path.stat().st_size), 0x10)
+    report = verify_order(order_folder)
+    assert not report.passed
+    assert all(difference.startswith(file) for difference in report.differences)
+    with pytest.raises(CheckFailed, match=file):
+        report.require()
+
+
+def test_every_single_byte_of_a_mask_file_counts(order_folder):
+    path = order_folder / MASKS[3]
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 7):
+        flip(path, place, 0x40)
+        assert any(MASKS[3] in difference for difference in verify_order(order_folder).differences)
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("file", [MASKS[0], MASKS[4]])
+def test_a_missing_pixel_is_located_by_both_readers(order_folder, file):
+    gone = []
+
+    def without_last(shapes):
+        layer = Layer(2)
+        gone.extend(shapes[layer].rectangles[-1].tolist())
+        return {**shapes, layer: Shapes(shapes[layer].rectangles[:-1], shapes[layer].polygons)}
+
+    redraw(order_folder, file, without_last)
+    manifest = read_manifest(order_folder)
+    edges = pixel_edges(manifest.grid())
+    row, column = int(np.searchsorted(edges.y, gone[1])), int(np.searchsorted(edges.x, gone[0]))
+    pixels = (gone[2] - gone[0]) * (gone[3] - gone[1]) // 1850**2
+    told = f"layer 2/0: {pixels} pixel"
+    place = f"from the level map, the first at row {row}, column {column}"
+    for question in ("own reader", "gdstk"):
+        problems = problems_of(order_folder, file, question)
+        assert any(problem.startswith(told) and problem.endswith(place) for problem in problems), problems
+    assert any("bytes instead of" in problem for problem in problems_of(order_folder, file, "bytes"))
+
+
+def test_overlaps_strays_other_shapes_and_other_layers_are_named(order_folder):
+    def spoil(shapes):
+        layer = Layer(1)
+        rects = shapes[layer].rectangles
+        stray = rects[:1] + np.array([[1, 0, 1, 0]], dtype=np.int32)
+        pentagon = np.array([[0, 0], [1850, 0], [1850, 1850], [900, 2000], [0, 1850]], dtype=np.int32)
+        spoiled = Shapes(np.concatenate([rects, rects[:1], stray]), (pentagon,))
+        return {layer: spoiled, Layer(9): Shapes(rects[:2])}
+
+    redraw(order_folder, MASKS[3], spoil)
+    own = " ".join(problems_of(order_folder, MASKS[3], "own reader"))
+    other = " ".join(problems_of(order_folder, MASKS[3], "gdstk"))
+    for words in ("covered more than once", "shapes are no rectangles"):
+        assert words in own
+        assert words in other
+    assert "layer 9/0: 2 shapes on a layer that should be empty" in own
+    assert "1 rectangles are off the pixel raster" in own
+    assert "3 polygons more or less" in own
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p[:-1], "chrome polygons instead of"),
+        (lambda p: (p[0] + 3, *p[1:]), "lie on neither of the two circles"),
+        (lambda p: (p[0], p[0], *p[2:]), "leaves its circle by"),
+        (lambda p: (np.concatenate([p[0][:1], p[0][-1:], p[0][1:-1]]), *p[1:]), "chrome area is off"),
+    ],
+    ids=["missing", "moved", "doubled", "crossed"],
+)
+def test_a_chrome_that_is_no_annulus_is_told(order_folder, change, words):
+    redraw(order_folder, MASKS[2], lambda s: {Layer(5): Shapes(s[Layer(5)].rectangles, change(s[Layer(5)].polygons))})
+    for question in ("own reader", "gdstk"):
+        assert any(words in problem for problem in problems_of(order_folder, MASKS[2], question))
+
+
+def test_an_altered_oasis_file_that_still_parses_is_compared_pixel_by_pixel(order_folder, tmp_path):
+    import klayout.db as kdb
+
+    layout = kdb.Layout()
+    layout.read(str(order_folder / MASKS[1]))
+    shapes = layout.top_cell().shapes(layout.find_layer(3, 0))
+    shapes.clear()
+    options = kdb.SaveLayoutOptions()
+    options.format = "OASIS"
+    layout.write(str(order_folder / MASKS[1]), options)
+    problems = problems_of(order_folder, MASKS[1])
+    assert any(problem.startswith("layer 3/0:") and "from the level map" in problem for problem in problems)
+
+
+def test_another_cell_name_or_unit_is_told(order_folder):
+    layout = read_gds(order_folder / MASKS[3])
+    write_gds(order_folder / MASKS[3], Layout("OTHER", 2e-9, layout.shapes))
+    problems = " ".join(problems_of(order_folder, MASKS[3]))
+    assert "named 'OTHER' instead of 'DOE_SMALL_M1_B0_75NM'" in problems
+    assert "database unit is 2 nm instead of 1 nm" in problems
+
+
+def test_a_swapped_mask_file_fails(order_folder):
+    shutil.copy(order_folder / MASKS[3], order_folder / MASKS[4])
+    problems = " ".join(problems_of(order_folder, MASKS[4]))
+    assert "layer 1/0" in problems
+    assert "layer 2/0" in problems
+
+
+def test_missing_cut_and_unlisted_files_are_named(order_folder):
+    (order_folder / MASKS[3]).unlink()
+    (order_folder / MASKS[4]).write_bytes((order_folder / MASKS[4]).read_bytes()[:500])
+    shutil.copy(order_folder / MASKS[5], order_folder / "EXTRA.GDS")
+    differences = verify_order(order_folder).differences
+    assert f"{MASKS[3]}: bytes as in the manifest: the file is missing" in differences
+    assert any(d.startswith(MASKS[4]) and "cannot be read" in d for d in differences)
+    assert any(d.startswith("EXTRA.GDS") for d in differences)
+
+
+def test_a_damaged_level_map_does_not_put_the_blame_on_the_masks(order_folder):
+    flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
+    assert {d.split(":")[0] for d in verify_order(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
+    (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
+    assert {d.split(":")[0] for d in verify_order(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
+
+
+def test_without_any_level_map_there_is_nothing_to_compare_with(order_folder):
+    (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
+    (order_folder / MASKS[0]).write_bytes(b"ruin")
+    with pytest.raises(CheckFailed, match=r"LEVELS\.npy"):
+        verify_order(order_folder)
+
+
+def test_a_damaged_map_and_a_damaged_mask_are_both_told(order_folder):
+    flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
+    redraw(order_folder, MASKS[0], lambda s: {**s, Layer(1): Shapes(s[Layer(1)].rectangles[1:])})
+    files = {d.split(":")[0] for d in verify_order(order_folder).differences}
+    assert {"DOE_SMALL_LEVELS.npy", MASKS[0]} <= files
+
+
+def test_verifying_changes_nothing(order_folder):
+    before = {path.name: sha256_file(path) for path in order_folder.iterdir()}
+    verify_order(order_folder)
+    assert {path.name: sha256_file(path) for path in order_folder.iterdir()} == before
+
+
+def test_what_is_no_order_is_refused(tmp_path):
+    with pytest.raises(InputError, match="must exist"):
+        verify_order(tmp_path)
+    with pytest.raises(InputError, match="must exist"):
+        verify_order(tmp_path / "missing")
+
+
+def test_a_level_map_is_rebuilt_only_from_separate_pixels(tmp_path):
+    levels, edges = Levels(4, 75e-9), pixel_edges(Grid((2, 2), 1e-6))
+    rects = np.array([[-1000, -1000, 0, 0], [-1000, -1000, 1000, 0]], dtype=np.int32)
+    write_gds(tmp_path / "a.gds", Layout("TOP", 1e-9, {Layer(1): Shapes(rects[:1]), Layer(2): Shapes(rects[1:])}))
+    assert read_level_map(tmp_path / "a.gds", levels, edges).tolist() == [[0, 1], [3, 3]]
+    write_gds(tmp_path / "a.gds", Layout("TOP", 1e-9, {Layer(1): Shapes(rects)}))
+    with pytest.raises(InputError, match=r"a\.gds: layer 1/0 .*1 pixels covered twice"):
+        read_level_map(tmp_path / "a.gds", levels, edges)
