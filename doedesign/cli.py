@@ -19,6 +19,7 @@ app = App(
     name="doedesign",
     help="Design diffractive optical elements and the masks that make them.",
     version=__version__,
+    result_action="return_value",  # and not sys.exit, so that main returns the code
 )
 
 Overrides = Annotated[

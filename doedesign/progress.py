@@ -31,10 +31,14 @@ class _PlainMeter:
 
     def __init__(self, title: str, total: int, start: int) -> None:
         self._title, self._total, self._start = title, total, start
-        self._begun = self._told = time.monotonic()
+        self._begun: float | None = None
+        self._told = time.monotonic()
 
     def advance(self, done: int, note: str = "") -> None:
         now = time.monotonic()
+        if self._begun is None:
+            # The clock starts after the first piece, which also pays for compilation.
+            self._begun, self._start = now, done
         if now - self._told < self._INTERVAL_S and done < self._total:
             return
         self._told = now

@@ -22,7 +22,7 @@ from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
 from fab.polygons import annulus_sectors, doubled_area, rectangles
-from fab.units import MM, NM, UM, format_length
+from fab.units import MM, NM, format_length
 
 __all__ = [
     "Chrome",
@@ -290,8 +290,9 @@ def mask_layout(
     Raises:
         InputError: the map does not belong to the levels or the grid, or a number is out of range.
     """
-    if not 0 < aperture_m <= max(grid.extent_m) * (1 + 1e-9):
-        rule = f"must lie from 0 to the width of the raster, {format_length(max(grid.extent_m))}"
+    side_m = min(grid.extent_m)
+    if not 0 < aperture_m <= side_m * (1 + 1e-9):
+        rule = f"must lie from 0 to the shorter side of the raster, {format_length(side_m)}"
         raise InputError("aperture", rule, format_length(aperture_m), "Give the diameter of the clear aperture.")
     edges = pixel_edges(grid)
     inside = unetched_outside(level_map, levels, grid, aperture_m)

@@ -116,26 +116,23 @@ class Painted:
 
 
 @njit(cache=True, nogil=True)
-def _edge_number(value, edges, scale):  # pragma: no cover - compiled
-    number = int((value - edges[0]) * scale + 0.5)
-    if number < 0 or number >= edges.size or edges[number] != value:
-        return -1
-    return number
-
-
-@njit(cache=True, nogil=True)
 def _paint(rects, x_edges, y_edges, value, canvas):  # pragma: no cover - compiled
     x_scale = (x_edges.size - 1) / (x_edges[-1] - x_edges[0])
     y_scale = (y_edges.size - 1) / (y_edges[-1] - y_edges[0])
+    # Half a pixel below the first edge, so that cutting off the fraction rounds to the nearest edge.
+    x_start = x_edges[0] - 0.5 / x_scale
+    y_start = y_edges[0] - 0.5 / y_scale
     overlaps = 0
     strays = 0
     first = -1
     for i in range(rects.shape[0]):
-        x0 = _edge_number(rects[i, 0], x_edges, x_scale)
-        y0 = _edge_number(rects[i, 1], y_edges, y_scale)
-        x1 = _edge_number(rects[i, 2], x_edges, x_scale)
-        y1 = _edge_number(rects[i, 3], y_edges, y_scale)
-        if x0 < 0 or y0 < 0 or x1 < 0 or y1 < 0:
+        x0 = np.int32((rects[i, 0] - x_start) * x_scale)
+        y0 = np.int32((rects[i, 1] - y_start) * y_scale)
+        x1 = np.int32((rects[i, 2] - x_start) * x_scale)
+        y1 = np.int32((rects[i, 3] - y_start) * y_scale)
+        sound = x0 >= 0 and y0 >= 0 and x1 < x_edges.size and y1 < y_edges.size and x0 < x1 and y0 < y1
+        sound = sound and x_edges[x0] == rects[i, 0] and x_edges[x1] == rects[i, 2]
+        if not (sound and y_edges[y0] == rects[i, 1] and y_edges[y1] == rects[i, 3]):
             if first < 0:
                 first = i
             strays += 1

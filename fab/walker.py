@@ -36,13 +36,16 @@ from fab.units import UM
 
 __all__ = ["read_gds"]
 
-_BLOCK = 1 << 22
+_BLOCK = 1 << 20
 # No record, and so no element of this kind, is longer than its 16-bit length says.
 _LONGEST = 1 << 17
 # The shortest element: a closed triangle.
 _SHORTEST = 4 + 6 + 6 + 4 + 4 * 8 + 4
 _SPOILED = "Write the order again, or fetch the file again."
 _END_OF_FILE = (4).to_bytes(2, "big") + ENDLIB.to_bytes(2, "big")
+# The words that mark an element: length of the record, then its type.
+_BOUNDARY, _LAYER = 4 << 16 | BOUNDARY, 6 << 16 | LAYER
+_ENDEL, _ENDSTR = 4 << 16 | ENDEL, 4 << 16 | ENDSTR
 _MORE, _DONE, _UNEXPECTED, _OPEN = 0, 1, 2, 3
 
 
@@ -51,51 +54,39 @@ def _from_real(data: bytes) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _two(buffer, p):  # pragma: no cover - compiled
-    return (np.int64(buffer[p]) << 8) | np.int64(buffer[p + 1])
+def _walk(words, rects, rect_keys, points, ends, keys):  # pragma: no cover - compiled
+    """Read whole elements from the front of the words; see `_Found` for the arrays that are filled.
 
-
-@njit(cache=True, nogil=True)
-def _four(buffer, p):  # pragma: no cover - compiled
-    return np.int32((_two(buffer, p) << 16) | _two(buffer, p + 2))
-
-
-@njit(cache=True, nogil=True)
-def _walk(buffer, stop, rects, rect_keys, points, ends, keys):  # pragma: no cover - compiled
-    """Read whole elements from the front of the buffer; see `_Body.take` for the arrays.
-
-    Returns how many bytes were read, how many rectangles, polygons and points, and why it stopped.
+    Every record of a boundary ends on a multiple of four bytes from the start of the element, so an element
+    is a row of 32-bit words: BOUNDARY, LAYER with its number across two words, DATATYPE likewise, XY, points,
+    ENDEL. Returns how many words were read, how many rectangles and polygons, and why it stopped.
     """
     p = 0
     count = polygons = used = 0
-    while p + 4 <= stop:
-        kind = _two(buffer, p + 2)
-        if kind == ENDSTR and _two(buffer, p) == 4:
-            return p + 4, count, polygons, used, _DONE
-        if kind != BOUNDARY or _two(buffer, p) != 4:
-            return p, count, polygons, used, _UNEXPECTED
-        if p + 20 > stop:
+    stop = words.size
+    while p < stop:
+        if words[p] == _ENDSTR:
+            return p + 1, count, polygons, _DONE
+        if words[p] != _BOUNDARY:
+            return p, count, polygons, _UNEXPECTED
+        if p + 5 > stop:
             break
-        length = _two(buffer, p + 16)
-        end = p + 20 + length
-        if _two(buffer, p + 4) != 6 or _two(buffer, p + 6) != LAYER:
-            return p + 4, count, polygons, used, _UNEXPECTED
-        if _two(buffer, p + 10) != 6 or _two(buffer, p + 12) != DATATYPE:
-            return p + 10, count, polygons, used, _UNEXPECTED
-        if _two(buffer, p + 18) != XY or length < 36 or length % 8 != 4:
-            return p + 16, count, polygons, used, _UNEXPECTED
-        if end > stop:
+        if words[p + 1] != _LAYER or words[p + 2] & 0xFFFF != 6 or words[p + 3] >> 16 != DATATYPE:
+            return p + 1, count, polygons, _UNEXPECTED
+        length = (words[p + 4] >> 16) & 0xFFFF
+        if words[p + 4] & 0xFFFF != XY or length < 36 or length % 8 != 4:
+            return p + 4, count, polygons, _UNEXPECTED
+        q = p + 5
+        end = q + length // 4 - 1
+        if end >= stop:
             break
-        if _two(buffer, end - 4) != 4 or _two(buffer, end - 2) != ENDEL:
-            return end - 4, count, polygons, used, _UNEXPECTED
-        key = (_two(buffer, p + 8) << 16) | _two(buffer, p + 14)
-        q = p + 20
-        x0, y0 = _four(buffer, q), _four(buffer, q + 4)
-        if _four(buffer, end - 12) != x0 or _four(buffer, end - 8) != y0:
-            return p + 16, count, polygons, used, _OPEN
-        x1, y1 = _four(buffer, q + 8), _four(buffer, q + 12)
-        x2, y2 = _four(buffer, q + 16), _four(buffer, q + 20)
-        x3, y3 = _four(buffer, q + 24), _four(buffer, q + 28)
+        if words[end] != _ENDEL:
+            return end, count, polygons, _UNEXPECTED
+        x0, y0, x1, y1 = words[q], words[q + 1], words[q + 2], words[q + 3]
+        x2, y2, x3, y3 = words[q + 4], words[q + 5], words[q + 6], words[q + 7]
+        if words[end - 2] != x0 or words[end - 1] != y0:
+            return p + 4, count, polygons, _OPEN
+        key = (words[p + 2] & 0xFFFF0000) | (words[p + 3] & 0xFFFF)
         lying = y0 == y1 and x1 == x2 and y2 == y3 and x3 == x0
         standing = x0 == x1 and y1 == y2 and x2 == x3 and y3 == y0
         if length == 44 and (lying or standing) and x0 != x2 and y0 != y2:
@@ -106,15 +97,15 @@ def _walk(buffer, stop, rects, rect_keys, points, ends, keys):  # pragma: no cov
             rect_keys[count] = key
             count += 1
         else:
-            for i in range(length // 8 - 1):
-                points[used, 0] = _four(buffer, q + 8 * i)
-                points[used, 1] = _four(buffer, q + 8 * i + 4)
+            for i in range(q, end - 2, 2):
+                points[used, 0] = words[i]
+                points[used, 1] = words[i + 1]
                 used += 1
             ends[polygons] = used
             keys[polygons] = key
             polygons += 1
-        p = end
-    return p, count, polygons, used, _MORE
+        p = end + 1
+    return p, count, polygons, _MORE
 
 
 class _Found:
@@ -123,6 +114,7 @@ class _Found:
     def __init__(self) -> None:
         most = (_BLOCK + _LONGEST) // _SHORTEST + 1
         self.rects = np.empty((most, 4), dtype=np.int32)
+        self.words = np.empty((_BLOCK + _LONGEST) // 4, dtype=np.int32)
         self.rect_keys = np.empty(most, dtype=np.int64)
         self.points = np.empty(((_BLOCK + _LONGEST) // 8, 2), dtype=np.int32)
         self.ends = np.empty(most, dtype=np.int64)
@@ -132,23 +124,24 @@ class _Found:
 
     def take(self, buffer: NDArray[np.uint8], stop: int) -> tuple[int, int]:
         """Read the whole elements at the front of `buffer[:stop]`; return the bytes used and why it stopped."""
-        read, count, polygons, _, why = _walk(
-            buffer, stop, self.rects, self.rect_keys, self.points, self.ends, self.keys
-        )
-        keys = self.rect_keys[:count]
-        for key in np.unique(keys) if count and (keys != keys[0]).any() else keys[:1]:
-            self.all_rects[int(key)].append(self.rects[:count][keys == key])
+        words = self.words[: stop // 4]
+        np.copyto(words, buffer[: words.size * 4].view(">i4"))
+        read, count, polygons, why = _walk(words, self.rects, self.rect_keys, self.points, self.ends, self.keys)
+        rects, keys = self.rects[:count], self.rect_keys[:count]
+        mixed = count and (keys != keys[0]).any()
+        for key in np.unique(keys) if mixed else keys[:1]:
+            self.all_rects[int(key)].append(rects[keys == key] if mixed else rects.copy())
         start = 0
         for key, end in zip(self.keys[:polygons], self.ends[:polygons], strict=True):
             self.all_polygons[int(key)].append(self.points[start:end].copy())
             start = end
-        return int(read), int(why)
+        return 4 * int(read), int(why)
 
     def shapes(self) -> dict[Layer, Shapes]:
         """Hand over everything, by layer number; the block lists are emptied on the way to save memory."""
         none = [np.empty((0, 4), dtype=np.int32)]
         return {
-            Layer(key >> 16, key & 0xFFFF): Shapes(
+            Layer(key >> 16 & 0xFFFF, key & 0xFFFF): Shapes(
                 np.concatenate(self.all_rects.pop(key, none)), tuple(self.all_polygons.pop(key, ()))
             )
             for key in sorted({*self.all_rects, *self.all_polygons})

@@ -5,7 +5,7 @@ paper's sizes that means cells below a micrometre, which is why `sim.farfield` i
 reference and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda d nu^2)
 and the `"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T.
 Shimobaba, Opt. Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded
-grid is dropped.
+grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate.
 """
 
 from typing import Literal, cast
@@ -22,6 +22,8 @@ from sim.pixel import Banded, pixel_weights
 from sim.pupil import PupilRows, cis
 
 Kernel = Literal["fresnel", "angular_spectrum"]
+
+_UNTAPERED = 0.75  # share of the kernel's band that passes in full
 
 
 class DirectPath(eqx.Module):
@@ -79,17 +81,18 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
             f'Use propagation = "far_field", or a pitch of at most {limit * 1e6:.3g} um '
             f"(N = {int(np.ceil(camera.aperture_m / limit))}) for this aperture.",
         )
-    padded = cast(int, next_fast_len(3 * cells))
     half = camera.window * camera.pixel_m / 2 / pitch
     width = camera.pixel_m * camera.fill / pitch
     kept = 2 * int(np.ceil(half + width + 8))
-    if kept > padded:
+    if 2 * half > 3 * cells:
         raise InputError(
             "sensor.window",
-            f"on the direct path the window must fit on three apertures, {padded * pitch * 1e3:.4g} mm",
+            f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm",
             f"{camera.window * camera.pixel_m * 1e3:.4g} mm",
             "Use a smaller window or the far-field path.",
         )
+    # Light from one rim of the aperture to the far edge of the window must pass the kernel's band untapered.
+    padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
     middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
     first = int(np.floor(middle)) - kept // 2
     weights = pixel_weights(
@@ -130,5 +133,7 @@ def _kernel(
         # Relative to the carrier exp(ikd): sqrt(a - s) - sqrt(a) without cancellation.
         waves = -distance_m * square / (np.sqrt(np.maximum(carrier - square, 0.0)) + np.sqrt(carrier))
         limit = 1 / (wavelength_m * np.sqrt((2 * step * distance_m) ** 2 + 1))
-    passed = (np.abs(frequency)[:, None] <= limit) & (np.abs(frequency)[None, :] <= limit) & (square < carrier)
-    return cis(jnp.asarray(_wrapped(waves))) * jnp.asarray(passed)
+    fall = np.clip((np.abs(frequency) / limit - _UNTAPERED) / (1 - _UNTAPERED), 0.0, 1.0)
+    passed = np.cos(np.pi / 2 * fall) ** 2
+    passed = passed[:, None] * passed[None, :] * (square < carrier)
+    return cis(jnp.asarray(_wrapped(waves))) * jnp.asarray(passed, jnp.float32)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.fft import fft2
+from scipy.fft import fft, fft2, ifft
 
 from sim.camera import Camera, Colour
 from sim.psf import pupil_field
@@ -81,14 +81,49 @@ def participation(psf: Array) -> Array:
 
 
 def mtf(psf: Float[np.ndarray, "y x"], pixel_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Modulation transfer along x: frequencies (cycles per metre, 0 to Nyquist) and |OTF| with OTF(0) = 1.
+    """Modulation transfer along x of a PSF as sampled: frequencies (cycles per metre) and |OTF| with OTF(0) = 1.
 
-    The pixel's own transfer is in it, because the PSF is integrated over pixels. Light outside the window acts as
-    veiling glare and is not in it.
+    For measured PSFs. Where pixels are wider than the Airy disc it depends on where on the grid the image falls.
     """
     line = np.asarray(np.sum(psf, axis=0, dtype=np.float64))
     transfer = np.abs(np.fft.rfft(line))
     return np.fft.rfftfreq(len(line), pixel_m), transfer / transfer[0]
+
+
+def presampled_mtf(
+    camera: Camera,
+    height_m: Float[np.ndarray, "y x"],
+    depth_m: float,
+    colour: Colour,
+    frequencies_per_m: Float[np.ndarray, " f"],
+) -> Float[np.ndarray, " f"]:
+    """Modulation transfer along x before sampling: |OTF| of lens, DOE and pixel, with OTF(0) = 1.
+
+    The OTF is the autocorrelation of the pupil at the lag lambda d nu. For square cells the autocorrelation at whole
+    cells is a sum over cells, and linear between them, so nothing is approximated. It counts all light behind the
+    DOE, also what misses any window, and does not depend on where on the pixel grid the image falls (a PSF that is
+    sampled by pixels wider than the Airy disc does).
+
+    Args:
+        camera: optics.
+        height_m: `[y, x]` the map.
+        depth_m: source depth.
+        colour: colour; several wavelengths add with their weights.
+        frequencies_per_m: spatial frequencies on the sensor, cycles per metre.
+    """
+    total = np.zeros(len(frequencies_per_m), np.complex128)
+    cells = camera.grid.shape[1]
+    for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+        field = np.asarray(pupil_field(camera, height_m, depth_m, wavelength))
+        rows = np.asarray(fft(field, 2 * cells, axis=1, workers=-1))
+        correlation = np.asarray(ifft(np.square(np.abs(rows), dtype=np.float64).sum(axis=0)))[:cells]
+        lag = wavelength * camera.sensor_distance_m * np.asarray(frequencies_per_m) / camera.grid.pitch_m
+        part = np.interp(lag, np.arange(cells), correlation.real, right=0.0) + 1j * np.interp(
+            lag, np.arange(cells), correlation.imag, right=0.0
+        )
+        total += weight * part / correlation[0].real
+    pixel = np.sinc(camera.pixel_m * camera.fill * np.asarray(frequencies_per_m))
+    return np.abs(total * pixel)
 
 
 def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:

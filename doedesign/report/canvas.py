@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -68,9 +68,9 @@ def picture(path: str | Path, size_in: tuple[float, float], title: str = "") -> 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    defaults = {key: value for key, value in mpl.rcParamsDefault.items() if not key.startswith("backend")}
+    settings: Any = {key: value for key, value in mpl.rcParamsDefault.items() if not key.startswith("backend")} | _LOOK
     stream = io.BytesIO()
-    with mpl.rc_context({**defaults, **_LOOK}):
+    with mpl.rc_context(settings):
         figure = Figure(figsize=size_in, dpi=DPI)
         FigureCanvasAgg(figure)
         if title:
@@ -90,7 +90,7 @@ def place(figure: "Figure", left: float, bottom: float, width: float, height: fl
 
 def wrapped(words: str, width_in: float) -> str:
     """Break small words into lines that fit a width."""
-    return textwrap.fill(words, max(20, int(14.5 * width_in)))
+    return textwrap.fill(words, max(20, int(17 * width_in)))
 
 
 def note(figure: "Figure", left: float, bottom: float, words: str) -> None:

@@ -23,6 +23,7 @@ from doedesign.report.canvas import (
     picture,
     place,
     spread,
+    wrapped,
 )
 from fab.units import MM, UM
 from sim.camera import Camera
@@ -30,7 +31,6 @@ from sim.camera import Camera
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
     from scipy.sparse import csr_array
 
     from sim.psf import PsfBank
@@ -41,7 +41,6 @@ _RADII = 96
 _LENS = {"ls": "--", "lw": 0.9}
 # Inches: a panel's height and least width, room at the left, between columns and rows, and for the legend.
 _HIGH, _WIDE, _LEFT, _ASIDE, _APART, _LEGEND = 1.75, 2.6, 0.65, 0.2, 0.7, 0.35
-_FADED = {"alpha": 0.35, "lw": 0.8}
 
 # (panel, position of a depth in the bank, name of its group)
 _DrawPanel = Callable[["Axes", int, str], None]
@@ -57,8 +56,12 @@ def draw_mtf(
 ) -> None:
     """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
 
-    Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of more than three near or far depths, and of more than six colours, an even choice is shown. Light outside the
-    window lowers the contrast of a picture further and is not in these curves.
+    Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of
+    more than three near or far depths, and of more than six colours, an even choice is shown.
+
+    These are curves of the PSF as the sensor samples it (`sim.metrics.mtf`): where the optics resolve more than the
+    pixels, they depend on where in a pixel the spot falls, and the picture says where. Light outside the window lowers
+    the contrast further and is not in them.
 
     Args:
         path: the PNG file.
@@ -88,7 +91,9 @@ def draw_mtf(
         axes.set_xlim(lowest if group == "near" else 0, 0.5 * MM / bank.pixel_m)
 
     words = ("frequency along x (cycles/mm)", "MTF")
-    _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, "")
+    centre = "pixel" if bank.energy.shape[-1] % 2 else "corner of four pixels"
+    marks = f"as sampled by the sensor, spot centred on a {centre}; light outside the window left out"
+    _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, marks)
 
 
 def draw_encircled(
@@ -119,23 +124,26 @@ def draw_encircled(
 
     hues = line_colours(camera.colours)
     size = bank.energy.shape[-1]
-    radii = bank.pixel_m * np.geomspace(0.5, size / np.sqrt(2), _RADII)
+    radii = bank.pixel_m * np.geomspace(1.0, size / np.sqrt(2), _RADII)
     rings = ring_shares(size, radii / bank.pixel_m)
 
     def draw(axes: "Axes", depth: int, group: str) -> None:
         for of, style in _both(bank, lens_bank, bank.depths_m[depth]):
             for colour in _shown(camera):
                 axes.plot(radii / UM, np.cumsum(rings @ folded(of[colour]).ravel()), color=hues[colour], **style)
-        spots = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
-        disc = [(camera.defocus_radius_m(bank.depths_m[depth]), FAINT)]
-        for radius, hue in spots if group == "far" else disc:
+        lines = [(camera.defocus_radius_m(bank.depths_m[depth]), FAINT)]
+        if group == "far":
+            lines = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
+        for radius, hue in lines:
             axes.axvline(radius / UM, color=hue, ls=":", lw=1.0)
         axes.set_xscale("log")
         axes.set_xlim(radii[0] / UM, radii[-1] / UM)
         axes.xaxis.set_major_formatter("{x:g}")
 
     words = ("radius (µm)", "encircled energy")
-    marks = "dotted: far spot (far), geometric defocus disc (near)"
+    spots = ["far spot (far)"] if far_m else []
+    discs = ["geometric defocus disc (near)"] if near_m else []
+    marks = "dotted: " + ", ".join(spots + discs)
     _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, marks)
 
 
@@ -205,8 +213,10 @@ def _draw_panels(
         raise ValueError("`near_m` and `far_m` must hold at least one depth, but both are empty")
     columns = max(len(depths) for depths in groups.values())
     width = max(_WIDE, 4.8 / columns - _ASIDE)
-    legend = _LEGEND + (0.2 if marks else 0.0)
-    size = (_LEFT + columns * (width + _ASIDE), len(groups) * (_HIGH + _APART) + legend)
+    across = _LEFT + columns * (width + _ASIDE)
+    words_above = wrapped(marks, across - _LEFT)
+    legend = _LEGEND + 0.15 * (words_above.count("\n") + 1)
+    size = (across, len(groups) * (_HIGH + _APART) + legend)
     with picture(path, size) as figure:
         for row, (name, depths) in enumerate(reversed(groups.items())):
             for column, depth in enumerate(depths):
@@ -221,7 +231,7 @@ def _draw_panels(
                 if column == 0:
                     axes.set_ylabel(words[1])
         _legend(figure, camera, with_lens)
-        note(figure, _LEFT, size[1] - 0.45, marks)
+        note(figure, _LEFT, size[1] - legend + 0.05, words_above)
 
 
 def _legend(figure: "Figure", camera: Camera, with_lens: bool) -> None:
@@ -262,9 +272,12 @@ def draw_history(path: str | Path, records: Sequence[Mapping[str, Any]]) -> None
         for i, (label, series) in enumerate(zip(labels, values.T, strict=True)):
             if i > 0 and np.allclose(series, values[:, 0]):
                 continue  # the only term is the loss
-            look = {"color": INK if i == 0 else SERIES[(i - 1) % len(SERIES)], "zorder": 3 if i == 0 else 2}
+            look: dict[str, Any] = {
+                "color": INK if i == 0 else SERIES[(i - 1) % len(SERIES)],
+                "zorder": 3 if i == 0 else 2,
+            }
             if window > 1:
-                axes.plot(steps, series, **look, **_FADED)
+                axes.plot(steps, series, **look, alpha=0.35, lw=0.8)
             middle = slice((window - 1) // 2, len(steps) - window // 2)
             mean = np.convolve(series, np.full(window, 1 / window), mode="valid")
             axes.plot(steps[middle], mean, **look, lw=2.0 if i == 0 else 1.4, label=label)
@@ -272,7 +285,7 @@ def draw_history(path: str | Path, records: Sequence[Mapping[str, Any]]) -> None
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=min(0.0, float(values.min())))
-        axes.set_xlabel("step", labelpad=2)
-        axes.set_ylabel("value, terms without weight" + (f", mean of {window} steps" if window > 1 else ""))
+        axes.set_xlabel(f"step (running mean of {window})" if window > 1 else "step", labelpad=2)
+        axes.set_ylabel("loss and its terms without weights")
         axes.grid(color=FAINT, lw=0.4, alpha=0.5)
         axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)

@@ -44,8 +44,8 @@ def draw_height(
         raise ValueError(f"`height_m` must have the grid's shape {grid.shape}, but got {height_m.shape}")
     inside = grid.inside_circle(camera.aperture_m)
     heights = height_m[inside]
-    low, high = _range_m(heights, levels)
-    look = {"cmap": _palette(), "vmin": low / NM, "vmax": high / NM}
+    ends = _range_m(heights, levels)
+    look = {"cmap": _palette(), "vmin": ends[0] / NM, "vmax": ends[1] / NM}
     # At 160 dots per inch, one dot per sample of the overview and six dots per cell of a window.
     with picture(path, (10.1, 5.35), title) as figure:
         whole = place(figure, 0.75, 0.55, 4.2, 4.2)
@@ -55,7 +55,7 @@ def draw_height(
             _draw_window(axes, height_m, inside, grid, window, f"{name}, {length_text(grid.pitch_m)} cells", look)
             _mark(whole, grid, window, name)
         strip = place(figure, 7.95, 0.55, 0.16, 4.2)
-        _draw_shares(strip, place(figure, 8.19, 0.55, 1.75, 4.2), heights, levels, look)
+        _draw_shares(strip, place(figure, 8.19, 0.55, 1.75, 4.2), heights, levels, ends, look)
 
 
 def _palette() -> Any:
@@ -68,7 +68,8 @@ def _range_m(heights: Float[np.ndarray, " n"], levels: Levels | None) -> tuple[f
     """Heights at the two ends of the colours: half a step round the staircase, and more where the map goes beyond."""
     low, high = (float(heights.min()), float(heights.max())) if heights.size else (0.0, 0.0)
     if levels is not None:
-        return min(low, -0.5 * levels.step_m), max(high, (levels.count - 0.5) * levels.step_m)
+        half = levels.step_m / 2
+        return min(low, 0.0) - half, max(high, (levels.count - 1) * levels.step_m) + half
     return (low, high) if high > low else (low - NM, high + NM)
 
 
@@ -115,7 +116,7 @@ def _draw_whole(
     factor = max(grid.shape) / _MOST
     averaged = f", mean over about {factor:.2g} × {factor:.2g}" if factor > 1 else ""
     axes.set_title(f"{grid.shape[1]} × {grid.shape[0]} cells{averaged}")
-    words = f"dashed: clear aperture {length_text(camera.aperture_m)}"
+    words = f"clear aperture {length_text(camera.aperture_m)}"
     axes.text(1, -0.075, words, transform=axes.transAxes, ha="right", va="top", fontsize=SMALL, color=MARK)
     axes.set_xlabel("x (mm)", labelpad=2)
     axes.set_ylabel("y (mm)", labelpad=2)
@@ -153,47 +154,60 @@ def _mark(axes: "Axes", grid: Grid, window: tuple[slice, slice], name: str) -> N
     axes.annotate(name, corner, textcoords="offset points", fontsize=SMALL, bbox=style, **side)
 
 
-def _bins_m(heights: Float[np.ndarray, " n"], levels: Levels | None, ends_m: tuple[float, float]) -> np.ndarray:
-    """Edges of the bins: one bin per level where every height is a level, narrow ones otherwise."""
-    if levels is None:
-        return np.linspace(*ends_m, _FINE_BINS + 1)
-    steps = heights / levels.step_m
-    # float32 keeps a level to 1e-6 of a step; a thousandth is far below what any process distinguishes.
-    if np.max(np.abs(steps - np.rint(steps)), initial=0.0) < 1e-3:
-        first, last = (round(end / levels.step_m + sign) for end, sign in zip(ends_m, (0.499, -0.499), strict=True))
-        return (np.arange(first, last + 2) - 0.5) * levels.step_m
-    return np.linspace(*ends_m, _FINE_BINS + 1)
+def height_shares(
+    heights: Float[np.ndarray, " n"], levels: Levels | None, ends_m: tuple[float, float]
+) -> tuple[Float[np.ndarray, " edge"], Float[np.ndarray, " bin"]]:
+    """Share of the cells at every height.
+
+    Args:
+        heights: heights of the cells, metres.
+        levels: the staircase, or None.
+        ends_m: range that holds all heights, metres.
+
+    Returns:
+        Edges of the bins in metres and the shares, which sum to 1: one bin per level where every height is a level,
+        narrow bins otherwise.
+    """
+    edges = np.linspace(*ends_m, _FINE_BINS + 1)
+    if levels is not None and heights.size:
+        steps = heights / levels.step_m
+        whole = np.rint(steps)
+        # float32 keeps a level to 1e-6 of a step; a thousandth is far below what any process distinguishes.
+        if np.abs(steps - whole).max() < 1e-3:
+            first, last = min(0, int(whole.min())), max(levels.count - 1, int(whole.max()))
+            edges = (np.arange(first, last + 2) - 0.5) * levels.step_m
+    counts, _ = np.histogram(heights, edges)
+    return edges, counts / max(heights.size, 1)
 
 
 def _draw_shares(
-    strip: "Axes", axes: "Axes", heights: Float[np.ndarray, " n"], levels: Levels | None, look: dict[str, Any]
+    strip: "Axes",
+    axes: "Axes",
+    heights: Float[np.ndarray, " n"],
+    levels: Levels | None,
+    ends_m: tuple[float, float],
+    look: dict[str, Any],
 ) -> None:
     """Draw the colour scale and, along it, the share of the clear aperture's area at every height."""
     from matplotlib.colors import Normalize
 
     low, high = look["vmin"], look["vmax"]
-    strip.imshow(
-        np.linspace(low, high, 512)[:, None],
-        origin="lower",
-        extent=(0, 1, low, high),
-        aspect="auto",
-        **look,
-    )
+    scale = np.linspace(low, high, 512)[:, None]
+    strip.imshow(scale, origin="lower", extent=(0, 1, low, high), aspect="auto", **look)
     strip.set_xticks([])
     strip.set_ylabel("height above the deepest floor (nm)", labelpad=3)
     if levels is not None:
         strip.set_yticks((levels.heights_m() / NM)[:: max(1, levels.count // 16)])
-    edges = _bins_m(heights, levels, (low * NM, high * NM))
-    counts, _ = np.histogram(heights, edges)
-    shares = 100 * counts / max(heights.size, 1)
+    edges, shares = height_shares(heights, levels, ends_m)
     middles = (edges[:-1] + edges[1:]) / 2 / NM
-    one_each = len(shares) < _FINE_BINS
-    thickness = (edges[1] - edges[0]) / NM * (0.8 if one_each else 1.0)
-    axes.barh(middles, shares, thickness, color=look["cmap"](Normalize(low, high)(middles)), ec=INK, lw=0.4 * one_each)
+    fine = len(shares) == _FINE_BINS
+    thickness = (edges[1] - edges[0]) / NM * (1.0 if fine else 0.8)
+    hues = look["cmap"](Normalize(low, high)(middles))
+    axes.barh(middles, 100 * shares, thickness, color=hues, ec=INK, lw=0.0 if fine else 0.4)
     axes.set_ylim(low, high)
     axes.set_yticks([])
     axes.set_xlim(left=0)
-    axes.set_xlabel(f"area per {'level' if one_each else length_text(edges[1] - edges[0])} (%)", labelpad=2)
+    axes.set_xlabel(f"area per {(edges[1] - edges[0]) / NM:.3g} nm (%)" if fine else "area per level (%)", labelpad=2)
     axes.set_title("share of the clear aperture")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)

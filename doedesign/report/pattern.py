@@ -1,6 +1,7 @@
 """The picture of a pattern: the target beside what the plate draws."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -8,6 +9,11 @@ from jaxtyping import Float
 from doedesign.report.canvas import DPI, LIGHT, picture, place, shrunk
 from fab.units import UM
 from sim.camera import Camera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.image import AxesImage
 
 _SIDE = 3.2
 
@@ -42,28 +48,38 @@ def draw_pattern(
 
     if target.shape != achieved.shape:
         raise ValueError(f"`achieved` must have the target's shape {target.shape}, but got {achieved.shape}")
-    dots = round(_SIDE * DPI)
-    images = [shrunk(image, dots) for image in (target, achieved)]
+    images = [shrunk(image, round(_SIDE * DPI)) for image in (target, achieved)]
     # Speckle has rare pixels many times brighter than the rest, which would darken an even target.
-    top = max(float(images[0].max()), float(np.quantile(images[1], 0.9995)), np.finfo(np.float32).tiny)
+    top = max(float(images[0].max()), float(np.quantile(images[1], 0.9995)), 1e-30)
     norm = PowerNorm(0.5, 0.0, top, clip=True)
-    ends = [sign * size * camera.pixel_m / UM / 2 for size in reversed(target.shape) for sign in (-1, 1)]
     with picture(path, (8.3, 4.0)) as figure:
-        for image, title, left in zip(
-            images,
-            ("target", f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %"),
-            (0.75, 4.05),
-            strict=True,
-        ):
-            axes = place(figure, left, 0.5, _SIDE, _SIDE)
-            shown = axes.imshow(image, origin="lower", extent=ends, norm=norm, cmap=LIGHT, interpolation="auto")
-            axes.set_title(title)
-            axes.set_xlabel("x (µm)", labelpad=2)
-            axes.tick_params(labelleft=left < 1, length=2.5)
-            for axis in (axes.xaxis, axes.yaxis):
-                axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-            if left < 1:
-                axes.set_ylabel("y (µm)", labelpad=2)
+        wanted = place(figure, 0.75, 0.5, _SIDE, _SIDE)
+        _draw(wanted, images[0], target.shape, camera.pixel_m, norm)
+        wanted.set_title("target")
+        wanted.set_ylabel("y (µm)", labelpad=2)
+        made = place(figure, 4.05, 0.5, _SIDE, _SIDE)
+        shown = _draw(made, images[1], achieved.shape, camera.pixel_m, norm)
+        made.set_title(f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %")
+        made.tick_params(labelleft=False)
         above = "max" if float(images[1].max()) > top else "neither"
         bar = figure.colorbar(shown, cax=place(figure, 7.35, 0.5, 0.12, _SIDE), extend=above, format="{x:.2g}")
+        bar.locator = MaxNLocator(4)
+        bar.update_ticks()
         bar.set_label("share of light per pixel")
+
+
+def _draw(
+    axes: "Axes", image: Float[np.ndarray, "v u"], shape: tuple[int, ...], pixel_m: float, norm: "Normalize"
+) -> "AxesImage":
+    """Draw a picture of a window of `shape` pixels with axes in micrometres from its centre."""
+    from matplotlib.ticker import MaxNLocator
+
+    up, right = (size * pixel_m / UM / 2 for size in shape)
+    shown = axes.imshow(
+        image, origin="lower", extent=(-right, right, -up, up), norm=norm, cmap=LIGHT, interpolation="auto"
+    )
+    axes.set_xlabel("x (µm)", labelpad=2)
+    axes.tick_params(length=2.5)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    return shown

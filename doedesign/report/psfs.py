@@ -116,7 +116,8 @@ def _scale(images: Float[np.ndarray, "w d v u"], brightest: float) -> "LogNorm":
     from matplotlib.colors import LogNorm
 
     top = brightest if brightest > 0 else 1.0
-    ordered = np.sort(images, axis=None)
+    # Dark pixels may lie a rounding error below zero.
+    ordered = np.sort(np.maximum(images, 0.0), axis=None)
     light = np.cumsum(ordered, dtype=np.float64)
     dim = float(ordered[np.searchsorted(light, _BLACK * light[-1])])
     return LogNorm(min(max(dim, 1e-7 * top), 1e-2 * top), top, clip=True)

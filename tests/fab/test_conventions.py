@@ -1,5 +1,7 @@
 """What a lab and every other module rely on: one place that pins the conventions of the masks."""
 
+from typing import Any
+
 import gdstk
 import klayout.db as kdb
 import numpy as np
@@ -20,7 +22,8 @@ def drawn(tmp_path, level_map):
     """Return the polygons of each layer in micrometres, as another library reads them."""
     write_gds(tmp_path / "a.gds", mask_layout(level_map, LEVELS, GRID, 8e-6, "DOE", Chrome(overlap_m=1e-6)))
     found = {}
-    for polygon in gdstk.read_gds(str(tmp_path / "a.gds")).cells[0].polygons:
+    cells: list[Any] = gdstk.read_gds(str(tmp_path / "a.gds")).cells
+    for polygon in cells[0].polygons:
         found.setdefault((polygon.layer, polygon.datatype), []).append(polygon)
     return found
 

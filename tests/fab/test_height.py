@@ -123,4 +123,4 @@ def test_a_height_map_belongs_to_its_grid():
     with pytest.raises(InputError, match="aperture"):
         HeightMap(HEIGHTS, Grid((3, 4), UM), 0.0)
     with pytest.raises(InputError, match="float32 or float64"):
-        HeightMap(COUNTS, Grid((3, 4), UM), UM)
+        HeightMap(HEIGHTS.astype(np.float16), Grid((3, 4), UM), UM)

@@ -100,7 +100,7 @@ def test_orders_of_every_kind_verify(tmp_path, count, step_nm, shape, fill):
     level_map = rng.integers(0, count, shape) if fill is None else np.full(shape, fill)
     said = []
     report = write_order(
-        tmp_path / "o", level_map, levels, grid, grid.extent_m[0], "kind", {}, chrome=Chrome(1e-6), say=said.append
+        tmp_path / "o", level_map, levels, grid, min(grid.extent_m), "kind", {}, chrome=Chrome(1e-6), say=said.append
     )
     assert report.passed
     assert said[0] == "drawing the masks"
@@ -113,7 +113,7 @@ def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
     grid = Grid((5, 7), 1e-6 / 3)
     rng = np.random.default_rng(1)
     report = write_order(
-        tmp_path / "o", rng.integers(0, 16, (5, 7)), levels, grid, 2e-6, "thirds", {}, chrome=Chrome(1e-7)
+        tmp_path / "o", rng.integers(0, 16, (5, 7)), levels, grid, 1.6e-6, "thirds", {}, chrome=Chrome(1e-7)
     )
     assert report.passed
     assert read_manifest(tmp_path / "o").pixel_edges.startswith("each pixel edge is rounded to 1 nm")

@@ -1,3 +1,5 @@
+from contextlib import suppress
+
 import gdstk
 import numpy as np
 import pytest
@@ -115,10 +117,9 @@ def test_flipped_bytes_never_pass_for_an_error_of_the_program(gds):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << int(rng.integers(8))
         gds.write_bytes(damaged)
-        try:
+        # Read or refused: any other exception would fail here.
+        with suppress(InputError):
             read_gds(gds)
-        except InputError as error:
-            assert "a.gds" in str(error)
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -6,7 +6,6 @@ from scipy.special import j0, j1
 
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.camera import Camera
-from sim.farfield import plan_far_field
 from sim.metrics import encircled_energy, mtf
 from sim.pixel import disc_autocorrelation
 from sim.psf import psf_bank
@@ -40,10 +39,10 @@ def test_profile(pixel_m: float, window: int, fill: float):
 
 
 def test_encircled_energy():
-    camera = make_camera(600, 1.2e-3, 4e-3, 0.5e-6, 161)
-    radii = np.array([1.0, 2.0, 3.0, 5.0, 8.0, 16.0]) * YELLOW_M * camera.focal_length_m / camera.aperture_m
+    camera = make_camera(600, 1.2e-3, 4e-3, 0.25e-6, 161)
+    radii = np.array([1.0, 2.0, 3.0, 5.0, 8.0]) * YELLOW_M * camera.focal_length_m / camera.aperture_m
     v = np.pi * radii * camera.aperture_m / (YELLOW_M * camera.focal_length_m)
-    # Four pixels per lambda f / D: the rim of the disc is drawn in eighths of a pixel.
+    # Eight pixels per lambda f / D; a rim that cuts a steep part of the profile is blurred by half of one.
     wanted = 1 - j0(v) ** 2 - j1(v) ** 2
     np.testing.assert_allclose(encircled_energy(flat_psf(camera), camera.pixel_m, radii), wanted, atol=3e-3)
 
@@ -54,7 +53,7 @@ def test_transfer_function(pixel_m: float):
     frequency, transfer = mtf(flat_psf(camera), pixel_m)
     cutoff = camera.aperture_m / (YELLOW_M * camera.focal_length_m)
     wanted = np.zeros_like(frequency)
-    for alias in (-1, 0, 1):  # pixels sample: what lies beyond Nyquist folds back
+    for alias in range(-3, 4):  # pixels sample: what lies beyond Nyquist folds back
         # An even window's middle is a pixel corner; the fold changes sign with it, as |OTF| sees.
         true = frequency + alias / pixel_m
         wanted += disc_autocorrelation(true / cutoff) * np.sinc(true * pixel_m) * (-1) ** alias
@@ -73,5 +72,4 @@ def test_the_bright_middle_by_hand(fill: float):
     """Energy of the middle pixel, if it is much smaller than the disc, is the peak density times its area."""
     camera = make_camera(200, 0.2e-3, 8e-3, 0.5e-6, 21, fill=fill)  # lambda f / D = 23.6 um
     peak = np.pi / 4 * (0.2e-3 / (YELLOW_M * 8e-3)) ** 2 * (0.5e-6 * fill) ** 2
-    assert plan_far_field(camera, YELLOW_M).length >= 6 * 200  # so small a pixel asks for the densest samples
     assert flat_psf(camera)[10, 10] == pytest.approx(peak, rel=3e-3)

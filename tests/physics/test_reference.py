@@ -21,20 +21,32 @@ def field64(camera: Camera, height: np.ndarray, depth_m: float, wavelength_m: fl
 @pytest.mark.parametrize("wavelength_m", [486e-9, 589e-9, 656e-9])
 @pytest.mark.parametrize(("pixel_m", "fill"), [(1.85e-6, 1.0), (3.7e-6, 1.0), (1.85e-6, 0.8)])
 def test_wrapped_sixteen_level_plate(wavelength_m: float, pixel_m: float, fill: float):
-    camera = make_camera(512, 1e-3, 2e-3, pixel_m, 96, wavelength_m=wavelength_m, fill=fill)
+    camera = make_camera(512, 1e-3, 2e-3, pixel_m, 64, wavelength_m=wavelength_m, fill=fill)
     height = wrapped_map(512)
     got = psf_bank(camera, height, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
     wanted = oversampled_psf(camera, wavelength_m, field64(camera, height, np.inf, wavelength_m))
-    error = relative_error(got, wanted)
-    assert error < 3e-3  # the project's target
+    assert relative_error(got, wanted) < 3e-3  # the project's target
     assert got.sum() == pytest.approx(wanted.sum(), rel=2e-4)  # the mean is weighted most; see `_MEAN_WEIGHT`
+
+
+@pytest.mark.parametrize("wavelength_m", [486e-9, 656e-9])
+@pytest.mark.parametrize(("pixel_m", "fill"), [(1.85e-6, 1.0), (3.7e-6, 1.0), (1.85e-6, 0.6)])
+def test_a_plan_knows_its_error(wavelength_m: float, pixel_m: float, fill: float, rng: np.random.Generator):
+    """A plate of noise makes the fully developed speckle that the prediction is for."""
+    camera = make_camera(256, 0.5e-3, 1e-3, pixel_m, 48, wavelength_m=wavelength_m, fill=fill)
+    height = rng.uniform(0, 1, (256, 256)) / camera.waves_per_metre(wavelength_m)
+    got = psf_bank(camera, height, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
+    # Forty samples per pixel, for a reference that is itself better than 3e-4.
+    wanted = oversampled_psf(camera, wavelength_m, field64(camera, height, np.inf, wavelength_m), 40)
     predicted = plan_far_field(camera, wavelength_m).expected_error
-    assert predicted / 2 < error < 2 * predicted
+    # Speckle's mean is integrated almost exactly; the prediction is about what varies.
+    assert predicted / 2 < np.linalg.norm(got - wanted) / np.linalg.norm(wanted - wanted.mean()) < 2 * predicted
+    assert relative_error(got, wanted) < predicted
 
 
 @pytest.mark.parametrize("depth_m", [0.02, 1.0])
 def test_near_sources_too(depth_m: float):
-    camera = make_camera(512, 1e-3, 2e-3, 1.85e-6, 96)
+    camera = make_camera(512, 1e-3, 2e-3, 1.85e-6, 64)
     height = wrapped_map(512, seed=1)
     got = psf_bank(camera, height, [depth_m]).energy[0, 0] / camera.transmission(589e-9)
     wanted = oversampled_psf(camera, 589e-9, field64(camera, height, depth_m, 589e-9))
@@ -43,14 +55,14 @@ def test_near_sources_too(depth_m: float):
 
 @pytest.mark.parametrize("depth_m", [np.inf, 0.02])
 def test_rings_against_a_raster_eight_times_finer(depth_m: float):
-    camera = make_camera(192, 0.375e-3, 1.5e-3, 1.85e-6, 96)
+    camera = make_camera(192, 0.375e-3, 1.5e-3, 1.85e-6, 64)
     noise = gaussian_filter1d(np.random.default_rng(0).normal(size=ring_count(camera)), 6)
     profile = np.mod(noise * 6e-6, 1.2e-6)
     plan = plan_hankel(camera, 589e-9)
     source = jnp.asarray(ring_source_waves(camera, depth_m, 589e-9))
     rate = jnp.float32(camera.waves_per_metre(589e-9))
     got = np.asarray(plan.energy(jnp.asarray(profile, jnp.float32), source, rate))
-    fine = make_camera(192 * 8, 0.375e-3, 1.5e-3, 1.85e-6, 96)
+    fine = make_camera(192 * 8, 0.375e-3, 1.5e-3, 1.85e-6, 64)
     raster = psf_bank(fine, revolve(np.repeat(profile, 8), fine.grid), [depth_m]).energy[0, 0]
     # The raster's rule is good to 2e-3, its staircase to 2e-3, the rings' interpolation to 1e-3.
     assert relative_error(got, raster.astype(np.float64) / camera.transmission(589e-9)) < 4e-3

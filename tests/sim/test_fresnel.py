@@ -29,8 +29,8 @@ def test_operators_pass_or_stop_but_never_amplify(kernel: str):
     plan = plan_direct(make_camera(120, 0.12e-3, 1e-3, 1e-6, 40), YELLOW_M, kernel)  # pyright: ignore[reportArgumentType]
     assert np.abs(np.abs(plan.lens) - 1).max() < 1e-5  # the accuracy of `cis`
     modulus = np.abs(plan.kernel)
-    assert np.all((modulus == 0) | (np.abs(modulus - 1) < 1e-5))
+    assert modulus.max() < 1 + 1e-5
     assert modulus[0, 0] == pytest.approx(1, abs=1e-5)
     # Band-limited: the highest frequencies would leave the padded grid.
-    assert np.all(modulus[180] == 0)
-    assert np.all(modulus[:, 180] == 0)
+    assert modulus[180].max() < 1e-12
+    assert modulus[:, 180].max() < 1e-12
