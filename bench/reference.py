@@ -27,7 +27,7 @@ def make_camera(
     fill: float = 1.0,
     defocus_m: float = 0.0,
 ) -> Camera:
-    """Camera of one colour with a fused-silica plate whose grid is as wide as the clear aperture (lengths in metres)."""
+    """Camera of one colour with a fused-silica plate, its grid as wide as the clear aperture (lengths in metres)."""
     colour = Colour("only", (wavelength_m,), (1.0,))
     grid = Grid((cells, cells), aperture_m / cells)
     return Camera(grid, aperture_m, "fused_silica", (colour,), focal_length_m, pixel_m, window, fill, defocus_m)

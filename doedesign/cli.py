@@ -148,7 +148,7 @@ def psf(
     depths_m = [inf if text == "inf" else _length("--depths", text) or 0.0 for text in depths]
     if any(not z > 0 for z in depths_m):
         raise InputError("--depths", "must be positive", ", ".join(depths), 'For example --depths "5 cm".')
-    if any(abs(angle) > 60 for angle in field_deg):
+    if not all(abs(angle) <= 60 for angle in field_deg):
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), _say)
     _print([folder, *sorted(folder.iterdir())], json_)

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from doedesign.objectives import Term
 from doedesign.patterns import spot_centres_m
-from doedesign.problem import lens_participation
 from doedesign.spec import Spec
 from fab.units import parse_length
 from sim.camera import Camera
@@ -27,7 +26,7 @@ from sim.psf import PsfBank
 
 
 def design_metrics(
-    camera: Camera, height_m: Float[np.ndarray, "y x"], bank: PsfBank, near_m: tuple[float, ...]
+    camera: Camera, height_m: Float[np.ndarray, "y x"], bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank
 ) -> list[dict[str, Any]]:
     """One row per colour and depth of a bank.
 
@@ -36,13 +35,14 @@ def design_metrics(
         height_m: `[y, x]` the map the bank was made from.
         bank: its PSFs on the axis.
         near_m: which of the bank's depths are obstructions.
+        lens: PSFs of the plain lens at the same depths.
 
     Returns:
         rows with the energy budget; for far depths the far-spot energy; for near depths ring:disc, the
         concentration relative to the plain lens and its lower bound, the square of the far-spot energy (design.md §4).
     """
     far_m = [z for z in bank.depths_m if z not in near_m]
-    lens = lens_participation(camera, near_m)
+    plain = participation(jnp.asarray(lens.energy))
     rows = []
     for c, colour in enumerate(camera.colours):
         wavelength = mean_wavelength_m(colour)
@@ -59,7 +59,7 @@ def design_metrics(
             row |= {"in_window": float(psf.sum(dtype=np.float64)), "zeroth_order": order, "budget": budget}
             if depth in near_m:
                 ring = ring_to_disc(psf, camera, depth)
-                concentration = float(participation(jnp.asarray(psf))) / float(lens[c, near_m.index(depth)])
+                concentration = float(participation(jnp.asarray(psf))) / float(plain[c, d])
                 row |= {"ring_to_disc": ring.ratio if np.isfinite(ring.ratio) else None}
                 row |= {"disc_radius_m": ring.disc_radius_m, "concentration": concentration}
                 row |= {"concentration_bound": max(far_energies) ** 2 if far_energies else None}

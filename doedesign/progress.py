@@ -1,4 +1,4 @@
-"""Progress of long work: an injected object, silent by default.
+"""Progress of long work.
 
 On a terminal a bar with rate, losses and time left; otherwise plain lines, one in about ten seconds, so that a
 log stays short. All of it goes to stderr; stdout is for results.
@@ -17,13 +17,6 @@ class Meter(Protocol):
     def advance(self, done: int, note: str = "") -> None:
         """`done` of the total are finished; `note` is a few words on how it goes."""
         ...
-
-
-class SilentMeter:
-    """Says nothing."""
-
-    def advance(self, done: int, note: str = "") -> None:
-        """Ignore the progress."""
 
 
 class _PlainMeter:

@@ -11,13 +11,18 @@
         *.png                   pictures
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
-disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes.
+disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
+process at a time works in a run folder.
 """
 
+import contextlib
+import fcntl
 import io
 import json
-import zipfile
-from collections.abc import Mapping, Sequence
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +36,9 @@ from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json
 
 FORMAT = "doedesign run 1"
 CHECKPOINT = "checkpoint.npz"
+
+# Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
+_UNFINISHED = re.compile(r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|psf\.new)\.[a-z0-9_]{8}")
 
 
 @dataclass(frozen=True)
@@ -64,38 +72,92 @@ def input_digests(files: Mapping[str, Path]) -> dict[str, str]:
     return {key: sha256_file(path) for key, path in files.items()}
 
 
-def begin_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Sequence[str]) -> Run:
-    """Open a folder for a spec: a new run, an unfinished one to resume, or a finished one.
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a run folder, and clear away what a killed one was writing there.
+
+    The system lets go of the folder when this process ends, however it ends.
+
+    Args:
+        folder: the run folder; made if missing.
+
+    Raises:
+        InputError: another process works in the folder, or the system refuses it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise explain_os_error(error, folder) from error
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise InputError(
+                    str(folder), "only one process may work in a run folder", "a second one", "Wait for the first."
+                ) from error
+        for path in folder.iterdir():
+            if _UNFINISHED.fullmatch(path.name):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> Iterator[Run]:
+    """Keep a folder for a spec: one for a new run, an unfinished run to resume, or a finished one.
 
     Args:
         folder: the run folder; made if missing.
         spec: the spec.
         inputs: digests of the files the spec names.
-        overrides: `--set` overrides that led to the spec, for the record.
+
+    Yields:
+        the run. Nothing is written before `begin_run`.
 
     Raises:
-        InputError: the folder belongs to another spec, to other inputs, or to something else altogether.
+        InputError: the folder belongs to another spec, to other inputs, or to something else altogether; its
+            results changed since; or another process works in it.
     """
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / MANIFEST_NAME).is_file()):
-        raise InputError(
-            str(folder), "a run needs a new or empty folder, or its own", "other content", "Choose another --out."
-        )
-    if (folder / MANIFEST_NAME).is_file():
-        found = read_json(folder / MANIFEST_NAME)
-        _require_run(folder, found)
-        wanted = _manifest(spec, inputs, overrides, "running")
-        if any(found.get(key) != wanted[key] for key in ("spec_sha256", "inputs_sha256")):
+    if folder.exists() and not folder.is_dir():
+        raise InputError(str(folder), "a run needs a folder", "a file", "Choose another --out.")
+    with alone_in(folder):
+        if (folder / MANIFEST_NAME).is_file():
+            yield Run(folder, spec, _is_done(folder, spec, inputs))
+        elif any(folder.iterdir()):
             raise InputError(
-                str(folder),
-                f"the folder must belong to this spec (sha256 {wanted['spec_sha256'][:12]})",
-                f"the run of another spec or other input files ({str(found.get('spec_sha256'))[:12]})",
-                "Choose another --out, or remove that run.",
+                str(folder), "a run needs a new or empty folder, or its own", "other content", "Choose another --out."
             )
-        return Run(folder, spec, found["state"] == "done")
-    write_atomic(folder / MANIFEST_NAME, canonical_json(_manifest(spec, inputs, overrides, "running")))
+        else:
+            yield Run(folder, spec, done=False)
+
+
+def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
+    """Whether a run is finished; refuse it if it is not that of a spec and its inputs."""
+    found = _read_manifest(folder)
+    if found["spec_sha256"] != spec_digest(spec) or found["inputs_sha256"] != dict(inputs):
+        raise InputError(
+            str(folder),
+            f"the folder must belong to this spec (sha256 {spec_digest(spec)[:12]})",
+            f"the run of another spec or other input files ({found['spec_sha256'][:12]})",
+            "Choose another --out, or remove that run.",
+        )
+    return found["state"] == "done" and open_run(folder).done
+
+
+def begin_run(run: Run, inputs: Mapping[str, str], overrides: Sequence[str]) -> None:
+    """Record what is running here, and the spec.
+
+    Args:
+        run: a claimed run.
+        inputs: digests of the files the spec names.
+        overrides: `--set` overrides that led to the spec, for the record.
+    """
+    write_atomic(run.path(MANIFEST_NAME), canonical_json(_manifest(run.spec, inputs, overrides, "running")))
     comments = ["every default filled in", *(f"--set {override}" for override in overrides)]
-    write_atomic(folder / "spec.toml", spec_to_toml(spec, comments).encode())
-    return Run(folder, spec, done=False)
+    write_atomic(run.path("spec.toml"), spec_to_toml(run.spec, comments).encode())
 
 
 def finish_run(run: Run, inputs: Mapping[str, str], overrides: Sequence[str], results: Sequence[str]) -> None:
@@ -116,36 +178,50 @@ def open_run(folder: Path) -> Run:
         raise InputError(str(folder), "must be a run folder", "no folder", "Make one with: doedesign optimize SPEC")
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
-    manifest = read_json(folder / MANIFEST_NAME)
-    _require_run(folder, manifest)
+    manifest = _read_manifest(folder)
     spec = load_spec(folder / "spec.toml")
-    if spec_digest(spec) != manifest.get("spec_sha256"):
+    if spec_digest(spec) != manifest["spec_sha256"]:
         raise InputError(
             str(folder / "spec.toml"),
             "must be the spec of this run",
             "a file that was changed since",
             "Restore it, or optimise the changed spec into a folder of its own.",
         )
-    if manifest.get("state") != "done":
+    if manifest["state"] != "done":
         raise InputError(
             str(folder), "the run must be finished", "an unfinished run", "Resume it with the same optimize command."
         )
-    for name, digest in manifest.get("results_sha256", {}).items():
+    for name, digest in manifest["results_sha256"].items():
         if name.endswith(".exr") and sha256_file(folder / name) != digest:
             raise InputError(
-                str(folder / name), "must be the file this run wrote", "a changed file", "Restore it or run it again."
+                str(folder / name),
+                "must be the file this run wrote",
+                "a changed file",
+                f"Restore it, or remove {folder} and optimise again.",
             )
     return Run(folder, spec, done=True)
 
 
-def _require_run(folder: Path, manifest: Mapping[str, Any]) -> None:
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a run, with everything in it that is relied upon."""
+    path = folder / MANIFEST_NAME
+    manifest = read_json(path)
     if manifest.get("format") != FORMAT:
         raise InputError(
-            str(folder / MANIFEST_NAME),
+            str(path),
             f'must say format "{FORMAT}"',
             repr(manifest.get("format")),
             "Give a folder that optimize of this version wrote.",
         )
+    kinds = {"state": str, "spec_sha256": str, "inputs_sha256": dict}
+    if manifest.get("state") == "done":
+        kinds["results_sha256"] = dict
+    for key, kind in kinds.items():
+        if not isinstance(manifest.get(key), kind):
+            raise InputError(
+                str(path), f"must hold {key}", repr(manifest.get(key)), f"Remove {folder} and optimise again."
+            )
+    return manifest
 
 
 def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: Sequence[Mapping[str, Any]]) -> None:
@@ -175,12 +251,12 @@ def load_checkpoint(
             arrays = [stored[f"array{i}"] for i in range(len(shapes))]
             step, history = int(stored["step"]), json.loads(stored["history"].tobytes())
             digest = stored["spec"].tobytes().decode()
-    except OSError as error:
-        if error.errno is not None:
+    # What numpy, zipfile and json raise depends on where the damage is.
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
             raise explain_os_error(error, path) from error
-        raise InputError(str(path), "must be a whole checkpoint", f'"{error}"', cure) from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise InputError(str(path), "must be a whole checkpoint", f'"{error}"', cure) from error
+        got = f'"{error}"' if str(error) else type(error).__name__
+        raise InputError(str(path), "must be a whole checkpoint", got, cure) from error
     if digest != spec_digest(run.spec) or [a.shape for a in arrays] != list(shapes):
         raise InputError(str(path), "must belong to this run's spec", "a checkpoint of another spec", cure)
     return arrays, step, history

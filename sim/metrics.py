@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.fft import fft, fft2, ifft
 
 from sim.camera import Camera, Colour
 from sim.psf import pupil_field
@@ -80,52 +80,6 @@ def participation(psf: Array) -> Array:
     return jnp.sum(psf**2, axis=(-2, -1))
 
 
-def mtf(psf: Float[np.ndarray, "y x"], pixel_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Modulation transfer along x of a PSF as sampled: frequencies (cycles per metre) and |OTF| with OTF(0) = 1.
-
-    For measured PSFs. Where pixels are wider than the Airy disc it depends on where on the grid the image falls.
-    """
-    line = np.asarray(np.sum(psf, axis=0, dtype=np.float64))
-    transfer = np.abs(np.fft.rfft(line))
-    return np.fft.rfftfreq(len(line), pixel_m), transfer / transfer[0]
-
-
-def presampled_mtf(
-    camera: Camera,
-    height_m: Float[np.ndarray, "y x"],
-    depth_m: float,
-    colour: Colour,
-    frequencies_per_m: Float[np.ndarray, " f"],
-) -> Float[np.ndarray, " f"]:
-    """Modulation transfer along x before sampling: |OTF| of lens, DOE and pixel, with OTF(0) = 1.
-
-    The OTF is the autocorrelation of the pupil at the lag lambda d nu. For square cells the autocorrelation at whole
-    cells is a sum over cells, and linear between them, so nothing is approximated. It counts all light behind the
-    DOE, also what misses any window, and does not depend on where on the pixel grid the image falls (a PSF that is
-    sampled by pixels wider than the Airy disc does).
-
-    Args:
-        camera: optics.
-        height_m: `[y, x]` the map.
-        depth_m: source depth.
-        colour: colour; several wavelengths add with their weights.
-        frequencies_per_m: spatial frequencies on the sensor, cycles per metre.
-    """
-    total = np.zeros(len(frequencies_per_m), np.complex128)
-    cells = camera.grid.shape[1]
-    for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        field = np.asarray(pupil_field(camera, height_m, depth_m, wavelength))
-        rows = np.asarray(fft(field, 2 * cells, axis=1, workers=-1))
-        correlation = np.asarray(ifft(np.square(np.abs(rows), dtype=np.float64).sum(axis=0)))[:cells]
-        lag = wavelength * camera.sensor_distance_m * np.asarray(frequencies_per_m) / camera.grid.pitch_m
-        part = np.interp(lag, np.arange(cells), correlation.real, right=0.0) + 1j * np.interp(
-            lag, np.arange(cells), correlation.imag, right=0.0
-        )
-        total += weight * part / correlation[0].real
-    pixel = np.sinc(camera.pixel_m * camera.fill * np.asarray(frequencies_per_m))
-    return np.abs(total * pixel)
-
-
 def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:
     """Fraction |<t>|^2 of the light that passes as if the plate were flat, t = exp(i phi) over the clear aperture."""
     # A star in focus is a plane wave; out of focus, a phase that is not the plate's would be added.
@@ -152,6 +106,13 @@ class EnergyBudget(NamedTuple):
     higher_orders: float
 
 
+@jax.jit
+def _band_energy(field: Array, envelope: Array) -> Array:
+    """Energy of the bare grid's transform under the cells' sinc² along both axes."""
+    spectrum = jnp.fft.fft2(field)
+    return envelope @ (spectrum.real**2 + spectrum.imag**2) @ envelope
+
+
 def energy_budget(
     camera: Camera,
     height_m: Float[np.ndarray, "y x"],
@@ -171,15 +132,14 @@ def energy_budget(
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc²), not
     from the PSF, so `uncollected` near zero or below it would show a fault in either.
     """
-    envelope = np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2
+    envelope = jnp.asarray(np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2, jnp.float32)
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        spectrum = np.asarray(fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1))
-        power = np.square(np.abs(spectrum), dtype=np.float64)
+        field = pupil_field(camera, height_m, depth_m, wavelength)
         share = weight * camera.transmission(wavelength)
         passed += share
-        band += share * float(envelope @ power @ envelope) / scale
+        band += share * float(_band_energy(field, envelope)) / scale
     total = float(np.sum(psf, dtype=np.float64))
     spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
     return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)

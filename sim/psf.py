@@ -87,17 +87,24 @@ def psf_bank(
         raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height_m.shape}")
     height = jnp.asarray(height_m, jnp.float32)
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+    lines = [
+        (
+            c,
+            weight * camera.transmission(wavelength),
+            wavelength,
+            plan_propagation(camera, wavelength, propagation, sampling),
+        )
+        for c, colour in enumerate(camera.colours)
+        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
+    ]
     energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
-    for c, colour in enumerate(camera.colours):
-        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-            plan = plan_propagation(camera, wavelength, propagation, sampling)
+    for d, depth in enumerate(depths_m):
+        path = source_path_m(camera, depth, field_rad)
+        for c, factor, wavelength, plan in lines:
             rate = jnp.float32(camera.waves_per_metre(wavelength, field_rad))
-            factor = weight * camera.transmission(wavelength)
-            for d, depth in enumerate(depths_m):
-                source = jnp.asarray(wrapped_waves(source_path_m(camera, depth, field_rad), wavelength))
-                image = _energy(plan, phase_pupil, PhaseRows(height, source, coverage), rate)
-                energy[c, d] += factor * np.asarray(image)
-                on_psf()
+            rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
+            energy[c, d] += factor * np.asarray(_energy(plan, phase_pupil, rows, rate))
+            on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
 
 

@@ -16,13 +16,23 @@ from fab.levels import Levels, quantise
 
 @dataclass(frozen=True)
 class LevelMap:
-    """A map that can be drawn: level numbers `[y, x]`, the staircase, the raster and the relief's diameter."""
+    """A map that can be drawn.
+
+    Attributes:
+        level: level numbers `[y, x]`.
+        levels: the staircase.
+        grid: the raster.
+        aperture_m: diameter of the relief, metres.
+        name: what it is called, letters A-Z and digits at least in part.
+        file: where its heights were read.
+    """
 
     level: NDArray[np.uint8]
     levels: Levels
     grid: Grid
     aperture_m: float
     name: str
+    file: Path
 
 
 def read_any_height(
@@ -46,26 +56,30 @@ def read_any_height(
     from sim.store import read_height as read_exr
 
     stored = read_exr(path)
-    pitch = pitch_m or stored.pitch_m
+    pitch = stored.pitch_m if pitch_m is None else pitch_m
     if pitch is None:
         raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Add --pitch-um.")
     ny, nx = stored.height_m.shape
     grid = Grid((ny, nx), pitch)
-    return HeightMap(stored.height_m, grid, aperture_m or stored.aperture_m or min(grid.extent_m))
+    if aperture_m is None:
+        aperture_m = stored.aperture_m or min(grid.extent_m)
+    return HeightMap(stored.height_m, grid, aperture_m)
 
 
 def levels_of_run(run: Run, count: int | None = None) -> LevelMap:
     """What a run draws, or its continuous design rounded to another number of levels over the same full height."""
     drawn = Levels(run.spec.process.levels, run.spec.process.level_step_m)
-    aperture = run.spec.doe.aperture_m
+    aperture, name = run.spec.doe.aperture_m, run.spec.name
     if count in (None, drawn.count) and run.spec.optimize.quantisation != "none":
-        height = read_any_height(run.path("height.exr"))
-        return LevelMap(quantise(height.height_m, drawn), drawn, height.grid, aperture, run.spec.name)
-    levels = Levels(count or drawn.count, drawn.count * drawn.step_m / (count or drawn.count))
-    height = read_any_height(run.path("height_continuous.exr"))
+        file = run.path("height.exr")
+        height = read_any_height(file)
+        return LevelMap(quantise(height.height_m, drawn), drawn, height.grid, aperture, name, file)
+    levels = drawn if count is None else Levels(count, drawn.count * drawn.step_m / max(count, 1))
+    file = run.path("height_continuous.exr")
+    height = read_any_height(file)
     # The design repeats with the full height, so the top half step rounds to the lowest level.
     wrapped = np.mod(np.rint(height.height_m / levels.step_m), levels.count).astype(np.uint8)
-    return LevelMap(wrapped, levels, height.grid, aperture, run.spec.name)
+    return LevelMap(wrapped, levels, height.grid, aperture, name, file)
 
 
 def level_map_from(
@@ -85,21 +99,21 @@ def level_map_from(
     if not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
     if source.is_dir():
-        given = [
-            f for f, v in (("step", step_m), ("pitch-um", pitch_m), ("scale", scale_m), ("aperture", aperture_m)) if v
-        ]
-        if given:
-            raise InputError(
-                f"--{given[0]}",
-                "a run brings its own geometry",
-                "a value",
-                "Leave the option out, or give a height map.",
-            )
+        options = {"--step": step_m, "--pitch-um": pitch_m, "--scale": scale_m, "--aperture": aperture_m}
+        for option, value in options.items():
+            if value is not None:
+                cure = "Leave the option out, or give a height map."
+                raise InputError(option, "a run brings its own geometry", "a value", cure)
         return levels_of_run(open_run(source), count)
     if count is None or step_m is None:
         missing, example = ("--levels", "--levels 16") if count is None else ("--step", '--step "75 nm"')
         raise InputError(str(source), f"a bare height map needs {missing}", "none", f"Add {example}.")
-    height = read_any_height(source, pitch_m, scale_m, aperture_m)
     levels = Levels(count, step_m)
-    name = "".join(c if c.isalnum() else "_" for c in source.stem) or "height"
-    return LevelMap(quantise(height.height_m, levels), levels, height.grid, height.aperture_m, name)
+    height = read_any_height(source, pitch_m, scale_m, aperture_m)
+    try:
+        level = quantise(height.height_m, levels)
+    except InputError as error:
+        raise InputError(str(source), error.rule, error.got, error.cure) from error
+    # What a mask shop takes in a name; a name of other letters alone leaves nothing.
+    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
+    return LevelMap(level, levels, height.grid, height.aperture_m, name, source)

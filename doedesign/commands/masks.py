@@ -31,12 +31,12 @@ def write_masks(source: Path, drawing: LevelMap, out: Path | None, say: Say = la
     """
     folder = out or Path("masks") / drawing.name
     chrome = Chrome()
+    kind, name = "height map", drawing.file.name
     if source.is_dir():
         run = open_run(source)
         chrome = Chrome(overlap_m=run.spec.process.chrome_overlap_m)
-        origin = {"kind": "run", "name": run.spec.name, "height_sha256": sha256_file(run.path("height.exr"))}
-    else:
-        origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
+        kind, name = "run", run.spec.name
+    origin = {"kind": kind, "name": name, "height_sha256": sha256_file(drawing.file)}
     report = write_order(
         folder,
         drawing.level,

@@ -10,13 +10,23 @@ import numpy as np
 from doedesign.evaluate import design_metrics, pattern_metrics
 from doedesign.optimize import Design, State, finished_design, initial_state, optimiser_of, steps
 from doedesign.problem import Problem, Scene, problem_of
-from doedesign.progress import SilentMeter, meter
+from doedesign.progress import meter
 from doedesign.report.pictures import draw_encircled, draw_height, draw_history, draw_mtf, draw_pattern, draw_psfs
-from doedesign.runs import Run, begin_run, finish_run, input_digests, load_checkpoint, save_checkpoint, write_history
+from doedesign.runs import (
+    Run,
+    begin_run,
+    claim_run,
+    finish_run,
+    input_digests,
+    load_checkpoint,
+    save_checkpoint,
+    write_history,
+)
 from doedesign.spec import Spec, input_files, load_spec
 from fab.files import canonical_json, write_atomic
 from sim.psf import PsfBank, psf_bank
 from sim.store import write_height
+from sim.transfer import transfer_bank
 
 Say = Callable[[str], None]
 
@@ -39,17 +49,18 @@ def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), s
     spec = load_spec(spec_path, overrides)
     files = input_files(spec, spec_path)
     inputs = input_digests(files)
-    run = begin_run(out or Path("runs") / spec.name, spec, inputs, overrides)
-    if run.done:
-        say(f"{run.folder} already holds the finished run of this spec")
-        return run
-    say("preparing sources and propagation")
-    problem, scene = problem_of(spec, files)
-    state, history = _resume(run, problem, scene, files, say)
-    state, history = _iterate(run, problem, scene, state, history)
-    say("evaluating the design")
-    results = _write_results(run, problem, finished_design(spec, problem, state), history)
-    finish_run(run, inputs, overrides, results)
+    with claim_run(out or Path("runs") / spec.name, spec, inputs) as run:
+        if run.done:
+            say(f"{run.folder} already holds the finished run of this spec")
+            return run
+        say("preparing sources and propagation")
+        problem, scene = problem_of(spec, files)
+        state, history = _resume(run, problem, scene, files, say)
+        begin_run(run, inputs, overrides)
+        state, history = _iterate(run, problem, scene, state, history)
+        say("evaluating the design")
+        results = _write_results(run, problem, finished_design(spec, problem, state), history)
+        finish_run(run, inputs, overrides, results)
     return Run(run.folder, spec, done=True)
 
 
@@ -96,10 +107,10 @@ def _iterate(
     return state, history
 
 
-def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray, on_psf: Callable[[], None]) -> PsfBank:
+def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray) -> PsfBank:
     """The exact PSF bank of a height map at all depths of the spec."""
     depths = (*spec.scene.near_m, *spec.scene.far_m)
-    return psf_bank(problem.camera, height_m, depths, propagation=spec.optics.propagation, on_psf=on_psf)
+    return psf_bank(problem.camera, height_m, depths, propagation=spec.optics.propagation)
 
 
 def _write_results(run: Run, problem: Problem, design: Design, history: list[dict[str, Any]]) -> list[str]:
@@ -109,16 +120,18 @@ def _write_results(run: Run, problem: Problem, design: Design, history: list[dic
     write_height(run.path("height_continuous.exr"), design.continuous_m, camera.grid.pitch_m, spec.doe.aperture_m)
     write_history(run, history)
     near, far = spec.scene.near_m, spec.scene.far_m
-    bank = design_bank(spec, problem, design.drawn_m, lambda: SilentMeter().advance(0))
-    metrics = {"psf": design_metrics(camera, design.drawn_m, bank, near)}
+    bank = design_bank(spec, problem, design.drawn_m)
+    flat = np.zeros_like(design.drawn_m)
+    lens = design_bank(spec, problem, flat)
+    metrics: dict[str, Any] = {"psf": design_metrics(camera, design.drawn_m, bank, near, lens)}
     patterns = pattern_metrics(spec, camera, bank, problem.terms)
     if patterns:
         metrics["patterns"] = patterns
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     draw_height(run.path("height.png"), design.drawn_m, levels, camera, spec.name)
     draw_psfs(run.path("psf.png"), camera, bank, near, far)
-    lens = psf_bank(camera, np.zeros_like(design.drawn_m), (*near, *far))
-    draw_mtf(run.path("mtf.png"), camera, bank, near, far, lens)
+    transfers = [transfer_bank(camera, height, (*near, *far)) for height in (design.drawn_m, flat)]
+    draw_mtf(run.path("mtf.png"), camera, transfers[0], near, far, transfers[1])
     draw_encircled(run.path("encircled.png"), camera, bank, near, far, lens)
     names = ["height.exr", "height_continuous.exr", "history.jsonl", "metrics.json", "spec.toml"]
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]

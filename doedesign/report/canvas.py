@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sim.psf import PsfBank
+    from sim.transfer import TransferBank
 
 INK, FAINT, CHROME, MARK, LINE = "#222222", "#9aa0a6", "#8c8f94", "#d1495b", "#14507a"
 HEIGHTS, LIGHT = "viridis", "inferno"
@@ -152,7 +153,7 @@ def spread(count: int, most: int) -> list[int]:
     return [round(i * (count - 1) / max(most - 1, 1)) for i in range(most)]
 
 
-def depth_positions(bank: "PsfBank", depths_m: Sequence[float], most: int) -> list[int]:
+def depth_positions(bank: "PsfBank | TransferBank", depths_m: Sequence[float], most: int) -> list[int]:
     """Positions in a bank of at most `most` of some depths.
 
     Raises:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from sim.psf import PsfBank
+    from sim.transfer import TransferBank
 
 _MOST_DEPTHS = 3
 _MOST_COLOURS = 6
@@ -49,51 +50,47 @@ _DrawPanel = Callable[["Axes", int, str], None]
 def draw_mtf(
     path: str | Path,
     camera: Camera,
-    bank: "PsfBank",
+    transfer: "TransferBank",
     near_m: Sequence[float],
     far_m: Sequence[float],
-    lens_bank: "PsfBank | None" = None,
+    lens_transfer: "TransferBank | None" = None,
 ) -> None:
     """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
 
     Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of
     more than three near or far depths, and of more than six colours, an even choice is shown.
 
-    These are curves of the PSF as the sensor samples it (`sim.metrics.mtf`): where the optics resolve more than the
-    pixels, they depend on where in a pixel the spot falls, and the picture says where. Light outside the window lowers
-    the contrast further and is not in them.
-
     Args:
         path: the PNG file.
         camera: colours.
-        bank: PSFs of the plate.
-        near_m: near depths of the bank, metres; may be empty.
-        far_m: far depths of the bank, metres; may be empty.
-        lens_bank: PSFs of the plain lens at the same depths, dashed.
+        transfer: MTF of lens, plate and pixel.
+        near_m: near depths to show, metres; may be empty.
+        far_m: far depths to show, metres; may be empty.
+        lens_transfer: MTF of the plain lens and pixel at the same depths, dashed.
 
     Raises:
         ValueError: no depth is given, or one is not in a bank.
         InputError: the system refuses the path.
     """
-    from sim.metrics import mtf
-
     hues = line_colours(camera.colours)
+    frequencies = transfer.frequencies_per_m * MM
 
     def draw(axes: "Axes", depth: int, group: str) -> None:
-        lowest = MM / (bank.energy.shape[-1] * bank.pixel_m)
-        for of, style in _both(bank, lens_bank, bank.depths_m[depth]):
+        curves: list[tuple[np.ndarray, dict[str, Any]]] = [(transfer.transfer[:, depth], {"lw": 1.2})]
+        if lens_transfer is not None:
+            at = depth_positions(lens_transfer, [transfer.depths_m[depth]], 1)[0]
+            curves.insert(0, (lens_transfer.transfer[:, at], _LENS))
+        for of, style in curves:
             for colour in _shown(camera):
-                frequency, transfer = mtf(of[colour], bank.pixel_m)
-                axes.plot(frequency * MM, transfer, color=hues[colour], **style)
+                axes.plot(frequencies, of[colour], color=hues[colour], **style)
         if group == "near":
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter("{x:g}")
-        axes.set_xlim(lowest if group == "near" else 0, 0.5 * MM / bank.pixel_m)
+        axes.set_xlim(frequencies[1] if group == "near" else 0, frequencies[-1])
 
     words = ("frequency along x (cycles/mm)", "MTF")
-    centre = "pixel" if bank.energy.shape[-1] % 2 else "corner of four pixels"
-    marks = f"as sampled by the sensor, spot centred on a {centre}; light outside the window left out"
-    _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, marks)
+    marks = "lens, plate and pixel before sampling; all light counts, also beyond the window"
+    _draw_panels(path, camera, transfer, (near_m, far_m), draw, words, lens_transfer is not None, marks)
 
 
 def draw_encircled(
@@ -199,7 +196,7 @@ def _both(
 def _draw_panels(
     path: str | Path,
     camera: Camera,
-    bank: "PsfBank",
+    bank: "PsfBank | TransferBank",
     depths_m: tuple[Sequence[float], Sequence[float]],
     draw: _DrawPanel,
     words: tuple[str, str],

@@ -6,7 +6,7 @@ from scipy.special import j0, j1
 
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.camera import Camera
-from sim.metrics import encircled_energy, mtf
+from sim.metrics import encircled_energy
 from sim.pixel import disc_autocorrelation
 from sim.psf import psf_bank
 
@@ -45,20 +45,6 @@ def test_encircled_energy():
     # Eight pixels per lambda f / D; a rim that cuts a steep part of the profile is blurred by half of one.
     wanted = 1 - j0(v) ** 2 - j1(v) ** 2
     np.testing.assert_allclose(encircled_energy(flat_psf(camera), camera.pixel_m, radii), wanted, atol=3e-3)
-
-
-@pytest.mark.parametrize("pixel_m", [1.85e-6, 0.5e-6])
-def test_transfer_function(pixel_m: float):
-    camera = make_camera(600, 1.2e-3, 2.16e-3, pixel_m, int(round(2 * 0.14e-3 / pixel_m / 2) * 2))
-    frequency, transfer = mtf(flat_psf(camera), pixel_m)
-    cutoff = camera.aperture_m / (YELLOW_M * camera.focal_length_m)
-    wanted = np.zeros_like(frequency)
-    for alias in range(-3, 4):  # pixels sample: what lies beyond Nyquist folds back
-        # An even window's middle is a pixel corner; the fold changes sign with it, as |OTF| sees.
-        true = frequency + alias / pixel_m
-        wanted += disc_autocorrelation(true / cutoff) * np.sinc(true * pixel_m) * (-1) ** alias
-    # Beyond 130 Airy radii lies 2 / (pi v) = 0.16 % of the light, all of it missing at frequency zero.
-    np.testing.assert_allclose(transfer, np.abs(wanted), atol=6e-3)
 
 
 def test_narrow_windows_see_the_same_pixels():

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import fresnel
 
 from bench.reference import YELLOW_M, make_camera, relative_error
+from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.fresnel import Kernel, plan_direct
 from sim.psf import psf_bank
@@ -45,7 +46,7 @@ def test_square_opening(kernel: Kernel, distance_m: float):
     open_1d = np.abs(axis) < 0.1e-3
     got = shadow(camera, open_1d[:, None] & open_1d[None, :], kernel)
     points = ((np.arange(10) + 0.5) / 10 - 0.5) * camera.pixel_m
-    profile = slit_intensity((camera.axis_m()[:, None] + points).ravel(), 0.2e-3, distance_m).reshape(-1, 10).mean(axis=1)
+    profile = slit_intensity(camera.axis_m()[:, None] + points, 0.2e-3, distance_m).mean(axis=1)
     wanted = np.outer(profile, profile) * camera.pixel_m**2 / (np.pi / 4 * camera.aperture_m**2)
     # The padded grid of three apertures stops the angles that leave it: an edge's ripples finer than its
     # 1 / (2 * 0.4 mm) are missing, some 1 % of the amplitude at the edge.
@@ -59,8 +60,6 @@ def test_circular_opening_on_the_axis(zones: float):
     radius = 0.15e-3
     distance = radius**2 / (YELLOW_M * zones)
     camera = without_lens(800, 2 * radius, distance, 1.5e-6, 21)
-    from sim.aperture import circle_coverage
-
     got = shadow(camera, circle_coverage(camera.grid, camera.aperture_m), "fresnel")[10, 10]
     open_wave = camera.pixel_m**2 / (np.pi * radius**2)
     # What the rim scatters beyond the kernel's band is missing: about 1 % of the amplitude.

@@ -1,4 +1,4 @@
-"""Pixel energies of rough plates against plain float64 sums with sixteen samples per pixel, and rings against rasters."""
+"""Pixel energies of rough plates against plain float64 sums over many samples per pixel, and rings against rasters."""
 
 import jax.numpy as jnp
 import numpy as np

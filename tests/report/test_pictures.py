@@ -27,6 +27,7 @@ from sim.camera import Camera, Colour
 from sim.material import full_wave_height_m
 from sim.metrics import encircled_energy
 from sim.psf import PsfBank, psf_bank
+from sim.transfer import TransferBank
 
 RGB = (Colour("656nm", (656e-9,), (1.0,)), Colour("589nm", (589e-9,), (1.0,)), Colour("486nm", (486e-9,), (1.0,)))
 CAMERA = Camera(Grid((64, 64), 1.85e-6), 116e-6, "fused_silica", RGB, 1e-3, 1.85e-6, 32)
@@ -40,6 +41,13 @@ def random_bank(
 ) -> PsfBank:
     energy = rng.exponential(0.8 / window**2, (len(camera.colours), len(depths), window, window)).astype(np.float32)
     return PsfBank(energy, tuple(c.name for c in camera.colours), depths, camera.pixel_m)
+
+
+def random_transfer(
+    rng: np.random.Generator, camera: Camera = CAMERA, depths: tuple[float, ...] = (*NEAR, *FAR)
+) -> TransferBank:
+    transfer = rng.uniform(0, 1, (len(camera.colours), len(depths), 40))
+    return TransferBank(transfer, np.linspace(0, 0.5 / camera.pixel_m, 40), depths)
 
 
 def random_levels(rng: np.random.Generator) -> np.ndarray:
@@ -56,7 +64,7 @@ def draw_all(folder: Path, rng: np.random.Generator) -> dict[str, Path]:
     files = {name: folder / f"{name}.png" for name in ("height", "psfs", "mtf", "encircled", "history", "pattern")}
     draw_height(files["height"], random_levels(rng), LEVELS, CAMERA, "a $name$ of one's own")
     draw_psfs(files["psfs"], CAMERA, bank, NEAR, FAR)
-    draw_mtf(files["mtf"], CAMERA, bank, NEAR, FAR, lens)
+    draw_mtf(files["mtf"], CAMERA, random_transfer(rng), NEAR, FAR, random_transfer(rng))
     draw_encircled(files["encircled"], CAMERA, bank, NEAR, FAR, lens)
     draw_history(files["history"], RECORDS)
     draw_pattern(files["pattern"], CAMERA, image, image, efficiency=0.9, uniformity=0.8)
@@ -156,7 +164,7 @@ def test_a_place_that_cannot_be_written_is_the_users_mistake(tmp_path: Path, blo
             pytest.skip("the superuser may write anywhere")
     for draw in (
         lambda path: draw_height(path, random_levels(rng), LEVELS, CAMERA, ""),
-        lambda path: draw_mtf(path, CAMERA, random_bank(rng), NEAR, FAR),
+        lambda path: draw_mtf(path, CAMERA, random_transfer(rng), NEAR, FAR),
         lambda path: draw_history(path, RECORDS),
     ):
         with pytest.raises(InputError, match="locked"):
@@ -167,11 +175,12 @@ def test_programmers_mistakes_are_named(tmp_path: Path, rng: np.random.Generator
     bank, path = random_bank(rng), tmp_path / "x.png"
     with pytest.raises(ValueError, match="grid's shape"):
         draw_height(path, np.zeros((8, 8)), LEVELS, CAMERA, "")
-    for draw in (draw_psfs, draw_mtf, draw_encircled):
+    transfer = random_transfer(rng)
+    for draw, what in ((draw_psfs, bank), (draw_mtf, transfer), (draw_encircled, bank)):
         with pytest.raises(ValueError, match="at least one depth"):
-            draw(path, CAMERA, bank, (), ())
+            draw(path, CAMERA, what, (), ())
         with pytest.raises(ValueError, match="must be in the bank"):
-            draw(path, CAMERA, bank, (0.123,), ())
+            draw(path, CAMERA, what, (0.123,), ())
     with pytest.raises(ValueError, match="target's shape"):
         draw_pattern(path, CAMERA, np.zeros((4, 4)), np.zeros((5, 5)), efficiency=0.0, uniformity=0.0)
     with pytest.raises(ValueError, match="at least one step"):
@@ -186,8 +195,9 @@ def test_unusual_plates_and_banks_are_drawn(tmp_path: Path, rng: np.random.Gener
     for colours, depths, window in ((RGB[:1], (1e-3, np.inf), 9), (five, many, 8)):
         camera = dataclasses.replace(CAMERA, colours=colours, window=window)
         bank = random_bank(rng, window, camera, depths)
-        for i, draw in enumerate((draw_psfs, draw_mtf, draw_encircled)):
-            draw(tmp_path / f"{len(colours)}{i}.png", camera, bank, depths[:-1], depths[-1:])
+        transfer = random_transfer(rng, camera, depths)
+        for i, (draw, what) in enumerate(((draw_psfs, bank), (draw_mtf, transfer), (draw_encircled, bank))):
+            draw(tmp_path / f"{len(colours)}{i}.png", camera, what, depths[:-1], depths[-1:])
     dark = PsfBank(np.zeros((3, 1, 8, 8), np.float32), ("656nm", "589nm", "486nm"), (1.0,), CAMERA.pixel_m)
     draw_psfs(tmp_path / "dark.png", CAMERA, dark, (), (1.0,))
     tiny = dataclasses.replace(CAMERA, grid=Grid((7, 7), 1e-6), aperture_m=5e-6)

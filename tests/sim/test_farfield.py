@@ -108,7 +108,8 @@ def test_point_cells_lack_only_the_envelope():
     camera = make_camera(256, 0.8e-3, 1.44e-3, 1.85e-6, 65)
     rows, rate = make_rows(camera), jnp.float32(camera.waves_per_metre(YELLOW_M))
     square, points = (
-        np.asarray(plan_far_field(camera, YELLOW_M, cell=cell).energy(phase_pupil, rows, rate)) for cell in (True, False)
+        np.asarray(plan_far_field(camera, YELLOW_M, cell=cell).energy(phase_pupil, rows, rate))
+        for cell in (True, False)
     )
     envelope = np.sinc(camera.axis_m() * camera.grid.pitch_m / (YELLOW_M * camera.focal_length_m)) ** 2
     # Across one pixel the envelope changes by at most 4 %, and linearly, so its value at the centre is near its mean.

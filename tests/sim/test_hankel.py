@@ -32,7 +32,9 @@ def test_pixels_against_the_integral():
     profile = noise_profile(ring_count(CAMERA))
     plan = plan_hankel(CAMERA, YELLOW_M)
     source = jnp.asarray(ring_source_waves(CAMERA, np.inf, YELLOW_M))
-    got = np.asarray(plan.energy(jnp.asarray(profile, jnp.float32), source, jnp.float32(CAMERA.waves_per_metre(YELLOW_M))))
+    got = np.asarray(
+        plan.energy(jnp.asarray(profile, jnp.float32), source, jnp.float32(CAMERA.waves_per_metre(YELLOW_M)))
+    )
     points = (np.arange(12) - 5.5) / 12 * CAMERA.pixel_m
     y, x = ((CAMERA.axis_m()[24 : 24 + n, None] + points).ravel() for n in (3, 10))
     values = image_on_the_axis(profile, np.hypot(y[:, None], x).ravel()).reshape(3, 12, 10, 12).mean(axis=(1, 3))

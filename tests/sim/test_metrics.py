@@ -13,7 +13,6 @@ from sim.metrics import (
     energy_budget,
     energy_within,
     mean_wavelength_m,
-    mtf,
     participation,
     radius_map_m,
     ring_to_disc,
@@ -74,16 +73,6 @@ def test_participation_of_equal_pixels():
     np.testing.assert_allclose(participation(image), [0.25, 1.0])
 
 
-def test_mtf_of_known_lines():
-    point = np.zeros((9, 32), np.float32)
-    point[4, 16] = 0.3
-    frequency, transfer = mtf(point, 2e-6)
-    assert frequency[-1] == pytest.approx(1 / 4e-6)
-    np.testing.assert_allclose(transfer, 1.0)
-    point[2, 20] = 0.3  # two points 4 pixels apart: |cos(pi nu 4)|
-    np.testing.assert_allclose(mtf(point, 2e-6)[1], np.abs(np.cos(np.pi * frequency * 8e-6)), atol=1e-7)
-
-
 @pytest.mark.parametrize("cells", [100, 257])
 def test_a_flat_plate_is_all_zeroth_order(cells: int):
     camera = make_camera(cells, 0.6e-3, 1.08e-3, 1.85e-6, 16)
@@ -102,7 +91,9 @@ def test_zeroth_order_is_a_property_of_the_plate_not_of_the_focus():
 @pytest.mark.parametrize("plate", ["flat", "wrapped", "rough"])
 def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np.random.Generator):
     camera = dataclasses.replace(CAMERA, fill=fill)
-    height = {"flat": np.zeros((256, 256)), "wrapped": wrapped_map(256), "rough": rng.uniform(0, 1.2e-6, (256, 256))}[plate]
+    height = {"flat": np.zeros((256, 256)), "wrapped": wrapped_map(256), "rough": rng.uniform(0, 1.2e-6, (256, 256))}[
+        plate
+    ]
     psf = psf_bank(camera, height, [depth_m]).energy[0, 0]
     budget = energy_budget(camera, height, psf, depth_m, camera.colours[0])
     assert sum(budget) == pytest.approx(1, abs=1e-9)

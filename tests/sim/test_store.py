@@ -180,13 +180,13 @@ def test_wrong_content_is_named(tmp_path: Path):
     write_foreign(tmp_path / "m.exr", {"Y": heights()})
     with pytest.raises(InputError, match="pixel pitch of a PSF from another program must be given"):
         read_bank(tmp_path / "m.exr")
-    assert read_height_without_lengths(tmp_path) == (None, None)
 
 
-def read_height_without_lengths(folder: Path) -> tuple[float | None, float | None]:
-    write_foreign(folder / "bare.exr", {"height": heights()})
-    stored = read_height(folder / "bare.exr")
-    return stored.pitch_m, stored.aperture_m
+def test_heights_of_another_program_may_lack_their_lengths(tmp_path: Path):
+    write_foreign(tmp_path / "bare.exr", {"height": heights()})
+    stored = read_height(tmp_path / "bare.exr")
+    assert (stored.pitch_m, stored.aperture_m) == (None, None)
+    np.testing.assert_array_equal(stored.height_m, heights()[::-1])
 
 
 def test_a_cropped_picture_has_lost_its_centre(tmp_path: Path):
@@ -209,9 +209,8 @@ def test_every_truncation_and_every_flipped_byte_is_noticed(tmp_path: Path, capf
         bad.write_bytes(content)
         try:
             stored = read_height(bad)
-        except InputError as error:
+        except InputError:
             refused += 1
-            assert "bad.exr" in str(error)
             continue
         np.testing.assert_array_equal(stored.height_m, height)
         assert (stored.pitch_m, stored.aperture_m) == (1.85e-6, 1.11e-5)
@@ -223,7 +222,7 @@ def test_every_truncation_and_every_flipped_byte_is_noticed(tmp_path: Path, capf
 
 @pytest.mark.parametrize("read", [read_height, read_bank])
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path, read: Callable[[Path], object]):
-    with pytest.raises(InputError, match="nowhere.exr: the file must exist"):
+    with pytest.raises(InputError, match=r"nowhere\.exr: the file must exist"):
         read(tmp_path / "nowhere.exr")
     with pytest.raises(InputError, match="the path must be a file"):
         read(tmp_path)
@@ -231,7 +230,7 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path, read: Callable[[P
 
 def test_an_unusable_place_is_named_and_nothing_is_left(tmp_path: Path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="above the last must be a folder|parent must not be a file"):
+    with pytest.raises(InputError, match=r"above the last must be a folder|parent must not be a file"):
         write_height(tmp_path / "file" / "h.exr", heights(), 1e-6, 1e-5)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
