@@ -252,7 +252,7 @@ def report(cells: int) -> None:
     points *= wanted.sum() / points.sum()
     error = relative_error(image, wanted)
     print(
-        f"  window: relative L2 error against 16 x 16 float64 samples per pixel ({wanted.sum():.0%} of the light in the window)"
+        f"  relative L2 error against 16 x 16 float64 samples per pixel; {wanted.sum():.0%} of the light in the window"
     )
     print(f"    {METHODS['ours'][0]:36s}{error:8.1e}" + verdict(error, TARGET_ERROR))
     print(f"    {METHODS['prysm'][0]:36s}{relative_error(points, wanted):8.1e}   (at the pixels' centres, same sum)")

@@ -5,6 +5,7 @@ that --help answers at once.
 """
 
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,12 +33,21 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _print(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
-    if as_json:
-        print(json.dumps({"paths": [str(path) for path in paths], **more}, sort_keys=True))
-    else:
-        for path in paths:
-            print(path)
+def _print(text: str) -> None:
+    """Print a result; what the terminal's encoding lacks is escaped."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    except OSError as error:
+        # What could not be printed would be tried again, and fail again, when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # a reader that has seen enough is no error
+            raise
+
+
+def _print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
+    names = [str(path) for path in paths]
+    _print(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(names))
 
 
 def _length(option: str, text: str | None) -> float | None:
@@ -65,7 +75,7 @@ def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_
     for warning in spec_warnings(load_spec(spec, set_)):
         _say(f"warning: {warning}")
     run = work(spec, out, set_, _say)
-    _print([run.folder], json_, metrics=str(run.path("metrics.json")))
+    _print_paths([run.folder], json_, metrics=str(run.path("metrics.json")))
 
 
 @app.command
@@ -104,7 +114,7 @@ def masks(
     )
     folder, report = write_masks(source, drawing, out, _say)
     _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
-    _print([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
+    _print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
 
 
 @app.command
@@ -119,7 +129,7 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     report = work(order)
     if json_:
         checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
-        print(json.dumps({"passed": report.passed, "checks": checks}))
+        _print(json.dumps({"passed": report.passed, "checks": checks}))
     report.require()
     _say(f"{len(report.checks)} checks passed")
 
@@ -151,7 +161,7 @@ def psf(
     if not all(abs(angle) <= 60 for angle in field_deg):
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), _say)
-    _print([folder, *sorted(folder.iterdir())], json_)
+    _print_paths([folder, *sorted(folder.iterdir())], json_)
 
 
 def exit_code(work: Callable[[], Any]) -> int:
@@ -174,8 +184,8 @@ def exit_code(work: Callable[[], Any]) -> int:
     except KeyboardInterrupt:
         _say("doedesign: interrupted; what was finished is kept, the same command goes on from there")
         return 130
-    except BrokenPipeError:
-        return 0
+    except BrokenPipeError:  # nobody listens to stderr any more
+        return 130
     except OSError as error:
         from fab.files import explain_os_error
 

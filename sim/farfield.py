@@ -34,10 +34,8 @@ from scipy.fft import next_fast_len
 
 from sim.camera import Camera
 from sim.pixel import Banded, pixel_weights, sampling_for
-from sim.pupil import PupilRows, cis
+from sim.pupil import PupilRows, block_size, cis, in_blocks
 
-# One block of rows (64-256 of a few thousand samples) fits a processor's second-level cache.
-_BLOCK = 128
 TOLERANCE = 2e-3  # predicted relative L2 error of pixel energies, unless a plan says otherwise
 
 
@@ -79,14 +77,6 @@ class FarField(eqx.Module):
             `[y, x]` energies; differentiable in every floating-point leaf of `rows` and `shared`.
         """
         return _pixel_energy((rows, shared), pupil, self)
-
-
-def _block(count: int) -> int:
-    """The largest divisor of `count` that is a good block, or `_BLOCK` (the rest is then padded)."""
-    if jax.default_backend() != "cpu":
-        return count
-    good = [b for b in range(48, 257) if count % b == 0]
-    return min(good, key=lambda b: abs(b - _BLOCK)) if good else min(_BLOCK, count)
 
 
 def plan_far_field(
@@ -140,7 +130,7 @@ def plan_far_field(
         cells=nx,
         length=length,
         kept=kept,
-        blocks=(_block(nx), _block(kept)),
+        blocks=(block_size(nx), block_size(kept)),
         spacing_m=spacing,
         expected_error=float(np.sqrt(2) * weights.expected_error),
     )
@@ -188,18 +178,6 @@ def _uncentral(samples: Complex[Array, "row kept"], length: int) -> Complex[Arra
     return jnp.concatenate([samples[..., half:], gap, samples[..., :half]], axis=-1)
 
 
-def _in_blocks(rows: PyTree, block: int, cells: int) -> PyTree:
-    """Every leaf `[cells, ...]` as `[count, block, ...]`, padded with zeros (closed aperture) to whole blocks."""
-    missing = -cells % block
-
-    def cut(leaf: Array) -> Array:
-        if missing:
-            leaf = jnp.concatenate([leaf, jnp.zeros((missing, *leaf.shape[1:]), leaf.dtype)])
-        return leaf.reshape(-1, block, *leaf.shape[1:])
-
-    return jax.tree.map(cut, rows)
-
-
 def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> tuple[Array, Array]:
     """Pixel energies, and the sensor field `[x, y]` at the kept samples."""
     pupil_block, sensor_block = plan.blocks
@@ -210,7 +188,7 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
             field = field * plan.tilt[1]
         return _central(_transform(field, plan.length), plan.kept)
 
-    half_done = jax.lax.map(along_x, _in_blocks(rows, pupil_block, plan.cells))
+    half_done = jax.lax.map(along_x, in_blocks(rows, pupil_block))
     half_done = half_done.reshape(-1, plan.kept)[: plan.cells]
 
     def along_y(block: Array) -> tuple[Array, Array]:
@@ -275,7 +253,7 @@ def _adjoint(
         return jax.tree.map(jnp.add, carry, shared_part), row_part
 
     count = half_done.shape[1] // pupil_block
-    blocks = (jnp.arange(count), *(_in_blocks(r, pupil_block, plan.cells) for r in (rows, constant_rows)))
+    blocks = (jnp.arange(count), *(in_blocks(r, pupil_block) for r in (rows, constant_rows)))
     shared_part, row_parts = jax.lax.scan(along_x, jax.tree.map(jnp.zeros_like, shared), blocks)
     row_parts = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: plan.cells], row_parts)
     return row_parts, shared_part

@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.fft import fft2
 
 from sim.camera import Camera, Colour
 from sim.psf import pupil_field
@@ -106,13 +106,6 @@ class EnergyBudget(NamedTuple):
     higher_orders: float
 
 
-@jax.jit
-def _band_energy(field: Array, envelope: Array) -> Array:
-    """Energy of the bare grid's transform under the cells' sinc² along both axes."""
-    spectrum = jnp.fft.fft2(field)
-    return envelope @ (spectrum.real**2 + spectrum.imag**2) @ envelope
-
-
 def energy_budget(
     camera: Camera,
     height_m: Float[np.ndarray, "y x"],
@@ -132,14 +125,15 @@ def energy_budget(
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc²), not
     from the PSF, so `uncollected` near zero or below it would show a fault in either.
     """
-    envelope = jnp.asarray(np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2, jnp.float32)
+    envelope = np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        field = pupil_field(camera, height_m, depth_m, wavelength)
+        spectrum = np.asarray(fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1))
+        power = np.square(np.abs(spectrum), dtype=np.float64)
         share = weight * camera.transmission(wavelength)
         passed += share
-        band += share * float(_band_energy(field, envelope)) / scale
+        band += share * float(envelope @ power @ envelope) / scale
     total = float(np.sum(psf, dtype=np.float64))
     spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
     return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.pupil import PhaseRows, phase_pupil
+from sim.pupil import PhaseRows, block_size, in_blocks, phase_pupil
 
 
 class TransferBank(NamedTuple):
@@ -43,13 +43,8 @@ def _row_spectra(rows: PhaseRows, waves_per_metre: Array) -> Array:
         spectrum = jnp.fft.fft(phase_pupil(block, waves_per_metre), len(total))
         return total + jnp.sum(spectrum.real**2 + spectrum.imag**2, axis=0), None
 
-    cells = rows.height_m.shape[1]
-    blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _block(leaf.shape[0]), cells), rows)
-    return jax.lax.scan(add, jnp.zeros(2 * cells), blocks)[0]
-
-
-def _block(count: int) -> int:
-    return max(b for b in range(1, 129) if count % b == 0)
+    count, cells = rows.height_m.shape
+    return jax.lax.scan(add, jnp.zeros(2 * cells), in_blocks(rows, block_size(count)))[0]
 
 
 def transfer_bank(

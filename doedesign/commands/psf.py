@@ -14,13 +14,15 @@ from doedesign.commands.heights import LevelMap, levels_of_run, read_any_height
 from doedesign.evaluate import design_metrics
 from doedesign.progress import meter
 from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
-from doedesign.runs import Run, open_run
+from doedesign.runs import Run, alone_in, open_run
+from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
-from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
 from fab.grid import Grid
 from fab.layout import pixel_edges
 from fab.levels import Levels, height_of
 from fab.manifest import read_manifest
+from fab.masks import unetched_outside
 from fab.units import format_length
 from fab.verify import read_level_map
 from sim.camera import Camera
@@ -72,14 +74,15 @@ def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[
         CheckFailed: the masks draw something else than the run's quantised map.
     """
     drawing = levels_of_run(run)
-    quantised = height_of(drawing.level, drawing.levels).astype(np.float32)
+    blank = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
+    quantised = height_of(blank, drawing.levels).astype(np.float32)
     designs = {"continuous": read_any_height(run.path("height_continuous.exr")).height_m, "quantised": quantised}
     folder = masks or Path("masks") / run.spec.name
     if masks is None and not (folder / MANIFEST_NAME).is_file():
         say(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
         return designs
     rebuilt = drawn_in_masks(folder, drawing)
-    different = (rebuilt != drawing.level) & drawing.grid.inside_circle(drawing.aperture_m)
+    different = rebuilt != blank
     if different.any():
         y, x = (int(i) for i in np.argwhere(different)[0])
         where = f"{int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"
@@ -112,22 +115,43 @@ def psf(
     """
     run = open_run(run_folder)
     camera = camera_of(run.spec)
-    depths = tuple(depths_m) or (*run.spec.scene.near_m, *run.spec.scene.far_m)
-    # A depth the spec does not name counts as near if it is no farther than the farthest obstruction.
-    near = tuple(z for z in depths if run.spec.scene.near_m and z <= max(run.spec.scene.near_m))
-    far = tuple(z for z in depths if z not in near)
+    near, far = _near_and_far(run.spec, depths_m)
     designs = designs_of(run, masks, say)
-    total = len(designs) * len(depths) * sum(len(c.wavelengths_m) for c in camera.colours)
-    with meter("PSFs", total) as progress:
-        done = count(1)
-        banks = {
-            name: _bank(run, camera, name, height, depths, field_rad, lambda: progress.advance(next(done)))
-            for name, height in designs.items()
-        }
-    if "from_masks" in banks and not np.array_equal(banks["from_masks"].energy, banks["quantised"].energy):
-        raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
-    say("writing banks and pictures")
-    return _write(run, camera, designs, banks, near, far)
+    total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
+    _require_own(run.path("psf"))
+    with alone_in(run.folder), atomic_folder(run.path("psf")) as fresh:
+        with meter("PSFs", total) as progress:
+            done = count(1)
+            banks = {
+                name: _bank(run, camera, name, height, (*near, *far), field_rad, lambda: progress.advance(next(done)))
+                for name, height in designs.items()
+            }
+        if "from_masks" in banks and not np.array_equal(banks["from_masks"].energy, banks["quantised"].energy):
+            raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
+        say("writing banks and pictures")
+        _write(fresh, run, camera, designs, banks, near, far)
+    return run.path("psf")
+
+
+def _near_and_far(spec: Spec, depths_m: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Near and far depths to look at; the rules of a spec hold for those of the command line, too."""
+    depths = tuple(dict.fromkeys(depths_m or (*spec.scene.near_m, *spec.scene.far_m)))
+    # A depth the spec does not name counts as near if it is no farther than the farthest obstruction.
+    near = tuple(z for z in depths if z <= max(spec.scene.near_m, default=0.0))
+    far = tuple(z for z in depths if z not in near)
+    scene = {"near_m": near or spec.scene.near_m, "far_m": far or spec.scene.far_m}
+    spec_from_json(spec_to_json(spec) | {"scene": scene}, "--depths")
+    return near, far
+
+
+def _require_own(folder: Path) -> None:
+    """Refuse to replace a folder that holds more than an earlier call wrote."""
+    if (folder / MANIFEST_NAME).is_file():
+        listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}
+        for path in sorted(folder.iterdir()):
+            if path.name not in listed:
+                rule = "a folder of results that is replaced must hold nothing else"
+                raise InputError(str(folder), rule, f"also {path.name!r}", "Move that file.")
 
 
 def _takes_hankel(run: Run, name: str, field_rad: tuple[float, float]) -> bool:
@@ -152,38 +176,37 @@ def _bank(
 
 
 def _write(
+    folder: Path,
     run: Run,
     camera: Camera,
     designs: dict[str, np.ndarray],
     banks: dict[str, PsfBank],
     near: tuple[float, ...],
     far: tuple[float, ...],
-) -> Path:
+) -> None:
     flat, depths, field = np.zeros(camera.grid.shape), (*near, *far), banks["quantised"].field_rad
     lens = psf_bank(camera, flat, depths, field_rad=field)
     lens_transfer = transfer_bank(camera, flat, depths)
     metrics: dict[str, Any] = {}
-    with atomic_folder(run.path("psf")) as fresh:
-        for name in ("continuous", "quantised"):
-            bank, height = banks[name], designs[name]
-            write_bank(fresh / f"{name}.exr", bank, {"design": run.spec.name})
-            draw_psfs(fresh / f"{name}_psf.png", camera, bank, near, far)
-            transfer = transfer_bank(camera, height, depths)
-            draw_mtf(fresh / f"{name}_mtf.png", camera, transfer, near, far, lens_transfer)
-            draw_encircled(fresh / f"{name}_encircled.png", camera, bank, near, far, lens)
-            metrics[name] = design_metrics(camera, height, bank, near, lens)
-        if _takes_hankel(run, "continuous", field):
-            # The budget's band is that of a raster of cells, which rings are not.
-            metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]
-        if "from_masks" in banks:
-            # Equal to the last bit (checked above), so its numbers and pictures are the same files.
-            metrics["from_masks"] = metrics["quantised"]
-            for path in sorted(fresh.glob("quantised*")):
-                shutil.copyfile(path, fresh / path.name.replace("quantised", "from_masks"))
-        title = f"{run.spec.name}, continuous"
-        draw_height(fresh / "continuous_height.png", designs["continuous"], None, camera, title)
-        (fresh / "metrics.json").write_bytes(canonical_json(metrics))
-        digests = {path.name: sha256_file(path) for path in sorted(fresh.iterdir())}
-        manifest = {"format": "doedesign psf 1", "run": run.spec.name, "results_sha256": digests}
-        (fresh / MANIFEST_NAME).write_bytes(canonical_json(manifest))
-    return run.path("psf")
+    for name in ("continuous", "quantised"):
+        bank, height = banks[name], designs[name]
+        write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
+        draw_psfs(folder / f"{name}_psf.png", camera, bank, near, far)
+        transfer = transfer_bank(camera, height, depths)
+        draw_mtf(folder / f"{name}_mtf.png", camera, transfer, near, far, lens_transfer)
+        draw_encircled(folder / f"{name}_encircled.png", camera, bank, near, far, lens)
+        metrics[name] = design_metrics(camera, height, bank, near, lens)
+    if _takes_hankel(run, "continuous", field):
+        # The budget's band is that of a raster of cells, which rings are not.
+        metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]
+    if "from_masks" in banks:
+        # Equal to the last bit (checked above), so its numbers and pictures are the same files.
+        metrics["from_masks"] = metrics["quantised"]
+        for path in sorted(folder.glob("quantised*")):
+            shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
+    title = f"{run.spec.name}, continuous"
+    draw_height(folder / "continuous_height.png", designs["continuous"], None, camera, title)
+    (folder / "metrics.json").write_bytes(canonical_json(metrics))
+    digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
+    manifest = {"format": "doedesign psf 1", "run": run.spec.name, "results_sha256": digests}
+    (folder / MANIFEST_NAME).write_bytes(canonical_json(manifest))

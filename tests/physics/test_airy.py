@@ -1,4 +1,4 @@
-"""A clear aperture in focus: the Airy disc, its encircled energy, and the transfer function of an ideal lens."""
+"""A clear aperture in focus: the Airy disc and its encircled energy."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from scipy.special import j0, j1
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.camera import Camera
 from sim.metrics import encircled_energy
-from sim.pixel import disc_autocorrelation
 from sim.psf import psf_bank
 
 
