@@ -20,7 +20,9 @@ app = App(
     name="doedesign",
     help="Design diffractive optical elements and the masks that make them.",
     version=__version__,
-    result_action="return_value",  # and not sys.exit, so that main returns the code
+    # Leave both to `exit_code`.
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
 )
 
 Overrides = Annotated[

@@ -10,7 +10,7 @@ from doedesign.objectives import Term
 from doedesign.patterns import spot_centres_m
 from doedesign.spec import Spec
 from fab.units import parse_length
-from sim.camera import Camera
+from sim.camera import Camera, Colour
 from sim.metrics import (
     airy_radius_m,
     energy_budget,
@@ -28,7 +28,7 @@ from sim.psf import PsfBank
 def design_metrics(
     camera: Camera, height_m: Float[np.ndarray, "y x"], bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank
 ) -> list[dict[str, Any]]:
-    """One row per colour and depth of a bank.
+    """One row per depth and colour of a bank.
 
     Args:
         camera: optics.
@@ -43,30 +43,36 @@ def design_metrics(
     """
     far_m = [z for z in bank.depths_m if z not in near_m]
     plain = participation(jnp.asarray(lens.energy))
+    wavelengths = [mean_wavelength_m(colour) for colour in camera.colours]
+    spots = [spot_radius_m(camera, wavelength) for wavelength in wavelengths]
+    far_spot = {
+        (c, z): energy_within(bank.energy[c, bank.depths_m.index(z)], camera.pixel_m, spots[c])
+        for c in range(len(camera.colours))
+        for z in far_m
+    }
+    orders = [_zeroth_order(camera, height_m, colour) for colour in camera.colours]
     rows = []
-    for c, colour in enumerate(camera.colours):
-        wavelength = mean_wavelength_m(colour)
-        spot = spot_radius_m(camera, wavelength)
-        far_energies = [energy_within(bank.energy[c, bank.depths_m.index(z)], camera.pixel_m, spot) for z in far_m]
-        order = sum(
-            weight * zeroth_order(camera, height_m, w)
-            for w, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
-        )
-        for d, depth in enumerate(bank.depths_m):
+    for d, depth in enumerate(bank.depths_m):
+        for c, colour in enumerate(camera.colours):
             psf = bank.energy[c, d]
             budget = energy_budget(camera, height_m, psf, depth, colour)._asdict()
             row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
-            row |= {"in_window": float(psf.sum(dtype=np.float64)), "zeroth_order": order, "budget": budget}
+            row |= {"in_window": float(psf.sum(dtype=np.float64)), "zeroth_order": orders[c], "budget": budget}
             if depth in near_m:
                 ring = ring_to_disc(psf, camera, depth)
-                concentration = float(participation(jnp.asarray(psf))) / float(plain[c, d])
                 row |= {"ring_to_disc": ring.ratio if np.isfinite(ring.ratio) else None}
-                row |= {"disc_radius_m": ring.disc_radius_m, "concentration": concentration}
-                row |= {"concentration_bound": max(far_energies) ** 2 if far_energies else None}
+                row |= {"disc_radius_m": ring.disc_radius_m}
+                row |= {"concentration": float(participation(jnp.asarray(psf))) / float(plain[c, d])}
+                row |= {"concentration_bound": max(far_spot[c, z] for z in far_m) ** 2 if far_m else None}
             else:
-                row |= {"far_spot": far_energies[far_m.index(depth)], "spot_radius_m": spot}
+                row |= {"far_spot": far_spot[c, depth], "spot_radius_m": spots[c]}
             rows.append(row)
     return rows
+
+
+def _zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], colour: Colour) -> float:
+    pairs = zip(colour.wavelengths_m, colour.weights, strict=True)
+    return sum(weight * zeroth_order(camera, height_m, wavelength) for wavelength, weight in pairs)
 
 
 def pattern_metrics(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[dict[str, float]]:

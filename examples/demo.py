@@ -21,6 +21,7 @@ from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
 from fab.files import MANIFEST_NAME, read_json
+from fab.units import format_length
 
 HERE = Path(__file__).parent
 
@@ -71,7 +72,7 @@ def summary(run_folder: Path, order: Path, light: Path, checks: int) -> str:
     rows = read_json(light / "metrics.json")["quantised"]
     lines = ["", "colour  depth     in window  far spot  ring:disc  concentration (bound)", "-" * 72]
     for row in rows:
-        depth = "inf" if row["depth_m"] is None else f"{row['depth_m'] * 100:.0f} cm"
+        depth = "inf" if row["depth_m"] is None else format_length(row["depth_m"])
         far = f"{row['far_spot']:8.3f}" if "far_spot" in row else " " * 8
         near = ""
         if "concentration" in row:

@@ -6,6 +6,7 @@ cancels the quadratic term of Fresnel propagation, so only the source's own path
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -93,6 +94,8 @@ def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
     return tangents / np.sqrt(1.0 + np.sum(tangents**2))
 
 
+# Colours of one depth share the path; one array is kept, and it is read-only.
+@lru_cache(maxsize=1)
 def source_path_m(
     camera: Camera, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
 ) -> Float[np.ndarray, "y x"]:
@@ -108,7 +111,9 @@ def source_path_m(
     """
     y = camera.grid.axis_m("y")[:, None]
     x = camera.grid.axis_m("x")[None, :]
-    return path_at_m(camera, y, x, depth_m, field_rad)
+    path = path_at_m(camera, y, x, depth_m, field_rad)
+    path.setflags(write=False)
+    return path
 
 
 def path_at_m(

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import fft2
 
+from fab.grid import Grid
+from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.psf import pupil_field
 
@@ -19,9 +21,8 @@ def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y
 
 
 def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Float[np.ndarray, "y x"]:
-    """Share of every pixel inside a centred disc, from 8 x 8 points per pixel, float32."""
-    fine = radius_map_m((shape[0] * 8, shape[1] * 8), pixel_m / 8) <= radius_m
-    return fine.reshape(shape[0], 8, shape[1], 8).mean(axis=(1, 3), dtype=np.float32)
+    """Share of every pixel's area inside a centred disc, float32."""
+    return circle_coverage(Grid(shape, pixel_m), 2 * radius_m)
 
 
 def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
@@ -44,14 +45,18 @@ def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
 
 def energy_within(psf: Float[np.ndarray, "y x"], pixel_m: float, radius_m: float) -> float:
     """Energy inside a centred disc, with partly covered pixels counted by area."""
-    return float(np.sum(psf * disc_weights(psf.shape, pixel_m, radius_m), dtype=np.float64))
+    return float(encircled_energy(psf, pixel_m, np.array([radius_m]))[0])
 
 
 def encircled_energy(
-    psf: Float[np.ndarray, "y x"], pixel_m: float, radii_m: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, " r"]:
-    """Energy inside centred discs of growing radius (not divided by the total)."""
-    return np.array([energy_within(psf, pixel_m, float(r)) for r in radii_m])
+    psfs: Float[np.ndarray, "*bank y x"], pixel_m: float, radii_m: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "*bank r"]:
+    """Energy of every PSF inside centred discs of growing radius (not divided by the total)."""
+    y, x = psfs.shape[-2:]
+    discs = (disc_weights((y, x), pixel_m, float(radius)) for radius in radii_m)
+    flat = psfs.reshape(-1, y * x).astype(np.float64)
+    energies = np.stack([flat @ disc.ravel() for disc in discs], axis=-1)
+    return energies.reshape(*psfs.shape[:-2], len(radii_m))
 
 
 class RingToDisc(NamedTuple):
@@ -130,7 +135,7 @@ def energy_budget(
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
         spectrum = np.asarray(fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1))
-        power = np.square(np.abs(spectrum), dtype=np.float64)
+        power = np.square(np.abs(spectrum))
         share = weight * camera.transmission(wavelength)
         passed += share
         band += share * float(envelope @ power @ envelope) / scale

@@ -31,7 +31,6 @@ from sim.camera import Camera
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from scipy.sparse import csr_array
 
     from sim.psf import PsfBank
     from sim.transfer import TransferBank
@@ -72,17 +71,11 @@ def draw_mtf(
         ValueError: no depth is given, or one is not in a bank.
         InputError: the system refuses the path.
     """
-    hues = line_colours(camera.colours)
     frequencies = transfer.frequencies_per_m * MM
 
     def draw(axes: "Axes", depth: int, group: str) -> None:
-        curves: list[tuple[np.ndarray, dict[str, Any]]] = [(transfer.transfer[:, depth], {"lw": 1.2})]
-        if lens_transfer is not None:
-            at = depth_positions(lens_transfer, [transfer.depths_m[depth]], 1)[0]
-            curves.insert(0, (lens_transfer.transfer[:, at], _LENS))
-        for of, style in curves:
-            for colour in _shown(camera):
-                axes.plot(frequencies, of[colour], color=hues[colour], **style)
+        lens = None if lens_transfer is None else lens_transfer.transfer
+        _plot_both(axes, frequencies, (transfer.transfer, transfer), (lens, lens_transfer), depth, camera)
         if group == "near":
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter("{x:g}")
@@ -117,17 +110,16 @@ def draw_encircled(
         ValueError: no depth is given, or one is not in a bank.
         InputError: the system refuses the path.
     """
-    from sim.metrics import mean_wavelength_m, spot_radius_m
+    from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
 
     hues = line_colours(camera.colours)
     size = bank.energy.shape[-1]
     radii = bank.pixel_m * np.geomspace(1.0, size / np.sqrt(2), _RADII)
-    rings = ring_shares(size, radii / bank.pixel_m)
+    shares = encircled_energy(bank.energy, bank.pixel_m, radii)
+    lens_shares = None if lens_bank is None else encircled_energy(lens_bank.energy, bank.pixel_m, radii)
 
     def draw(axes: "Axes", depth: int, group: str) -> None:
-        for of, style in _both(bank, lens_bank, bank.depths_m[depth]):
-            for colour in _shown(camera):
-                axes.plot(radii / UM, np.cumsum(rings @ folded(of[colour]).ravel()), color=hues[colour], **style)
+        _plot_both(axes, radii / UM, (shares, bank), (lens_shares, lens_bank), depth, camera)
         lines = [(camera.defocus_radius_m(bank.depths_m[depth]), FAINT)]
         if group == "far":
             lines = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
@@ -144,53 +136,28 @@ def draw_encircled(
     _draw_panels(path, camera, bank, (near_m, far_m), draw, words, lens_bank is not None, marks)
 
 
-def folded(psf: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "v u"]:
-    """Sum of the four quadrants of a PSF laid over each other, the centre at the first sample."""
-    out = np.asarray(psf, np.float64)
-    for _ in range(2):
-        middle = len(out) // 2
-        upper = out[middle:].copy()
-        upper[len(out) % 2 :] += out[:middle][::-1]
-        out = upper.T
-    return out
-
-
-def ring_shares(size: int, radii: Float[np.ndarray, " r"]) -> "csr_array":
-    """Share of every pixel of a folded window between one radius and the next, `[radius, pixel]`.
-
-    Args:
-        size: pixels per side of the whole window.
-        radii: increasing radii in pixels; the first ring reaches from the centre to the first one.
-
-    Every pixel counts as 8 x 8 points, as in `sim.metrics.disc_weights`, so the sums are those of `encircled_energy`;
-    here one table serves all PSFs and all radii.
-    """
-    from scipy.sparse import csr_array
-
-    side = (size + 1) // 2
-    # An odd window's first folded pixel is its middle one, and reaches half a pixel to either side of the centre.
-    points = (np.arange(8 * side) + 0.5) / 8 - 0.5 * (size % 2)
-    ring = np.searchsorted(radii, np.hypot(points[:, None], points[None, :]))
-    pixel = np.arange(8 * side) // 8
-    ring *= side**2
-    ring += pixel[:, None] * side + pixel[None, :]
-    counts = np.bincount(ring.reshape(-1), minlength=(len(radii) + 1) * side**2)
-    return csr_array(counts.reshape(-1, side**2)[:-1]) / 64
-
-
 def _shown(camera: Camera) -> list[int]:
     return spread(len(camera.colours), _MOST_COLOURS)
 
 
-def _both(
-    bank: "PsfBank", lens_bank: "PsfBank | None", depth_m: float
-) -> list[tuple[Float[np.ndarray, "w y x"], dict[str, Any]]]:
-    """PSFs of the lens and of the plate at a depth, and the style of their lines."""
-    curves: list[tuple[np.ndarray, dict[str, Any]]] = []
-    if lens_bank is not None:
-        curves.append((lens_bank.energy[:, depth_positions(lens_bank, [depth_m], 1)[0]], _LENS))
-    curves.append((bank.energy[:, depth_positions(bank, [depth_m], 1)[0]], {"lw": 1.2}))
-    return curves
+def _plot_both(
+    axes: "Axes",
+    x: Float[np.ndarray, " x"],
+    plate: tuple[Float[np.ndarray, "w d x"], "PsfBank | TransferBank"],
+    lens: tuple[Float[np.ndarray, "w d x"] | None, "PsfBank | TransferBank | None"],
+    depth: int,
+    camera: Camera,
+) -> None:
+    """Plot the curves of one depth, a line per colour: the plain lens dashed, the plate over it."""
+    hues = line_colours(camera.colours)
+    curves, bank = plate
+    lens_curves, lens_bank = lens
+    lines: list[tuple[np.ndarray, dict[str, Any]]] = [(curves[:, depth], {"lw": 1.2})]
+    if lens_curves is not None and lens_bank is not None:
+        lines.insert(0, (lens_curves[:, depth_positions(lens_bank, [bank.depths_m[depth]], 1)[0]], _LENS))
+    for values, style in lines:
+        for colour in _shown(camera):
+            axes.plot(x, values[colour], color=hues[colour], **style)
 
 
 def _draw_panels(

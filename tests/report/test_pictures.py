@@ -10,7 +10,6 @@ import pytest
 from matplotlib.image import imread
 
 from doedesign.report.canvas import colour_label, depth_positions, length_text, line_colours, shrunk, spread
-from doedesign.report.curves import folded, ring_shares
 from doedesign.report.height import height_shares
 from doedesign.report.pictures import (
     draw_encircled,
@@ -25,7 +24,6 @@ from fab.grid import Grid
 from fab.levels import Levels
 from sim.camera import Camera, Colour
 from sim.material import full_wave_height_m
-from sim.metrics import encircled_energy
 from sim.psf import PsfBank, psf_bank
 from sim.transfer import TransferBank
 
@@ -219,15 +217,6 @@ def test_shares_of_area_are_counted_once_each(rng: np.random.Generator):
         assert shares.sum() == pytest.approx(1.0)
     _, beyond = height_shares(np.array([0.0, 20 * 75e-9]), LEVELS, (0.0, 21 * 75e-9))
     assert beyond[0] == beyond[20] == 0.5
-
-
-@pytest.mark.parametrize("size", [16, 17])
-def test_encircled_energy_of_one_table_is_that_of_the_metric(size: int, rng: np.random.Generator):
-    psf = rng.exponential(1.0, (size, size)).astype(np.float32)
-    radii = np.linspace(0.3, 13.0, 40)
-    sums = np.cumsum(ring_shares(size, radii) @ folded(psf).ravel())
-    # The same 8 x 8 points per pixel; float32 weights and sums there, float64 here.
-    np.testing.assert_allclose(sums, encircled_energy(psf, 1.0, radii), rtol=1e-5)
 
 
 def test_shrinking_keeps_the_mean_and_makes_no_moire():
