@@ -8,6 +8,18 @@ Reading order, from the user's words to the result:
     spec_checks     rules that join several tables, and warnings
     spec_errors     what was wrong with a spec, in words a user can act on
     spec_text       a spec as TOML and as JSON
+    build           a spec's camera and levels, as values the physics works on
+    parametrize     free parameters -> heights the process can make
+    starts          baseline designs by name: flat, random, fresnel, ring
+    patterns        target images: spots, areas, pictures
+    objectives      what a design is judged by
+    problem         spec -> loss of one step, ready to differentiate
+    optimize        the loop
+    evaluate        the table of numbers every design gets
+    runs            run folders: manifest, checkpoint, resume
+    report          pictures
+    commands        the work behind each command
+    progress, cli   how the user sees it
 
 Conventions (the whole list is in README.md): a spec's lengths are text with a unit in TOML (`pitch = "1.85 um"`)
 and SI numbers with the unit in the name everywhere else (`pitch_m`). Importing this package imports nothing

@@ -247,14 +247,16 @@ def load_checkpoint(
         return None
     cure = f"Remove {path.name} to start this run again from the beginning."
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        data = path.read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             arrays = [stored[f"array{i}"] for i in range(len(shapes))]
             step, history = int(stored["step"]), json.loads(stored["history"].tobytes())
             digest = stored["spec"].tobytes().decode()
     # What numpy, zipfile and json raise depends on where the damage is.
     except Exception as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            raise explain_os_error(error, path) from error
         got = f'"{error}"' if str(error) else type(error).__name__
         raise InputError(str(path), "must be a whole checkpoint", got, cure) from error
     if digest != spec_digest(run.spec) or [a.shape for a in arrays] != list(shapes):

@@ -168,6 +168,8 @@ def start_heights(
         _number(options, "far_energy", 0.25, 0.0, 1.0),
         _length(options, "period", ring_period_m(camera)),
     )
-    # A perfect grating is a stationary point in many directions; a little roughness lets the optimiser leave it.
-    rough = _number(options, "roughness", 0.02, 0.0, 1.0) * full_wave_height_m(camera.material, wavelength_m)
-    return heights + rough * np.random.default_rng(seed).standard_normal(heights.shape)
+    wave = full_wave_height_m(camera.material, wavelength_m)
+    # A perfect grating is a stationary point in many directions; a little roughness lets the optimiser leave it. The
+    # quarter wave below keeps the floor of the grating away from the wrap at zero.
+    rough = _number(options, "roughness", 0.02, 0.0, 1.0) * np.random.default_rng(seed).standard_normal(heights.shape)
+    return heights + wave * (0.25 + rough)

@@ -20,6 +20,7 @@ from doedesign.commands.heights import level_map_from
 from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
+from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length
 
@@ -42,7 +43,7 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
         print(f"  {text}", file=sys.stderr, flush=True)
 
     say(f"1/3 optimising {spec_path}")
-    run = optimize(spec_path, runs / spec_path.stem, (), say)
+    run = optimize(spec_path, runs / load_spec(spec_path).name, (), say)
 
     order = masks / run.spec.name
     say(f"2/3 drawing {run.spec.process.levels} levels into {order}")
@@ -54,7 +55,7 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
 
     light = run.path("psf")
     say(f"3/3 PSFs of the continuous, the quantised and the drawn design into {light}")
-    if not (light / MANIFEST_NAME).is_file():
+    if not (light / "from_masks.exr").is_file():
         psf(run.folder, order, say=say)
     return summary(run.folder, order, light, len(report.checks))
 

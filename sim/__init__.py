@@ -11,7 +11,8 @@ Reading order, from the substance to the picture:
     hankel      the same for rotationally symmetric pupils
     fresnel     the direct path (eq. 5): reference for the other two
     psf         PSF banks: every colour and depth of one height map
-    metrics     numbers read off a PSF: far-spot energy, ring:disc, MTF, 0th order, energy budget
+    transfer    MTF of lens, DOE and pixel
+    metrics     numbers read off a PSF: far-spot energy, ring:disc, 0th order, energy budget
     store       PSF banks and height maps as OpenEXR files
 
 Conventions (pinned by tests/sim/test_conventions.py):

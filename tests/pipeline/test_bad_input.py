@@ -57,7 +57,7 @@ class Bomb:
     ("text", "words"),
     [
         ("", ["optics"]),
-        ("[optics", ["valid TOML", "line 1"]),
+        ("[optics", ["valid TOML", "end of document"]),
         ("\x00", ["valid TOML"]),
         (b"\xff\xfe", ["UTF-8"]),
         ("[" * 9000, ["valid TOML"]),
@@ -86,11 +86,15 @@ def test_spec_that_is_none(cli, tmp_path, text, words):
         ('objective=[{name="far_spot", options={reach=2}}]', ["far_spot"]),
         ('objective=[{name="target_pattern", options={image="none.png"}}]', ["none.png", "exist"]),
         ("optimize.start_options.pitch=3", ["start_options", "pitch"]),
-        ("optimize.learning_rate=1e30", ["learning_rate"]),
     ],
 )
 def test_override_that_cannot_be(tiny, cli, tmp_path, override, words):
     refuse(cli("optimize", tiny, "--out", tmp_path / "run", "--set", override), *words)
+
+
+def test_loss_without_end(tiny, cli, tmp_path):
+    weights = ("--set", "objective.0.weight=3e38", "--set", "objective.1.weight=3e38")
+    refuse(cli("optimize", tiny, "--out", tmp_path / "run", *weights), "loss must stay finite")
 
 
 def test_missing_files(cli, tmp_path):
@@ -156,7 +160,7 @@ def test_disk_that_takes_no_more(copied, tiny, cli, content, tmp_path, monkeypat
         refuse(cli("optimize", tiny, "--out", tmp_path / "new"), tmp_path / "new", words)
         refuse(cli("masks", copied.run, "--out", tmp_path / "new order"), tmp_path / "new order", words)
         refuse(cli("masks", copied.run, "--out", copied.order), copied.order, words)
-        refuse(cli("psf", copied.run, "--masks", copied.order), copied.run / "psf", words)
+        refuse(cli("psf", copied.run, "--masks", copied.order), copied.run, words)
     assert (content(copied.run), content(copied.order)) == before
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} <= {
         path.name for folder in (copied.run, copied.order) for path in folder.rglob("*")
@@ -267,7 +271,7 @@ def bad_maps():
     yield "nan", hole, ["finite", "row 3", "column 4"]
     yield "infinite", np.where(hole > -1, ramp, np.inf), ["finite", "row 3"]
     yield "negative", dent, ["negative", "row 3", "column 4", "-1 nm"]
-    yield "too high", ramp * 1.3, ["above the top level", "1.3 um"]
+    yield "too high", ramp * 1.3, ["above the top level", "16 levels of 75 nm"]
     yield "flat list", ramp[0], ["two axes"]
     yield "stack", ramp[None], ["two axes"]
     yield "nothing", ramp[:0], ["1 to"]
@@ -276,7 +280,7 @@ def bad_maps():
     yield "counts", np.ones((4, 4), int), ["scale"]
 
 
-@pytest.mark.parametrize(("name", "values", "words"), list(bad_maps()), ids=lambda value: value if type(value) is str else "")
+@pytest.mark.parametrize(("name", "values", "words"), list(bad_maps()), ids=[name for name, *_ in bad_maps()])
 def test_height_map_that_cannot_be_made(cli, tmp_path, name, values, words):
     path = tmp_path / f"{name}.npy"
     np.save(path, values)
@@ -285,13 +289,13 @@ def test_height_map_that_cannot_be_made(cli, tmp_path, name, values, words):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr", ".tif", ".png"])
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
 def test_height_map_cut_off(cli, tmp_path, suffix, share):
     from PIL import Image
     from tifffile import imwrite
 
     path = tmp_path / f"map{suffix}"
-    counts = np.arange(40 * 30, dtype=np.uint16).reshape(40, 30) % 1000
+    counts = np.random.default_rng(5).integers(0, 1000, (40, 30), dtype=np.uint16)
     if suffix == ".npy":
         np.save(path, counts)
     elif suffix == ".exr":
@@ -388,6 +392,7 @@ def test_one_flipped_byte_fails_verify_and_is_named(copied, cli):
 
 
 def test_files_missing_or_too_many_fail_verify(copied, cli):
+    kept = b""
     for name in mask_files(copied.order):
         kept = (copied.order / name).read_bytes()
         (copied.order / name).unlink()

@@ -34,7 +34,7 @@ def overrides(*pairs):
         ['scene.near=["6 mm", "6 mm"]'],
         ['optics.wavelengths=["656 nm", "486 nm"]', "sensor.defocus=5 um", "sensor.fill_factor=0.8"],
     ],
-    ids=lambda changes: " ".join(changes),
+    ids=" ".join,
 )
 def test_spec_to_light(tiny, cli, tmp_path, changes):
     run, order = tmp_path / "run", tmp_path / "order"

@@ -1,0 +1,149 @@
+"""The command line itself: help, options, where things are printed, exit codes. The work has tests of its own."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign import __version__
+from doedesign.cli import exit_code, main
+from fab.errors import CheckFailed, InputError
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = ("optimize", "masks", "verify", "psf")
+HEAVY = ("jax", "numba", "numpy", "matplotlib", "klayout", "gdstk", "pint", "OpenEXR")
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help(command: str, capsys: pytest.CaptureFixture[str]):
+    assert main([*command.split(), "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"doedesign {command}".strip() in shown
+    if not command:
+        assert all(name in shown for name in COMMANDS)
+
+
+def test_help_loads_nothing_heavy():
+    """A fresh interpreter: everything but the command line's own library is imported where it is used."""
+    calls = "; ".join(f"assert main({[*c.split(), '--help']}) == 0" for c in ("", *COMMANDS))
+    check = f"import sys; from doedesign.cli import main; {calls}; print(*({set(HEAVY)} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.splitlines()[-1] == ""
+
+
+def test_version(capsys: pytest.CaptureFixture[str]):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == __version__
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["optimise", "spec.toml"], "optimize"),
+        (["optimize"], "spec"),
+        (["optimize", "spec.toml", "--output", "x"], "--out"),
+        (["masks", "plate.npy", "--levels", "many"], "--levels"),
+        (["masks", "plate.npy", "--levels", "1e2"], "--levels"),
+        (["verify", "order", "another"], "another"),
+        (["psf", "run", "--field-deg", "1"], "--field-deg"),
+        (["optimize", "spec.toml", "--set"], "--set"),
+    ],
+)
+def test_usage_mistakes(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]):
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert words in printed.err
+    assert "doedesign --help" in printed.err
+    assert len(printed.err.splitlines()) == 2
+
+
+def failing(error: BaseException):
+    def work() -> None:
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (InputError("spec.toml: name", "must be plain", "?", "Change it."), 2, "spec.toml: name: must be plain"),
+        (CheckFailed(["M1.gds: differs", "M2.gds: differs"]), 1, "M1.gds: differs\nM2.gds: differs"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (OSError(28, "No space left on device", "out.gds"), 2, "out.gds: the disk must have room"),
+        (BrokenPipeError(32, "Broken pipe"), 130, ""),
+    ],
+)
+def test_exit_codes(error: BaseException, code: int, message: str, capsys: pytest.CaptureFixture[str]):
+    assert exit_code(failing(error)) == code
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.out == ""
+
+
+def test_a_defect_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        exit_code(lambda: 1 / 0)
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("plate") / "plate.npy"
+    np.save(path, np.zeros((8, 8)))
+    return path
+
+
+def draw(plate: Path, out: Path, *more: str) -> list[str]:
+    return ["masks", str(plate), "--levels", "2", "--step", "0.5 um", "--pitch-um", "9", "--out", str(out), *more]
+
+
+def test_json_is_one_line(plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(draw(plate, tmp_path / "a", "--json")) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert json.loads(line)["paths"][0] == str(tmp_path / "a")
+
+
+def test_warnings_go_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("doedesign.commands.optimize.optimize", failing_optimize)
+    assert main(["optimize", str(ROOT / "examples/quick.toml"), "--set", "process.level_step=70 nm"]) == 2
+    printed = capsys.readouterr()
+    assert "warning: process.level_step: 16 x 70 nm" in printed.err
+    assert printed.out == ""
+
+
+def failing_optimize(*_: object) -> None:
+    raise InputError("here", "stops", "it", "Go on.")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_names_the_terminal_cannot_show(plate: Path, tmp_path: Path, encoding: str, monkeypatch: pytest.MonkeyPatch):
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding))
+    assert main(draw(plate, tmp_path / "Größe")) == 0
+    first = shown.getvalue().splitlines()[0].decode()
+    assert first == str(tmp_path / ("Größe" if encoding == "utf-8" else "Gr\\xf6\\xdfe"))
+
+
+@pytest.mark.parametrize(("target", "code"), [("pipe", 0), ("/dev/full", 2)])
+def test_stdout_that_takes_nothing(plate: Path, tmp_path: Path, target: str, code: int):
+    """`doedesign masks ... | head` is no error, a full disk is; neither ends in a traceback."""
+    if target == "pipe":
+        reader, stdout = os.pipe()
+        os.close(reader)
+    elif not Path(target).exists():
+        pytest.skip(f"no {target} on this system")
+    else:
+        stdout = os.open(target, os.O_WRONLY)
+    command = [sys.executable, "-m", "doedesign.cli", *draw(plate, tmp_path / "order")]
+    done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False, cwd=ROOT)
+    os.close(stdout)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    assert main(["verify", str(tmp_path / "order")]) == 0

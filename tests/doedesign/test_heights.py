@@ -1,0 +1,95 @@
+"""Where height maps come from: files of any kind, and runs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign.commands.heights import level_map_from, levels_of_run, read_any_height
+from doedesign.runs import Run, begin_run, claim_run, finish_run
+from doedesign.spec import load_spec
+from fab.errors import InputError
+from fab.levels import Levels, height_of
+from sim.store import write_height
+
+QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
+STEP_M = 75e-9
+
+
+def finished(folder: Path, continuous_m: np.ndarray, *overrides: str) -> Run:
+    """A finished run of 16 x 16 cells around given heights."""
+    spec = load_spec(QUICK, ["doe.samples=16", "doe.aperture=29.6 um", *overrides])
+    with claim_run(folder, spec, {}) as run:
+        begin_run(run, {}, overrides)
+        drawn = np.mod(np.rint(continuous_m / STEP_M), 16) * STEP_M
+        write_height(run.path("height.exr"), drawn, 1.85e-6, 29.6e-6)
+        write_height(run.path("height_continuous.exr"), continuous_m, 1.85e-6, 29.6e-6)
+        finish_run(run, {}, overrides, ["height.exr", "height_continuous.exr"])
+    return run
+
+
+@pytest.fixture
+def continuous_m(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(0, 16 * STEP_M, (16, 16))
+
+
+def test_a_run_gives_the_levels_it_drew(tmp_path: Path, continuous_m: np.ndarray):
+    run = finished(tmp_path, continuous_m)
+    for count in (None, 16):
+        drawing = levels_of_run(run, count)
+        assert drawing.levels == Levels(16, STEP_M)
+        assert drawing.file == run.path("height.exr")
+        assert np.array_equal(drawing.level, np.mod(np.rint(continuous_m / STEP_M), 16))
+    assert drawing.name == "quick"
+    assert drawing.aperture_m == 29.6e-6
+
+
+@pytest.mark.parametrize("count", [2, 4, 8, 32, 64])
+def test_another_number_of_levels_spans_the_same_height(tmp_path: Path, continuous_m: np.ndarray, count: int):
+    drawing = levels_of_run(finished(tmp_path, continuous_m), count)
+    full = 16 * STEP_M
+    assert drawing.levels.count * drawing.levels.step_m == pytest.approx(full, rel=1e-12)
+    assert drawing.file.name == "height_continuous.exr"
+    off = height_of(drawing.level, drawing.levels) - continuous_m
+    around = np.minimum(np.abs(off), full - np.abs(off))
+    # Half a step, and the file's float32 heights.
+    assert around.max() <= drawing.levels.step_m / 2 + 1e-7 * full
+
+
+def test_a_continuous_run_is_rounded_when_it_is_drawn(tmp_path: Path, continuous_m: np.ndarray):
+    drawing = levels_of_run(finished(tmp_path, continuous_m, "optimize.quantisation=none"))
+    assert drawing.levels == Levels(16, STEP_M)
+    assert drawing.file.name == "height_continuous.exr"
+
+
+@pytest.mark.parametrize("count", [0, -8, 3, 12, 128])
+def test_impossible_levels(tmp_path: Path, continuous_m: np.ndarray, count: int):
+    run = finished(tmp_path, continuous_m)
+    with pytest.raises(InputError, match="power of two"):
+        level_map_from(run.folder, count)
+    np.save(tmp_path / "map.npy", continuous_m)
+    with pytest.raises(InputError, match="power of two"):
+        level_map_from(tmp_path / "map.npy", count, step_m=STEP_M, pitch_m=1e-6)
+
+
+def test_what_an_exr_does_not_say_must_be_given(tmp_path: Path):
+    path = tmp_path / "plate.exr"
+    write_height(path, np.zeros((4, 6)), 2e-6, 5e-6)
+    height = read_any_height(path)
+    assert (height.grid.pitch_m, height.aperture_m) == (2e-6, 5e-6)
+    height = read_any_height(path, pitch_m=3e-6, aperture_m=7e-6)
+    assert (height.grid.pitch_m, height.aperture_m) == (3e-6, 7e-6)
+    for wrong in ({"pitch_m": 0.0}, {"aperture_m": 0.0}):
+        with pytest.raises(InputError, match="positive"):
+            read_any_height(path, **wrong)
+
+
+def test_a_folder_is_no_height_map(tmp_path: Path):
+    with pytest.raises(InputError, match="a height map is a file"):
+        read_any_height(tmp_path)
+
+
+def test_messages_name_the_file(tmp_path: Path):
+    np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
+    with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
+        level_map_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)

@@ -1,0 +1,256 @@
+"""Run folders: whose they are, what is in them, and what is refused."""
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign.runs import (
+    CHECKPOINT,
+    Run,
+    alone_in,
+    begin_run,
+    claim_run,
+    finish_run,
+    input_digests,
+    load_checkpoint,
+    open_run,
+    save_checkpoint,
+    write_history,
+)
+from doedesign.spec import Spec, load_spec
+from fab.errors import InputError
+from fab.files import sha256_file
+
+QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
+
+
+@pytest.fixture(scope="module")
+def spec() -> Spec:
+    return load_spec(QUICK)
+
+
+@pytest.fixture
+def run(spec: Spec, tmp_path: Path) -> Run:
+    """A run that has begun."""
+    with claim_run(tmp_path / "run", spec, {}) as claimed:
+        begin_run(claimed, {}, [])
+    return claimed
+
+
+@pytest.fixture
+def done(run: Run) -> Run:
+    """A finished run with one result."""
+    run.path("height.exr").write_bytes(b"heights")
+    finish_run(run, {}, [], ["height.exr", "spec.toml"])
+    return run
+
+
+def test_a_run_is_begun_resumed_and_finished(spec: Spec, tmp_path: Path):
+    folder = tmp_path / "a" / "b"
+    with claim_run(folder, spec, {"image": "ab"}) as run:
+        assert not run.done
+        assert list(folder.iterdir()) == []
+        begin_run(run, {"image": "ab"}, ["optimize.seed=1"])
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", "spec.toml"}
+    assert load_spec(folder / "spec.toml") == spec
+    assert "--set optimize.seed=1" in (folder / "spec.toml").read_text()
+    with claim_run(folder, spec, {"image": "ab"}) as run:
+        assert not run.done
+        save_checkpoint(run, [np.zeros(3)], 1, [])
+        write_history(run, [{"step": 0}, {"step": 1}])
+        finish_run(run, {"image": "ab"}, ["optimize.seed=1"], ["history.jsonl"])
+    assert not (folder / CHECKPOINT).exists()
+    assert (folder / "history.jsonl").read_text() == '{"step": 0}\n{"step": 1}\n'
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["results_sha256"] == {"history.jsonl": sha256_file(folder / "history.jsonl")}
+    assert manifest["overrides"] == ["optimize.seed=1"]
+    with claim_run(folder, spec, {"image": "ab"}) as run:
+        assert run.done
+    assert open_run(folder) == run
+
+
+def test_another_spec_or_other_inputs_are_refused(run: Run, spec: Spec):
+    other = load_spec(QUICK, ["optimize.seed=2"])
+    for wanted, inputs in ((other, {}), (spec, {"image": "ab"})):
+        with (
+            pytest.raises(InputError, match="another spec or other input files"),
+            claim_run(run.folder, wanted, inputs),
+        ):
+            pytest.fail("claimed")
+
+
+def test_equal_specs_are_the_same_however_written(run: Run):
+    with claim_run(run.folder, load_spec(QUICK, ["optics.focal_length=0.1 cm"]), {}) as claimed:
+        assert claimed.spec == run.spec
+
+
+def test_foreign_folders_and_files_are_refused(spec: Spec, tmp_path: Path):
+    (tmp_path / "notes.txt").write_text("mine")
+    for folder in (tmp_path, tmp_path / "notes.txt", tmp_path / "notes.txt" / "below"):
+        with pytest.raises(InputError) as caught, claim_run(folder, spec, {}):
+            pytest.fail("claimed")
+        assert str(folder) in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_one_process_at_a_time(run: Run, spec: Spec):
+    with alone_in(run.folder):
+        with pytest.raises(InputError, match="only one process"), claim_run(run.folder, spec, {}):
+            pytest.fail("claimed")
+        with pytest.raises(InputError, match="unfinished"):  # and not that it is in use: reading needs no claim
+            open_run(run.folder)
+    with claim_run(run.folder, spec, {}):
+        pass
+
+
+def test_locks_may_be_missing(run: Run, monkeypatch: pytest.MonkeyPatch):
+    def unsupported(*_: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    with alone_in(run.folder), alone_in(run.folder):
+        pass
+
+
+def test_only_temporary_files_are_cleared_away(run: Run):
+    kept = [".gitignore", ".notes.txt.abcdefgh", "checkpoint.npz.abcdefgh", ".height.exr.bak", ".psf.exr"]
+    swept = [".checkpoint.npz.abcd_123", ".manifest.json.00000000", ".height_continuous.exr.zzzzzzzz"]
+    for name in kept + swept:
+        run.path(name).write_text("")
+    run.path(".psf.new.abcdefgh").mkdir()
+    with alone_in(run.folder):
+        assert {path.name for path in run.folder.iterdir()} == {*kept, "manifest.json", "spec.toml"}
+
+
+def test_nothing_stays_open(run: Run, spec: Spec):
+    before = len(os.listdir("/dev/fd"))
+    for _ in range(5):
+        with claim_run(run.folder, spec, {}):
+            pass
+    assert len(os.listdir("/dev/fd")) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run: run.path("manifest.json").unlink(), "has a manifest.json"),
+        (lambda run: run.path("manifest.json").write_text("{"), "must be JSON"),
+        (lambda run: run.path("manifest.json").write_text('{"format": "other"}'), "must say format"),
+        (lambda run: run.path("spec.toml").unlink(), "must exist"),
+        (lambda run: run.path("spec.toml").write_text("name = 3"), "spec.toml"),
+        (lambda run: run.path("spec.toml").write_text(QUICK.read_text().replace("seed = 1", "seed = 2")), "changed"),
+        (lambda run: run.path("height.exr").write_bytes(b"other"), "the file this run wrote"),
+        (lambda run: run.path("height.exr").unlink(), "must exist"),
+    ],
+)
+def test_a_changed_run_is_refused(done: Run, change: Callable[[Run], object], message: str):
+    assert open_run(done.folder).done
+    change(done)
+    with pytest.raises(InputError, match=message) as caught:
+        open_run(done.folder)
+    assert str(done.folder) in str(caught.value)
+
+
+def test_a_run_that_is_none(tmp_path: Path):
+    for folder in (tmp_path / "nothing", tmp_path):
+        with pytest.raises(InputError, match="run folder"):
+            open_run(folder)
+
+
+@pytest.mark.parametrize("key", ["format", "state", "spec_sha256", "inputs_sha256", "results_sha256"])
+@pytest.mark.parametrize("value", [None, 3, []])
+def test_a_manifest_with_a_hole(done: Run, key: str, value: object):
+    path = done.path("manifest.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        open_run(done.folder)
+
+
+def test_input_digests_name_a_missing_file(tmp_path: Path):
+    (tmp_path / "a").write_text("a")
+    assert input_digests({"start": tmp_path / "a"}) == {"start": sha256_file(tmp_path / "a")}
+    with pytest.raises(InputError, match="must exist"):
+        input_digests({"start": tmp_path / "b"})
+
+
+ARRAYS = [np.arange(12, dtype=np.float32).reshape(3, 4), np.array(7, np.int32), np.linspace(0, 1, 5, dtype=np.float32)]
+SHAPES = [(3, 4), (), (5,)]
+HISTORY = [{"step": 0, "loss": 0.1}, {"step": 1, "loss": 1e-300}]
+
+
+def test_checkpoint_round_trip(run: Run):
+    assert load_checkpoint(run, SHAPES) is None
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    stored = load_checkpoint(run, SHAPES)
+    assert stored is not None
+    arrays, step, history = stored
+    assert step == 2
+    assert history == HISTORY
+    for found, saved in zip(arrays, ARRAYS, strict=True):
+        assert found.dtype == saved.dtype
+        assert np.array_equal(found, saved)
+
+
+def test_equal_checkpoints_have_equal_bytes(run: Run):
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    first = run.path(CHECKPOINT).read_bytes()
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    assert run.path(CHECKPOINT).read_bytes() == first
+
+
+def test_a_checkpoint_of_something_else(run: Run):
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    for shapes in ([(3, 4), (), (6,)], [(4, 3), (), (5,)], [*SHAPES, ()]):
+        with pytest.raises(InputError, match=CHECKPOINT):
+            load_checkpoint(run, shapes)
+    other = Run(run.folder, load_spec(QUICK, ["optimize.seed=2"]), done=False)
+    with pytest.raises(InputError, match="another spec"):
+        load_checkpoint(other, SHAPES)
+
+
+def test_damage_is_found_or_harmless(run: Run):
+    """Cut or flipped anywhere, a checkpoint is refused with a cure, or gives exactly what was saved."""
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    whole = run.path(CHECKPOINT).read_bytes()
+    damaged = [whole[:n] for n in range(0, len(whole), 61)]
+    for where in range(0, len(whole), 5):
+        data = bytearray(whole)
+        data[where] ^= 1 << (where % 8)
+        damaged.append(bytes(data))
+    refused = 0
+    for data in damaged:
+        run.path(CHECKPOINT).write_bytes(data)
+        try:
+            stored = load_checkpoint(run, SHAPES)
+        except InputError as error:
+            refused += error.cure.startswith(f"Remove {CHECKPOINT}")
+            continue
+        assert stored is not None
+        assert stored[1:] == (2, HISTORY)
+        assert all(np.array_equal(a, b) for a, b in zip(stored[0], ARRAYS, strict=True))
+    # Names, times and padding of the archive are about a third of it; everything else is guarded.
+    assert refused > len(damaged) / 2
+
+
+class Bomb:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_checkpoint_is_never_unpickled(run: Run, tmp_path: Path):
+    bomb = Bomb(tmp_path / "exploded")
+    run.path(CHECKPOINT).write_bytes(pickle.dumps(bomb))
+    with pytest.raises(InputError, match="whole checkpoint"):
+        load_checkpoint(run, SHAPES)
+    np.savez(run.path(CHECKPOINT), allow_pickle=True, array0=np.array([bomb], dtype=object))
+    with pytest.raises(InputError, match="whole checkpoint"):
+        load_checkpoint(run, SHAPES)
+    assert not (tmp_path / "exploded").exists()

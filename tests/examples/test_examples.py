@@ -1,0 +1,121 @@
+"""Every example loads; the small ones run, and the narrated one goes from the spec to the light and back."""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import doedesign.commands.optimize
+import doedesign.commands.psf
+from doedesign.cli import main
+from doedesign.spec import load_spec, spec_warnings
+from fab.files import write_atomic
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SMALL = ("doe.samples=64", "sensor.window=48", "optimize.steps=3")
+
+
+def overrides(*changes: str) -> list[str]:
+    return [part for change in changes for part in ("--set", change)]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_spec_loads_without_a_warning(path: Path):
+    spec = load_spec(path)
+    assert spec.name == path.stem
+    assert spec_warnings(spec) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("quick", ["doe.aperture=0.1184 mm", 'scene.near=["6 mm"]', 'scene.far=["inf"]']),
+        ("beam_splitter", ["doe.aperture=0.128 mm", "objective.0.options.spacing=30 um"]),
+        ("diffuser", ["doe.aperture=0.128 mm", "objective.0.options.width=80 um"]),
+    ],
+)
+def test_small_specs_run(name: str, changes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run, order = tmp_path / "run", tmp_path / "order"
+    spec = EXAMPLES / f"{name}.toml"
+    assert main(["optimize", str(spec), "--out", str(run), *overrides(*SMALL, *changes)]) == 0
+    assert main(["masks", str(run), "--out", str(order)]) == 0
+    capsys.readouterr()
+    assert main(["psf", str(run), "--masks", str(order)]) == 0
+    printed = set(capsys.readouterr().out.splitlines())
+    assert {str(run / "psf" / f"{bank}.exr") for bank in ("continuous", "quantised", "from_masks")} < printed
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert ("patterns" in metrics) == (name != "quick")
+    assert (run / "pattern.png").exists() == (name != "quick")
+    for row in metrics["psf"]:
+        assert 0 < row["in_window"] < 1
+        assert np.isfinite([value for value in row.values() if isinstance(value, float)]).all()
+
+
+@pytest.fixture(scope="module")
+def demo() -> ModuleType:
+    found = importlib.util.spec_from_file_location("examples_demo", EXAMPLES / "demo.py")
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A spec whose file is not called after the design."""
+    text = (EXAMPLES / "quick.toml").read_text()
+    for old, new in (
+        ("samples = 320", "samples = 64"),
+        ('aperture = "0.592 mm"', 'aperture = "0.1184 mm"'),
+        ("window = 128", "window = 48"),
+        ("steps = 60", "steps = 3"),
+        ('["6 mm", "10 mm", "15 mm"]', '["6 mm"]'),
+        ('["0.6 m", "1.2 m"]', '["inf"]'),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path_factory.mktemp("spec") / "first try.toml"
+    path.write_text(text)
+    return path
+
+
+def test_demo_twice(demo: ModuleType, small: Path, tmp_path: Path):
+    runs, masks = tmp_path / "runs", tmp_path / "masks"
+    summary = demo.demo(small, runs, masks)
+    for folder in (runs / "quick", masks / "quick", runs / "quick" / "psf"):
+        assert str(folder) in summary
+        assert (folder / "manifest.json").is_file()
+    pictures = sorted(map(str, tmp_path.rglob("*.png")))
+    assert pictures
+    assert all(f"  {picture}\n" in f"{summary}\n" for picture in pictures)
+    assert "656nm" in summary
+    assert "every pixel of every file is as designed" in summary
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert demo.demo(small, runs, masks) == summary
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == times
+
+
+def test_demo_takes_no_other_order_for_its_own(
+    demo: ModuleType, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for module in (doedesign.commands.optimize, doedesign.commands.psf):
+        for name in dir(module):
+            if name.startswith("draw_"):  # pictures take most of the time
+                monkeypatch.setattr(module, name, lambda path, *_, **__: write_atomic(path, b"picture"))
+    runs, masks = tmp_path / "runs", tmp_path / "masks"
+    demo.demo(small, runs, masks)
+    run, order = runs / "quick", masks / "quick"
+    assert demo.run_is_drawn(run, order)
+    assert main(["masks", str(run), "--levels", "8", "--out", str(order)]) == 0
+    assert not demo.run_is_drawn(run, order)
+    # PSFs that were computed without the masks are not those of what was drawn.
+    monkeypatch.chdir(tmp_path / "runs")
+    assert main(["psf", "quick"]) == 0
+    assert not (run / "psf" / "from_masks.exr").exists()
+    demo.demo(small, runs, masks)
+    assert demo.run_is_drawn(run, order)
+    assert (run / "psf" / "from_masks.exr").exists()

@@ -1,0 +1,134 @@
+"""Height maps a user brings: every kind of file, any shape, and the same way up in the GDS as in the file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gdstk
+import numpy as np
+import pytest
+from PIL import Image
+from tifffile import imwrite
+
+from fab.levels import Levels, quantise
+from sim.store import write_height
+
+LEVELS, STEP_M, PITCH_UM = 16, 75e-9, 2.0
+FULL_M = (LEVELS - 1) * STEP_M
+
+
+def write_map(path: Path, height_m: np.ndarray, kind: str) -> tuple[str, ...]:
+    """Write heights (whole nanometres) as one kind of file; return the options it needs."""
+    counts = np.rint(height_m * 1e9).astype(np.uint16)
+    levels, pitch, scale = (
+        ("--levels", str(LEVELS), "--step", "75 nm"),
+        ("--pitch-um", str(PITCH_UM)),
+        ("--scale", "1 nm"),
+    )
+    if kind == "npy":
+        np.save(path, height_m)
+        return (*levels, *pitch)
+    if kind == "npy counts":
+        np.save(path, counts.astype(np.int64))
+        return (*levels, *pitch, *scale)
+    if kind == "npy float32, columns first":
+        np.save(path, np.asfortranarray(height_m.astype(np.float32)))
+        return (*levels, *pitch)
+    if kind == "exr":
+        write_height(path, height_m, PITCH_UM * 1e-6, min(height_m.shape) * PITCH_UM * 1e-6)
+        return levels
+    # Pictures are stored from the top row down, and +y is up.
+    if kind == "tif metres":
+        imwrite(path, height_m[::-1].astype(np.float32))
+        return (*levels, *pitch)
+    if kind == "tif":
+        imwrite(path, counts[::-1], compression="zlib")
+    else:
+        Image.fromarray(counts[::-1].copy()).save(path)
+    return (*levels, *pitch, *scale)
+
+
+KINDS = ["npy", "npy counts", "npy float32, columns first", "exr", "tif", "tif metres", "png"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", [(21, 15), (16, 23)])
+def test_a_marked_place_stays_where_it_is(cli, tmp_path, kind, shape):
+    """One deep cell up and to the left of the centre, blank glass everywhere else."""
+    up, left = 4, 3
+    row, column = (shape[0] - 1) // 2 + up, shape[1] // 2 - left
+    height = np.full(shape, FULL_M)
+    height[row, column] = 0
+    path = tmp_path / f"corner.{kind[:3]}"
+    done = cli("masks", path, *write_map(path, height, kind), "--out", tmp_path / "order")
+    assert done.code == 0, done.err
+    cells: list[Any] = gdstk.read_gds(str(tmp_path / "order" / "DOE_CORNER_ALL.gds")).cells
+    (cell,) = cells
+    # The centre of the cell, from the centre of the map, in micrometres: half a cell off where the count is even.
+    x, y = (column - (shape[1] - 1) / 2) * PITCH_UM, (row - (shape[0] - 1) / 2) * PITCH_UM
+    assert x < 0 < y
+    for layer in range(1, 5):
+        (polygon,) = (p for p in cell.polygons if p.layer == layer)
+        (x0, y0), (x1, y1) = polygon.bounding_box()
+        assert (x0, x1) == pytest.approx((x - PITCH_UM / 2, x + PITCH_UM / 2), abs=1e-3)
+        assert (y0, y1) == pytest.approx((y - PITCH_UM / 2, y + PITCH_UM / 2), abs=1e-3)
+    assert cli("verify", tmp_path / "order").code == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
+    shape = (37, 52)
+    counts = rng.integers(0, round(FULL_M * 1e9) + 1, shape)
+    # No height in the middle between two levels, where float32 metres may round the other way.
+    counts += (counts % 75 == 37).astype(int)
+    path = tmp_path / f"map.{kind[:3]}"
+    done = cli("masks", path, *write_map(path, counts * 1e-9, kind), "--out", tmp_path / "order", "--json")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
+    assert told["paths"][0] == str(tmp_path / "order")
+    assert told["checks"] > 20
+    level = np.load(tmp_path / "order" / "DOE_MAP_LEVELS.npy")
+    y, x = np.indices(shape)
+    inside = (y - 18) ** 2 + (x - 25.5) ** 2 <= (37 / 2) ** 2
+    assert np.array_equal(level[inside], quantise(counts * 1e-9, Levels(LEVELS, STEP_M))[inside])
+    assert (level[~inside] == LEVELS - 1).all()
+    manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
+    assert manifest["source"]["kind"] == "height map"
+    assert manifest["source"]["name"] == path.name
+    assert manifest["shape"] == [37, 52]
+    assert manifest["aperture_mm"] == pytest.approx(37 * PITCH_UM * 1e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 90), (90, 3)])
+def test_odd_shapes(cli, tmp_path, rng, shape):
+    np.save(tmp_path / "odd.npy", rng.uniform(0, FULL_M, shape))
+    options = ("--levels", LEVELS, "--step", "75 nm", "--pitch-um", 20, "--out", tmp_path / "order")
+    done = cli("masks", tmp_path / "odd.npy", *options)
+    assert done.code == 0, done.err
+    assert cli("verify", tmp_path / "order").code == 0
+
+
+@pytest.mark.parametrize(
+    ("stem", "folder", "order_id"),
+    [
+        ("My lens (v2)", "My_lens__v2", "MY_LENS_V2"),
+        ("Linse-Größe", "Linse_Gr__e", "LINSE_GR_E"),
+        ("плата", "height", "HEIGHT"),
+        ("…", "height", "HEIGHT"),
+    ],
+)
+def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / f"{stem}.npy", np.full((9, 9), FULL_M))
+    done = cli("masks", f"{stem}.npy", "--levels", LEVELS, "--step", "75 nm", "--pitch-um", 9)
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[0] == f"masks/{folder}"
+    assert (tmp_path / "masks" / folder / f"DOE_{order_id}_ALL.gds").is_file()
+
+
+def test_a_map_may_say_more_than_its_file(cli, tmp_path):
+    write_height(tmp_path / "plate.exr", np.full((20, 20), FULL_M), 2e-6, 40e-6)
+    levels = ("--levels", LEVELS, "--step", "75 nm", "--out", tmp_path / "order")
+    assert cli("masks", tmp_path / "plate.exr", *levels, "--pitch-um", 3, "--aperture", "50 um").code == 0
+    manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
+    assert (manifest["pitch_um"], manifest["aperture_mm"]) == (3, 0.05)
