@@ -2,12 +2,7 @@
 
 Reading order, from the user's words to the result:
 
-    spec            load a TOML spec, its JSON form and its digest; the door to the five files below
-    spec_values     the kinds of value a spec holds: lengths, names, options
-    spec_models     the spec itself: frozen tables, one per section of the TOML
-    spec_checks     rules that join several tables, and warnings
-    spec_errors     what was wrong with a spec, in words a user can act on
-    spec_text       a spec as TOML and as JSON
+    spec            a TOML spec as frozen tables, its rules, its words for every mistake, its digest
     build           a spec's camera and levels, as values the physics works on
     parametrize     free parameters -> heights the process can make
     starts          baseline designs by name: flat, random, fresnel, ring

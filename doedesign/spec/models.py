@@ -2,14 +2,14 @@
 
 An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
 (`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
-Rules between two tables are in `spec_checks`; `doedesign.spec.load_spec` applies both.
+Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
 """
 
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from doedesign.spec_values import (
+from doedesign.spec.values import (
     FROM_TOML,
     Aperture,
     ChromeOverlap,

@@ -6,6 +6,12 @@
 
 Every mistake in a file is an `InputError` that names the file, the key, the rule, the value and the cure; several
 are told together. `spec_warnings` returns what is allowed but probably not meant.
+
+    values      the kinds of value a spec holds: lengths, names, options
+    models      the tables, one per section of the TOML
+    checks      rules that join several tables, and warnings
+    errors      what was wrong, in words a user can act on
+    text        a spec as TOML and as JSON
 """
 
 import re
@@ -16,9 +22,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from doedesign.spec_checks import Problem, find_problems, spec_warnings
-from doedesign.spec_errors import SpecError, explain, key_as_written, spec_error
-from doedesign.spec_models import (
+from doedesign.spec.checks import Problem, find_problems, spec_warnings
+from doedesign.spec.errors import SpecError, explain, key_as_written, spec_error
+from doedesign.spec.models import (
     ColourSpec,
     DoeSpec,
     ObjectiveSpec,
@@ -29,8 +35,8 @@ from doedesign.spec_models import (
     SensorSpec,
     Spec,
 )
-from doedesign.spec_text import spec_digest, spec_to_json, spec_to_toml
-from doedesign.spec_values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
+from doedesign.spec.text import spec_digest, spec_to_json, spec_to_toml
+from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
 from fab.errors import InputError
 from fab.files import explain_os_error
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from doedesign.spec_models import Spec, Table, toml_key
+from doedesign.spec.models import Spec, Table, toml_key
 from fab.files import canonical_json, sha256_bytes
 from fab.units import format_length, parse_length
 

@@ -64,7 +64,7 @@ def broken(rule: str, cure: str) -> PydanticCustomError:
         cure: what to do about it, a full sentence.
 
     Returns:
-        An error of the type "spec", which `doedesign.spec_errors` knows how to tell.
+        An error of the type "spec", which `doedesign.spec.errors` knows how to tell.
     """
     return PydanticCustomError("spec", "{rule}", {"rule": rule, "cure": cure})
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from doedesign.spec_models import Spec
+from doedesign.spec.models import Spec
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index

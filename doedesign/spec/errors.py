@@ -11,9 +11,9 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from doedesign.spec_checks import Problem
-from doedesign.spec_models import Spec, Table, toml_key
-from doedesign.spec_values import nearest
+from doedesign.spec.checks import Problem
+from doedesign.spec.models import Spec, Table, toml_key
+from doedesign.spec.values import nearest
 from fab.errors import InputError
 
 __all__ = ["SpecError", "explain", "key_as_written", "spec_error"]
