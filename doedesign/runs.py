@@ -137,6 +137,8 @@ def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> Iterator[R
 def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
     """Whether a run is finished; refuse it if it is not that of a spec and its inputs."""
     found = _read_manifest(folder)
+    if found["state"] != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
+        return False  # begun and nothing more: there is nothing to lose, whatever the spec was
     if found["spec_sha256"] != spec_digest(spec) or found["inputs_sha256"] != dict(inputs):
         raise InputError(
             str(folder),

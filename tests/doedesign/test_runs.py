@@ -76,6 +76,7 @@ def test_a_run_is_begun_resumed_and_finished(spec: Spec, tmp_path: Path):
 
 def test_another_spec_or_other_inputs_are_refused(run: Run, spec: Spec):
     other = load_spec(QUICK, ["optimize.seed=2"])
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
     for wanted, inputs in ((other, {}), (spec, {"image": "ab"})):
         with (
             pytest.raises(InputError, match="another spec or other input files"),
@@ -84,18 +85,29 @@ def test_another_spec_or_other_inputs_are_refused(run: Run, spec: Spec):
             pytest.fail("claimed")
 
 
+def test_a_run_that_got_nowhere_gives_way(run: Run):
+    """Such as one with a start that diverges at once: mend the spec and go on."""
+    other = load_spec(QUICK, ["optimize.seed=2"])
+    with claim_run(run.folder, other, {"image": "ab"}) as claimed:
+        assert not claimed.done
+        begin_run(claimed, {"image": "ab"}, [])
+    assert load_spec(run.path("spec.toml")) == other
+
+
 def test_equal_specs_are_the_same_however_written(run: Run):
     with claim_run(run.folder, load_spec(QUICK, ["optics.focal_length=0.1 cm"]), {}) as claimed:
         assert claimed.spec == run.spec
 
 
-def test_foreign_folders_and_files_are_refused(spec: Spec, tmp_path: Path):
-    (tmp_path / "notes.txt").write_text("mine")
-    for folder in (tmp_path, tmp_path / "notes.txt", tmp_path / "notes.txt" / "below"):
+@pytest.mark.parametrize("name", ["notes.txt", "spec.toml", ".hidden"])
+def test_foreign_folders_and_files_are_refused(spec: Spec, tmp_path: Path, name: str):
+    (tmp_path / name).write_text("mine")
+    for folder in (tmp_path, tmp_path / name, tmp_path / name / "below"):
         with pytest.raises(InputError) as caught, claim_run(folder, spec, {}):
             pytest.fail("claimed")
         assert str(folder) in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
 
 
 def test_one_process_at_a_time(run: Run, spec: Spec):

@@ -1,3 +1,5 @@
+# pyright: reportMissingImports=false, reportArgumentType=false
+# The peers come with the `bench` extra alone, and their stubs take no floats.
 """The same small tasks given to prysm, POPPY and HCIPy (extra `bench`); each compared where it says the same thing."""
 
 import warnings

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from functools import partial
 from pathlib import Path
 
 import matplotlib as mpl
@@ -174,11 +175,12 @@ def test_programmers_mistakes_are_named(tmp_path: Path, rng: np.random.Generator
     with pytest.raises(ValueError, match="grid's shape"):
         draw_height(path, np.zeros((8, 8)), LEVELS, CAMERA, "")
     transfer = random_transfer(rng)
-    for draw, what in ((draw_psfs, bank), (draw_mtf, transfer), (draw_encircled, bank)):
+    draws = (partial(draw_psfs, path, CAMERA, bank), partial(draw_mtf, path, CAMERA, transfer))
+    for draw in (*draws, partial(draw_encircled, path, CAMERA, bank)):
         with pytest.raises(ValueError, match="at least one depth"):
-            draw(path, CAMERA, what, (), ())
+            draw((), ())
         with pytest.raises(ValueError, match="must be in the bank"):
-            draw(path, CAMERA, what, (0.123,), ())
+            draw((0.123,), ())
     with pytest.raises(ValueError, match="target's shape"):
         draw_pattern(path, CAMERA, np.zeros((4, 4)), np.zeros((5, 5)), efficiency=0.0, uniformity=0.0)
     with pytest.raises(ValueError, match="at least one step"):
@@ -194,8 +196,10 @@ def test_unusual_plates_and_banks_are_drawn(tmp_path: Path, rng: np.random.Gener
         camera = dataclasses.replace(CAMERA, colours=colours, window=window)
         bank = random_bank(rng, window, camera, depths)
         transfer = random_transfer(rng, camera, depths)
-        for i, (draw, what) in enumerate(((draw_psfs, bank), (draw_mtf, transfer), (draw_encircled, bank))):
-            draw(tmp_path / f"{len(colours)}{i}.png", camera, what, depths[:-1], depths[-1:])
+        name = tmp_path / f"{len(colours)}"
+        draw_psfs(f"{name}psf.png", camera, bank, depths[:-1], depths[-1:])
+        draw_mtf(f"{name}mtf.png", camera, transfer, depths[:-1], depths[-1:])
+        draw_encircled(f"{name}encircled.png", camera, bank, depths[:-1], depths[-1:])
     dark = PsfBank(np.zeros((3, 1, 8, 8), np.float32), ("656nm", "589nm", "486nm"), (1.0,), CAMERA.pixel_m)
     draw_psfs(tmp_path / "dark.png", CAMERA, dark, (), (1.0,))
     tiny = dataclasses.replace(CAMERA, grid=Grid((7, 7), 1e-6), aperture_m=5e-6)
