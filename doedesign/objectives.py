@@ -94,6 +94,8 @@ def handcrafted(view: View, *, near_weight: float = 1.0) -> Array:
     Squared distances, each relative to its target's: |p_far - delta|² where delta is all light in the far spot,
     and |p_near - u|² / |u|² where u spreads all light evenly over the window.
     """
+    if not isinstance(near_weight, int | float):
+        raise InputError("handcrafted: near_weight", "must be a number", repr(near_weight), "For example 1.0.")
     spots = spot_weights(view.camera)
     even = 1.0 / view.camera.window**2
     delta = spots / spots.sum(axis=(1, 2), keepdims=True)
@@ -167,6 +169,6 @@ def _require_options(function: partial[Array], where: str) -> None:
         raise InputError(
             f"{where}: options",
             f"must be options of {function.func.__name__}{inspect.signature(function.func)}",
-            str(error),
+            str(error).removeprefix("got "),
             "Correct or remove the option.",
         ) from error

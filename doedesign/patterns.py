@@ -69,6 +69,7 @@ def _disc(camera: Camera, options: dict[str, Any], where: str) -> Float[np.ndarr
     return disc_weights((camera.window, camera.window), camera.pixel_m, radius).astype(np.float64)
 
 
+_OPTIONS = {"spots": {"count", "spacing"}, "square": {"width"}, "disc": {"diameter"}}
 _PATTERNS: dict[str, Callable[[Camera, dict[str, Any], str], np.ndarray]] = {
     "spots": _spots,
     "square": _square,
@@ -88,6 +89,8 @@ def _picture(camera: Camera, path: Path) -> Float[np.ndarray, "y x"]:
         raise InputError(
             str(path), "must be a picture (PNG, TIFF, JPEG)", f'"{error}"', "Save it again as PNG."
         ) from error
+    if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,), (4,)):
+        raise InputError(str(path), "must be one grey or RGB picture", f"shape {image.shape}", "Save it again as PNG.")
     image = image.astype(np.float64) / (np.iinfo(image.dtype).max if image.dtype.kind in "ui" else 1.0)
     linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
     gray = rgb2gray(linear[..., :3]) if linear.ndim == 3 else linear
@@ -119,6 +122,10 @@ def target_pattern_image(
                 repr(name),
                 'For example options = { pattern = "square", width = "1 mm" }.',
             )
+        unknown = sorted(options.keys() - _OPTIONS[name] - {"pattern"})
+        if unknown:
+            known = ", ".join(sorted(_OPTIONS[name]))
+            raise InputError(where, f'options of pattern "{name}" are: {known}', unknown[0], "Remove or rename it.")
         target = _PATTERNS[name](camera, options, where)
     total = float(target.sum())
     if not total > 0:

@@ -56,7 +56,7 @@ def flat(camera: Camera, radial: bool) -> Heights:
 def random(camera: Camera, radial: bool, wavelength_m: float, seed: int, feature_m: float) -> Heights:
     """A random diffuser: heights uniform over one wave, constant over squares (or rings) of side `feature_m`."""
     shape = _radii_m(camera, radial).shape
-    cells = max(1, round(feature_m / camera.grid.pitch_m))
+    cells = min(max(1, round(feature_m / camera.grid.pitch_m)), max(shape))
     coarse = tuple(-(-n // cells) for n in shape)
     heights = np.random.default_rng(seed).uniform(0, full_wave_height_m(camera.material, wavelength_m), coarse)
     for axis in range(heights.ndim):

@@ -167,6 +167,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         InputError: the path is a file, a folder with foreign content, or refused by the system.
     """
     path = Path(path)
+    if path.is_symlink():
+        path = path.resolve()  # the link stays, and what it points to is replaced
     temporary: Path | None = None
     try:
         _require_replaceable(path)

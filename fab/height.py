@@ -109,6 +109,8 @@ def _load_png(path: Path) -> NDArray[Any]:
     from PIL import Image
 
     with Image.open(path, formats=["PNG"]) as image:
+        image.verify()  # reading the pixels skips their checksum
+    with Image.open(path, formats=["PNG"]) as image:
         _require_size(path, image.size)
         if image.mode not in ("L", "I;16", "I;16B", "I"):
             raise ValueError(f"colours (mode {image.mode})")

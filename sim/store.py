@@ -349,7 +349,12 @@ def _silence() -> Iterator[Callable[[], str]]:
     It prints through Python's stdout, which must carry data only, and says more straight to the process's stderr.
     """
     printed = io.StringIO()
-    saved = os.dup(2)
+    try:
+        saved = os.dup(2)
+    except OSError:  # the caller closed it
+        with contextlib.redirect_stdout(printed):
+            yield lambda: printed.getvalue().removeprefix("Warning: ")
+        return
     with contextlib.redirect_stdout(printed), open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
         try:

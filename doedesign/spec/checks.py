@@ -40,8 +40,40 @@ def find_problems(spec: Spec) -> list[Problem]:
     Args:
         spec: a spec whose single values are valid.
     """
-    rules = (_materials, _colours, _aperture, _depth_order, _source_sampling, _fresnel_sampling, _objectives)
+    rules = (
+        _materials,
+        _colours,
+        _aperture,
+        _opening,
+        _sensor,
+        _depth_order,
+        _source_sampling,
+        _fresnel_sampling,
+        _objectives,
+    )
     return [problem for rule in rules for problem in rule(spec)]
+
+
+def _opening(spec: Spec) -> Iterator[Problem]:
+    overlap, aperture = spec.process.chrome_overlap_m, spec.doe.aperture_m
+    if aperture - 2 * overlap < 2 * spec.doe.pitch_m:
+        yield Problem(
+            "process.chrome_overlap",
+            f"twice the overlap must leave an opening in an aperture of {format_length(aperture)}",
+            format_length(overlap),
+            "Choose a smaller overlap.",
+        )
+
+
+def _sensor(spec: Spec) -> Iterator[Problem]:
+    focal, defocus = spec.optics.focal_length_m, spec.sensor.defocus_m
+    if defocus <= -focal / 2:
+        yield Problem(
+            "sensor.defocus",
+            f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens",
+            format_length(defocus),
+            "Choose a smaller defocus.",
+        )
 
 
 def _wavelengths(spec: Spec) -> list[float]:

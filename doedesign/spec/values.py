@@ -90,7 +90,8 @@ def _length(low_m: float, high_m: float, *, infinite: bool = False) -> Callable[
             metres = float(value)
         else:
             raise broken("must be a number of metres", "Give a number.")
-        if not (low_m <= metres <= high_m or (infinite and metres == math.inf)):
+        slack = 1e-12  # a bound itself, rounded on its way from text, is inside
+        if not (low_m * (1 - slack) <= metres <= high_m * (1 + slack) or (infinite and metres == math.inf)):
             bounds = f"must lie between {format_length(low_m)} and {format_length(high_m)}"
             raise broken(bounds + (', or be "inf"' if infinite else ""), "Check the unit.")
         return metres

@@ -98,6 +98,7 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
         (["objective.0.options.radius=3"], "must be options of far_spot"),
         (["objective.0.name=target_pattern", "objective.0.options.pattern=hexagon"], "must be one of spots"),
         (["objective.0.name=target_pattern", "objective.0.options.pattern=square"], "must be a length"),
+        (["objective.0.name=target_pattern", "objective.0.options={pattern='disc', bogus=1}"], "are: diameter"),
     ],
 )
 def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:

@@ -357,3 +357,22 @@ def test_a_level_step_that_misses_the_wave_is_explained():
 )
 def test_doubts_are_said(overrides: list[str], part: str):
     assert any(part in warning for warning in spec_warnings(load_spec(AUTOMOTIVE, overrides)))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("process.chrome_overlap=1 mm", ""),
+        ("process.chrome_overlap=2 mm", "process.chrome_overlap: must lie between"),
+        ("sensor.defocus=-5 mm", "sensor.defocus: the sensor must stay beyond half the focal length, 8 mm"),
+    ],
+)
+def test_impossible_openings_and_sensors(override: str, message: str):
+    if message:
+        assert message in refusal(AUTOMOTIVE, override)
+    else:
+        assert load_spec(AUTOMOTIVE, [override]).process.chrome_overlap_m == 1e-3
+
+
+def test_a_bound_itself_is_inside():
+    assert load_spec(AUTOMOTIVE, ["process.level_step=0.1 nm"]).process.level_step_m == pytest.approx(1e-10)
