@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 from scipy.fft import fft2
 
 from fab.grid import Grid
@@ -111,6 +111,27 @@ class EnergyBudget(NamedTuple):
     higher_orders: float
 
 
+def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
+    """Energy of square cells within the band of their grid, lit from a direction of `slope` waves per cell and cell.
+
+    The factor sinc(nu - slope x) of a cell is interpolated between three directions (exact to 1e-3 for directions up to
+    a sixth of the band, and a single one for a distant source), so nine transforms take the place of one sum per cell.
+    """
+    cells = field.shape[0]
+    x, nu = np.arange(cells) - (cells - 1) / 2, np.fft.fftfreq(cells)
+    reach = slope * cells / 2
+    nodes = reach * np.cos(np.pi * np.array([1, 3, 5]) / 6) if slope else np.zeros(1)
+    lit = slope * x
+    shares = [np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells) for a in nodes]
+    seen = [np.sinc(nu - a) for a in nodes]
+    total = np.zeros(field.shape, np.complex64)
+    for share_y, seen_y in zip(shares, seen, strict=True):
+        for share_x, seen_x in zip(shares, seen, strict=True):
+            part = field * (share_y[:, None] * share_x).astype(np.float32)
+            total += np.asarray(fft2(part, workers=-1)) * (seen_y[:, None] * seen_x).astype(np.float32)
+    return float(np.sum(np.square(np.abs(total)), dtype=np.float64))
+
+
 def energy_budget(
     camera: Camera,
     height_m: Float[np.ndarray, "y x"],
@@ -127,18 +148,17 @@ def energy_budget(
         depth_m: source depth.
         colour: colour of this PSF.
 
-    The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc²), not
+    The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), not
     from the PSF, so `uncollected` near zero or below it would show a fault in either.
     """
-    envelope = np.sinc(np.fft.fftfreq(camera.grid.shape[0])) ** 2
+    curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        spectrum = np.asarray(fft2(np.asarray(pupil_field(camera, height_m, depth_m, wavelength)), workers=-1))
-        power = np.square(np.abs(spectrum))
+        field = np.asarray(pupil_field(camera, height_m, depth_m, wavelength))
         share = weight * camera.transmission(wavelength)
         passed += share
-        band += share * float(envelope @ power @ envelope) / scale
+        band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength) / scale
     total = float(np.sum(psf, dtype=np.float64))
     spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
     return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)

@@ -38,15 +38,19 @@ class PsfBank(eqx.Module):
 
 
 def plan_propagation(
-    camera: Camera, wavelength_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+    camera: Camera,
+    wavelength_m: float,
+    depth_m: float,
+    propagation: Propagation = "far_field",
+    sampling: float | None = None,
 ) -> FarField | DirectPath:
-    """Operators of one wavelength for the propagation a spec names.
+    """Operators of one wavelength and depth for the propagation a spec names (a direct path serves every depth).
 
     Raises:
         InputError: the direct path is asked for where eq. 6 does not hold.
     """
     if propagation == "far_field":
-        return plan_far_field(camera, wavelength_m, sampling=sampling)
+        return plan_far_field(camera, wavelength_m, depth_m=depth_m, sampling=sampling)
     return plan_direct(camera, wavelength_m, propagation)
 
 
@@ -88,19 +92,15 @@ def psf_bank(
     height = jnp.asarray(height_m, jnp.float32)
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     lines = [
-        (
-            c,
-            weight * camera.transmission(wavelength),
-            wavelength,
-            plan_propagation(camera, wavelength, propagation, sampling),
-        )
+        (c, weight * camera.transmission(wavelength), wavelength)
         for c, colour in enumerate(camera.colours)
         for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
     ]
     energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
     for d, depth in enumerate(depths_m):
         path = source_path_m(camera, depth, field_rad)
-        for c, factor, wavelength, plan in lines:
+        for c, factor, wavelength in lines:
+            plan = plan_propagation(camera, wavelength, depth, propagation, sampling)
             rate = jnp.float32(camera.waves_per_metre(wavelength, field_rad))
             rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
             energy[c, d] += factor * np.asarray(_energy(plan, phase_pupil, rows, rate))

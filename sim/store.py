@@ -206,19 +206,11 @@ def _bank_description(
         y, x = (float(angle) for angle in described["field_rad"])
         pixel = described["pixel_m"]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: {_BANK}",
-            "must list colours, depths_m, pixel_m and field_rad",
-            f'"{error!r}"',
-            "Write the file again.",
-        ) from error
+        rule = "must list colours, depths_m, pixel_m and field_rad"
+        raise InputError(f"{path}: {_BANK}", rule, f'"{error!r}"', "Write the file again.") from error
     if not colours or not all(depth > 0 for depth in depths) or not depths:
-        raise InputError(
-            f"{path}: {_BANK}",
-            "needs at least one colour and depths above 0",
-            f"{colours} and {depths}",
-            "Write the file again.",
-        )
+        rule = "needs at least one colour and depths above 0"
+        raise InputError(f"{path}: {_BANK}", rule, f"{colours} and {depths}", "Write the file again.")
     return colours, depths, _length(path, f"{_BANK}.pixel_m", pixel), (y, x)
 
 
@@ -239,12 +231,8 @@ def _measured_colours(path: str | Path, picture: _Picture) -> tuple[str, ...]:
 
 def _given_pixel(path: str | Path, pixel_m: float | None) -> float:
     if pixel_m is None:
-        raise InputError(
-            str(path),
-            "the pixel pitch of a PSF from another program must be given",
-            "none",
-            "Give the pixel pitch (after binning).",
-        )
+        rule = "the pixel pitch of a PSF from another program must be given"
+        raise InputError(str(path), rule, "none", "Give the pixel pitch (after binning).")
     return _length(path, "pixel pitch", pixel_m)
 
 

@@ -23,6 +23,7 @@ PLANS = {
         Camera(Grid((300, 300), 3e-6), 0.7e-3, "fused_silica", make_camera(8, 1, 1, 1, 8).colours, 1.3e-3, 1.85e-6, 41),
         {"sampling": 1.5},
     ),
+    "lit from 8 mm": (make_camera(128, 0.3e-3, 1.44e-3, 1.85e-6, 40), {"depth_m": 8e-3}),
     "small pixels, half filled": (make_camera(128, 0.4e-3, 1.44e-3, 1.85e-6, 40, fill=0.5), {"cell": False}),
 }
 
@@ -38,7 +39,7 @@ def dense(banded: Banded, inputs: int) -> np.ndarray:
     return np.asarray(banded(jnp.eye(inputs, dtype=jnp.float32)), np.float64)
 
 
-def inputs64(rows: PhaseRows, rate: np.floating) -> list[np.ndarray]:
+def inputs64(rows: PhaseRows, rate: np.ndarray | float) -> list[np.ndarray]:
     return [np.asarray(a, np.float64) for a in (rows.height_m, rows.source_waves, rows.coverage, rate)]
 
 
@@ -49,10 +50,14 @@ def field64(height: np.ndarray, source: np.ndarray, coverage: np.ndarray, rate: 
 def energy64(plan: FarField, field: np.ndarray) -> np.ndarray:
     """The plan's operators applied to a pupil, written as dense products in float64."""
     samples = np.arange(plan.kept) - plan.kept // 2
-    matrix = np.exp(-2j * np.pi * np.outer(samples, np.arange(plan.cells)) / plan.length)
+    cells = np.arange(plan.cells) - plan.cells // 2
+    matrix = np.exp(-2j * np.pi * np.outer(samples, cells) / plan.length)
     if plan.tilt is not None:
         field = np.asarray(plan.tilt[0])[:, None] * field * np.asarray(plan.tilt[1])
-    gather = dense(plan.gather, plan.kept)
+    if plan.refine:
+        parts = [dense(part, plan.kept).T for part in plan.refine]
+        matrix = (parts[0] + 1j * parts[1] if len(parts) > 1 else parts[0]) @ matrix
+    gather = dense(plan.gather, len(matrix))
     return gather.T @ np.abs(matrix @ field @ matrix.T) ** 2 @ gather
 
 

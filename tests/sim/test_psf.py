@@ -54,8 +54,10 @@ def test_the_field_behind_the_plate():
 
 
 def test_propagations_by_name():
-    assert isinstance(plan_propagation(ONE, 589e-9), FarField)
-    assert isinstance(plan_propagation(make_camera(300, 0.15e-3, 1e-3, 1e-6, 16), 589e-9, "fresnel"), DirectPath)
+    assert isinstance(plan_propagation(ONE, 589e-9, np.inf), FarField)
+    assert isinstance(
+        plan_propagation(make_camera(300, 0.15e-3, 1e-3, 1e-6, 16), 589e-9, np.inf, "fresnel"), DirectPath
+    )
 
 
 def test_a_map_of_another_shape_is_refused():
