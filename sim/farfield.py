@@ -207,8 +207,6 @@ def field_weights(
 
 def _apply(parts: Float[Array, "2 ..."], operators: tuple[Banded, ...]) -> Float[Array, "2 ..."]:
     """Product of a complex array, as real and imaginary part, with real or complex weights along the last axis."""
-    if not operators:
-        return parts
     product = operators[0](parts)
     if len(operators) > 1:
         turned = operators[1](parts)
@@ -232,17 +230,21 @@ def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
     )
 
 
-def _transform(field: Complex[Array, "row n"], length: int) -> Complex[Array, "row length"]:
-    """FFT of rows whose middle is the origin, so that the result varies slowly enough to be interpolated."""
-    middle = field.shape[-1] // 2
-    gap = jnp.zeros((field.shape[0], length - field.shape[-1]), field.dtype)
-    return jnp.fft.fft(jnp.concatenate([field[:, middle:], gap, field[:, :middle]], axis=-1))
+def _transform(plan: FarField, field: Complex[Array, "row n"]) -> Complex[Array, "row length"]:
+    """FFT of rows; where it is to be interpolated their middle is the origin, so that it varies slowly enough."""
+    middle = plan.cells // 2 if plan.refine else 0
+    if middle or plan.length > plan.cells:
+        gap = jnp.zeros((field.shape[0], plan.length - plan.cells), field.dtype)
+        field = jnp.concatenate([field[:, middle:], gap, field[:, :middle]], axis=-1)
+    return jnp.fft.fft(field)
 
 
-def _untransform(spectrum: Complex[Array, "row length"], cells: int) -> Complex[Array, "row n"]:
+def _untransform(plan: FarField, spectrum: Complex[Array, "row length"]) -> Complex[Array, "row n"]:
     """Transpose of `_transform`."""
-    middle, field = cells // 2, jnp.fft.fft(spectrum)
-    return jnp.concatenate([field[:, field.shape[-1] - middle :], field[:, : cells - middle]], axis=-1)
+    middle, field = plan.cells // 2 if plan.refine else 0, jnp.fft.fft(spectrum)
+    if not middle:
+        return field[:, : plan.cells]
+    return jnp.concatenate([field[:, plan.length - middle :], field[:, : plan.cells - middle]], axis=-1)
 
 
 def _central(spectrum: Complex[Array, "row length"], kept: int) -> Complex[Array, "row kept"]:
@@ -265,14 +267,17 @@ def _uncentral(samples: Complex[Array, "row kept"], length: int) -> Complex[Arra
 
 
 def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> tuple[Array, Array]:
-    """Pixel energies, and the sensor field `[real or imaginary, y, x]` at the samples of the intensity."""
+    """Pixel energies, and the sensor field at the samples of the intensity for the way back.
+
+    The field is `[real or imaginary, y, x]`, or `[block, x, y]` and complex where nothing is interpolated.
+    """
     pupil_block, sensor_block = plan.blocks
 
     def along_x(block_rows: PyTree) -> Array:
         field = pupil(block_rows, shared)
         if plan.tilt is not None:
             field = field * plan.tilt[1]
-        return _central(_transform(field, plan.length), plan.kept)
+        return _central(_transform(plan, field), plan.kept)
 
     half_done = jax.lax.map(along_x, in_blocks(rows, pupil_block))
     half_done = half_done.reshape(-1, plan.kept)[: plan.cells]
@@ -281,10 +286,23 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
         columns = jax.lax.dynamic_slice(half_done, (0, block * sensor_block), (plan.cells, sensor_block)).T
         if plan.tilt is not None:
             columns = columns * plan.tilt[0]
-        field = _central(_transform(columns, plan.length), plan.kept)
+        return _central(_transform(plan, columns), plan.kept)
+
+    blocks = jnp.arange(plan.kept // sensor_block)
+    if not plan.refine:
+        # The samples are those of the intensity: a block is integrated while it is in the cache.
+        def integrated(block: Array) -> tuple[Array, Array]:
+            field = along_y(block)
+            return plan.gather(field.real**2 + field.imag**2), field
+
+        columns, fields = jax.lax.map(integrated, blocks)
+        return plan.gather(columns.reshape(plan.kept, -1).T), fields
+
+    def refined(block: Array) -> Array:
+        field = along_y(block)
         return _apply(jnp.stack([field.real, field.imag]), plan.refine)
 
-    parts = jax.lax.map(along_y, jnp.arange(plan.kept // sensor_block))  # [block, part, x, y]
+    parts = jax.lax.map(refined, blocks)  # [block, part, x, y]
     parts = jnp.transpose(parts, (1, 3, 0, 2)).reshape(2, parts.shape[3], plan.kept)
     parts = _apply(parts, plan.refine)
     columns = plan.gather(parts[0] ** 2 + parts[1] ** 2)
@@ -317,23 +335,37 @@ def _adjoint(
     """
     (rows, shared), (constant_rows, constant_shared) = eqx.partition(operands, perturbed)
     pupil_block, sensor_block = plan.blocks
-    weights = plan.spread(plan.spread(cotangent).T).T
-    back = jnp.stack([2.0 * weights * parts[0], -2.0 * weights * parts[1]])
-    back = _apply(back, plan.coarsen)
-    back = jnp.transpose(back.reshape(2, back.shape[1], -1, sensor_block), (2, 0, 3, 1))
 
-    def along_y(block: Array) -> Array:
-        real, imaginary = _apply(block, plan.coarsen)
-        columns = _untransform(_uncentral(jax.lax.complex(real, imaginary), plan.length), plan.cells)
+    def along_y(samples: Array) -> Array:
+        columns = _untransform(plan, _uncentral(samples, plan.length))
         return columns if plan.tilt is None else columns * plan.tilt[0]
 
-    half_done = jax.lax.map(along_y, back).reshape(plan.kept, plan.cells)
+    if not plan.refine:
+        half_spread = plan.spread(cotangent).T.reshape(-1, sensor_block, cotangent.shape[0])
+
+        def spread_block(block: tuple[Array, Array]) -> Array:
+            weights, field = block
+            return along_y(2.0 * plan.spread(weights) * jnp.conj(field))
+
+        half_done = jax.lax.map(spread_block, (half_spread, parts))
+    else:
+        weights = plan.spread(plan.spread(cotangent).T).T
+        back = jnp.stack([2.0 * weights * parts[0], -2.0 * weights * parts[1]])
+        back = _apply(back, plan.coarsen)
+        back = jnp.transpose(back.reshape(2, back.shape[1], -1, sensor_block), (2, 0, 3, 1))
+
+        def coarse_block(block: Array) -> Array:
+            real, imaginary = _apply(block, plan.coarsen)
+            return along_y(jax.lax.complex(real, imaginary))
+
+        half_done = jax.lax.map(coarse_block, back)
+    half_done = half_done.reshape(plan.kept, plan.cells)
     half_done = jnp.pad(half_done, ((0, 0), (0, -plan.cells % pupil_block)))
 
     def along_x(carry: PyTree, block: tuple[Array, PyTree, PyTree]) -> tuple[PyTree, PyTree]:
         index, block_rows, block_constants = block
         columns = jax.lax.dynamic_slice(half_done, (0, index * pupil_block), (plan.kept, pupil_block)).T
-        cotangents = _untransform(_uncentral(columns, plan.length), plan.cells)
+        cotangents = _untransform(plan, _uncentral(columns, plan.length))
         if plan.tilt is not None:
             cotangents = cotangents * plan.tilt[1]
 

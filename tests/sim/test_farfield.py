@@ -39,7 +39,7 @@ def dense(banded: Banded, inputs: int) -> np.ndarray:
     return np.asarray(banded(jnp.eye(inputs, dtype=jnp.float32)), np.float64)
 
 
-def inputs64(rows: PhaseRows, rate: np.ndarray | float) -> list[np.ndarray]:
+def inputs64(rows: PhaseRows, rate: np.ndarray | np.floating | float) -> list[np.ndarray]:
     return [np.asarray(a, np.float64) for a in (rows.height_m, rows.source_waves, rows.coverage, rate)]
 
 
