@@ -217,7 +217,8 @@ class OptimizeSpec(Table, frozen=True):
         quantisation: levels in the loop: "straight_through", "annealed" or "none".
         sampling: "sparse" takes one FFT of the bare grid per PSF and moves the image by a random fraction of a
             pixel at every step, so that what one step misses averages out; "exact" integrates every pixel to 0.2 %
-            at four times the work, with the image on the axis (for patterns that must fall on certain pixels).
+            at several times the work, with the image on the axis (for patterns that must fall on certain pixels).
+            Both keep the cells' sinc about the axis for near sources, which the reported PSFs do not.
         checkpoint_every: steps between checkpoints.
     """
 
