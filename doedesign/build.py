@@ -1,9 +1,17 @@
 """From a spec to the values the physics works on. The only file that knows both."""
 
-from doedesign.spec import Spec
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from doedesign.spec import DefectsSpec, ProcessSpec, Spec, process_from_json
 from fab.grid import Grid
 from fab.levels import Levels
+from fab.process import ERRORS, Defects, Process, Spread, error_names
 from sim.camera import Camera, Colour
+
+# Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
+_SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m")
+_EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")
 
 
 def camera_of(spec: Spec) -> Camera:
@@ -25,3 +33,68 @@ def camera_of(spec: Spec) -> Camera:
 def levels_of(spec: Spec) -> Levels:
     """The staircase of heights the process can make."""
     return Levels(spec.process.levels, spec.process.level_step_m)
+
+
+def process_of(spec: ProcessSpec) -> Process:
+    """What the fab lab does, with what the spec leaves out taken from its stock process.
+
+    Args:
+        spec: the process of a spec, or of a file of its own.
+
+    Returns:
+        The process; errors whose mean and standard deviation are zero are left out of its spreads.
+    """
+    full = spec.filled()
+    spreads = dict(_spreads(full))
+    defects = full.defects.in_si()
+    return Process(
+        levels=Levels(spec.levels, spec.level_step_m),
+        order=tuple(etch.mask for etch in full.etches),
+        spreads=spreads,
+        defects=Defects(**defects),
+        name=spec.stock or ("custom" if spreads or any(defects[key] for key in _EVENTS) else "ideal"),
+        **{key: getattr(full, key) for key in _SHARED},
+    )
+
+
+def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Spread]]:
+    for error, given in spec.errors.given().items():
+        names = error_names(spec.masks, error)
+        for name, spread in zip(names, given.spreads(len(names)), strict=True):
+            if spread != Spread():
+                yield name, spread
+
+
+def process_spec_of(process: Process, like: ProcessSpec) -> ProcessSpec:
+    """The spec of a process, every number said and none left to a stock process.
+
+    Args:
+        process: the process, for example one fitted to measurements.
+        like: the spec it came from, for what a process does not know (the chrome's overlap).
+
+    Raises:
+        InputError: a number that no spec may hold.
+    """
+    errors = {}
+    for error in ERRORS:
+        spreads = [process.spreads.get(name, Spread()) for name in error_names(process.masks, error)]
+        if any(spread != Spread() for spread in spreads):
+            errors[error] = {
+                "mean": _one_or_each([float(spread.mean) for spread in spreads]),
+                "sigma": _one_or_each([float(spread.sigma) for spread in spreads]),
+            }
+    in_order = process.order == tuple(range(process.masks))
+    data: dict[str, Any] = {
+        "levels": process.levels.count,
+        "level_step_m": process.levels.step_m,
+        "chrome_overlap_m": like.chrome_overlap_m,
+        "etches": [] if in_order else [{"mask": k, "depth_m": process.depths_m()[k]} for k in process.order],
+        "errors": errors,
+        "defects": DefectsSpec.from_si(vars(process.defects)),
+        **{key: getattr(process, key) for key in _SHARED},
+    }
+    return process_from_json(data, f"process {process.name}")
+
+
+def _one_or_each(values: Sequence[float]) -> float | tuple[float, ...]:
+    return values[0] if len(set(values)) == 1 else tuple(values)

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -103,7 +103,7 @@ def masks(
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
     """
-    from doedesign.commands.heights import level_map_from
+    from doedesign.drawing import level_map_from
     from doedesign.commands.masks import write_masks
 
     drawing = level_map_from(
@@ -164,6 +164,57 @@ def psf(
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), _say)
     _print_paths([folder, *sorted(folder.iterdir())], json_)
+
+
+@app.command
+def tolerance(
+    run: Path,
+    *,
+    draws: int = 100,
+    seed: int = 0,
+    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
+    sobol: int = 64,
+    corners: Annotated[bool, Parameter(negative="")] = False,
+    budget: str | None = None,
+    yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
+    limit: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    process: Path | None = None,
+    masks: Path | None = None,
+    draw: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    out: Path | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Study what the errors of a process make of a run: yield, which errors matter, and how large they may be.
+
+    Args:
+        run: Run folder.
+        draws: Plates of the Monte-Carlo study, and per point of the budget.
+        seed: Seed of every draw.
+        sensitivity: Which errors matter, each alone or as shares of variance.
+        sobol: Rows of the samples behind Sobol indices, a power of two; each costs sources + 2 plates.
+        corners: Look at worst-case corners, too.
+        budget: Errors for which the largest sigma is sought, such as overlay, overlay_x or overlay_x[3].
+        yield_: Yield that the budget is for.
+        limit: What a good plate obeys, such as "zeroth_order <= 5 %"; the spec's limits by default.
+        process: TOML file with a [process] table; the run's own by default.
+        masks: Its mask order; masks/NAME by default.
+        draw: Repeat a single plate, such as normal/17, and print its errors as TOML and its numbers.
+        workers: Worker processes; as many as there are cores and memory for by default.
+        scheduler: Address of a Dask scheduler whose workers are taken instead.
+        out: Folder; RUN/tolerance by default. The same command resumes a stopped study.
+    """
+    from doedesign.commands.tolerance import Plan, one_draw
+    from doedesign.commands.tolerance import tolerance as work
+
+    settings = {"process": process, "limits": limit or None, "seed": seed, "masks": masks, "scheduler": scheduler}
+    if draw is not None:
+        _print(one_draw(run, draw, json_, **settings).rstrip())
+        return
+    plan = Plan(draws, sensitivity, sobol, corners, budget, yield_)
+    folder = work(run, plan, out, _say, workers=workers, **settings)
+    _print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
 
 
 def exit_code(work: Callable[[], Any]) -> int:

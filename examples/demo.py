@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.commands.heights import level_map_from
+from doedesign.drawing import level_map_from
 from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf

@@ -18,7 +18,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["MAX_VERTICES", "Painted", "annulus_sectors", "doubled_area", "paint", "rectangles", "smallest_runs"]
+__all__ = [
+    "MAX_VERTICES",
+    "Painted",
+    "annulus_sectors",
+    "doubled_area",
+    "paint",
+    "rectangles",
+    "run_lengths",
+    "smallest_runs",
+]
 
 # The classic limit of 200 points per GDSII boundary counts the closing point.
 MAX_VERTICES = 199
@@ -199,6 +208,32 @@ def smallest_runs(bitmap: NDArray[np.uint8]) -> tuple[int | None, int | None]:
     lines = (np.ascontiguousarray(bitmap), np.ascontiguousarray(bitmap.T))
     width, space = (min(pair) for pair in zip(*(_smallest_runs(line, none) for line in lines), strict=True))
     return (width if width < none else None), (space if space < none else None)
+
+
+@njit(cache=True, nogil=True)
+def _run_lengths(bitmap, out):  # pragma: no cover - compiled
+    for y in range(bitmap.shape[0]):
+        start = 0
+        for x in range(1, bitmap.shape[1] + 1):
+            if x < bitmap.shape[1] and (bitmap[y, x] != 0) == (bitmap[y, x - 1] != 0):
+                continue
+            if bitmap[y, x - 1] != 0:
+                out[y, start:x] = min(x - start, 255)
+            start = x
+
+
+def run_lengths(bitmap: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return for every set pixel the length of the run of set pixels along x that it belongs to.
+
+    Args:
+        bitmap: ``[y, x]``, zero or not.
+
+    Returns:
+        ``[y, x]`` lengths in pixels, at most 255; 0 where the bitmap is clear.
+    """
+    out = np.zeros(bitmap.shape, dtype=np.uint8)
+    _run_lengths(np.ascontiguousarray(bitmap), out)
+    return out
 
 
 def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[np.int32]]:

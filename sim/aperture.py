@@ -5,25 +5,29 @@ of its area; what an edge cell scatters at angles beyond the
 cell grid (a few parts in ten thousand of the light) counts among the higher orders of the energy budget.
 """
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fab.grid import Grid
 
 
-def circle_coverage(grid: Grid, diameter_m: float) -> Float[np.ndarray, "y x"]:
-    """Share of each cell's area inside a centred circle, float32 in 0-1.
+def circle_coverage(
+    grid: Grid, diameter_m: float, centre_m: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "y x"]:
+    """Share of each cell's area inside a circle, float32 in 0-1.
 
     Args:
         grid: cells of the DOE.
-        diameter_m: diameter of the clear aperture, metres.
+        diameter_m: diameter of the circle, metres.
+        centre_m: its centre (y, x), metres; the clear aperture's is the grid's.
 
     Each edge cell is cut into 64 strips along y whose open length along x is exact, so the total area is
     right to about 1e-7 of the circle for apertures of a thousand cells or more.
     """
     radius = diameter_m / 2 / grid.pitch_m
-    y = np.abs(grid.axis_m("y")) / grid.pitch_m
-    x = np.abs(grid.axis_m("x")) / grid.pitch_m
+    y = np.abs(grid.axis_m("y") - centre_m[0]) / grid.pitch_m
+    x = np.abs(grid.axis_m("x") - centre_m[1]) / grid.pitch_m
     far = np.hypot(y[:, None] + 0.5, x[None, :] + 0.5)
     near = np.hypot(np.maximum(y[:, None] - 0.5, 0), np.maximum(x[None, :] - 0.5, 0))
     coverage = (far <= radius).astype(np.float32)
@@ -40,3 +44,25 @@ def circle_coverage(grid: Grid, diameter_m: float) -> Float[np.ndarray, "y x"]:
 def clear_area_m2(diameter_m: float) -> float:
     """Area of the clear aperture in square metres."""
     return np.pi * diameter_m**2 / 4
+
+
+def displaced_circle_coverage(
+    grid: Grid, diameter_m: Array | float, centre_m: tuple[Array | float, Array | float]
+) -> Float[Array, "y x"]:
+    """Share of each cell's area inside a large circle, differentiable in its diameter and centre (y, x).
+
+    Within a cell the circle is taken as straight: the area of a unit square on one side of a line is a closed form,
+    and what the bow leaves out is pitch / (12 diameter) of an edge cell, 1e-7 of a circle of a thousand cells.
+    """
+    radius = diameter_m / 2 / grid.pitch_m
+    y = (jnp.asarray(grid.axis_m("y"), jnp.float32) - centre_m[0])[:, None] / grid.pitch_m
+    x = (jnp.asarray(grid.axis_m("x"), jnp.float32) - centre_m[1])[None, :] / grid.pitch_m
+    distance = jnp.sqrt(jnp.maximum(y * y + x * x, 1e-6))
+    steep = jnp.maximum(jnp.abs(y), jnp.abs(x)) / distance
+    flat = jnp.maximum(jnp.minimum(jnp.abs(y), jnp.abs(x)) / distance, 1e-4)
+    inward = radius - distance
+    far, near = (steep + flat) / 2, (steep - flat) / 2
+    # A line through opposite sides cuts a trapezoid; nearer to a corner, a triangle.
+    triangle = jnp.square(jnp.maximum(far - jnp.abs(inward), 0.0)) / (2 * steep * flat)
+    beyond = jnp.where(inward > 0, 1.0 - triangle, triangle)
+    return jnp.where(jnp.abs(inward) <= near, 0.5 + inward / steep, beyond)

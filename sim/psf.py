@@ -1,6 +1,7 @@
 """PSF banks: the image of a point source for every colour and depth of one DOE height map."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -14,7 +15,8 @@ from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.farfield import FarField, plan_far_field
 from sim.fresnel import DirectPath, plan_direct
 from sim.hankel import plan_hankel, ring_source_waves
-from sim.pupil import PhaseRows, PupilRows, phase_pupil
+from sim.pupil import PhaseRows, PupilRows, SurfaceRows, phase_pupil, surface_pupil
+from sim.surface import Surface
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
 
@@ -105,6 +107,41 @@ def psf_bank(
             rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
             energy[c, d] += factor * np.asarray(_energy(plan, phase_pupil, rows, rate))
             on_psf()
+    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
+
+
+def surface_bank(
+    camera: Camera,
+    surface: Surface,
+    depths_m: Sequence[float],
+    *,
+    field_rad: tuple[float, float] = (0.0, 0.0),
+    on_psf: Callable[[], None] = lambda: None,
+) -> PsfBank:
+    """PSFs of a plate as fabricated, for every colour of the camera and every depth, in the far field.
+
+    Args:
+        camera: lens, sensor and substrate.
+        surface: the plate, with every wavelength of the camera.
+        depths_m: source depths, metres (`inf` allowed).
+        field_rad: field angles (y, x); the plate's transmission is taken as that on the axis.
+        on_psf: called after every single PSF, for progress.
+
+    Returns:
+        the bank, per unit power incident on the *nominal* clear aperture, Fresnel loss of the substrate included.
+    """
+    own = replace(camera, grid=surface.grid)
+    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
+    for d, depth in enumerate(depths_m):
+        path = source_path_m(own, depth, field_rad)
+        for c, colour in enumerate(camera.colours):
+            for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+                plan = plan_propagation(own, wavelength, depth)
+                source = jnp.asarray(wrapped_waves(path, wavelength))
+                rows = SurfaceRows(surface.at(wavelength), source, surface.coverage)
+                factor = weight * camera.transmission(wavelength)
+                energy[c, d] += factor * np.asarray(_energy(plan, surface_pupil, rows, None))
+                on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
 
 

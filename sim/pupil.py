@@ -54,6 +54,25 @@ def phase_pupil(rows: PhaseRows, waves_per_metre: Float[Array, ""]) -> Complex[A
     return rows.coverage * cis(rows.height_m * waves_per_metre + rows.source_waves)
 
 
+class SurfaceRows(eqx.Module):
+    """Row-wise description of a plate whose transmission is known (`sim.surface`).
+
+    Attributes:
+        transmission: `[y, x]` complex transmission of every cell.
+        source_waves: `[y, x]` wrapped optical path of the source, waves.
+        coverage: `[y, x]` open share of each cell.
+    """
+
+    transmission: Complex[Array, "y x"]
+    source_waves: Float[Array, "y x"]
+    coverage: Float[Array, "y x"]
+
+
+def surface_pupil(rows: SurfaceRows, shared: None) -> Complex[Array, "y x"]:
+    """Field coverage * transmission * exp(2 pi i source) behind a plate."""
+    return rows.coverage * rows.transmission * cis(rows.source_waves)
+
+
 # One block of rows (64-256 of a few thousand samples) fits a processor's second-level cache.
 _BLOCK = 128
 # The FFT library transforms a batch in groups of 16 rows and the rest one by one, with other rounding, and it

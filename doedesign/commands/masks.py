@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from doedesign.commands.heights import LevelMap
+from doedesign.drawing import LevelMap
 from doedesign.runs import open_run
 from fab.files import sha256_file
 from fab.layout import Chrome

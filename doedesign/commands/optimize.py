@@ -67,7 +67,7 @@ def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), s
 def _resume(
     run: Run, problem: Problem, scene: Scene, files: dict[str, Path], say: Say
 ) -> tuple[State, list[dict[str, Any]]]:
-    from doedesign.commands.heights import read_any_height
+    from doedesign.drawing import read_any_height
 
     optimiser = optimiser_of(run.spec)
     size = len(problem.camera.grid.axis_m("x"))

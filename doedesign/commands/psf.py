@@ -3,14 +3,13 @@
 import shutil
 from collections.abc import Callable, Sequence
 from itertools import count
-from math import isclose
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from doedesign.build import camera_of
-from doedesign.commands.heights import LevelMap, levels_of_run, read_any_height
+from doedesign.drawing import drawn_in_masks, levels_of_run, read_any_height
 from doedesign.evaluate import design_metrics
 from doedesign.progress import meter
 from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
@@ -18,13 +17,8 @@ from doedesign.runs import Run, alone_in, open_run
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
-from fab.grid import Grid
-from fab.layout import pixel_edges
-from fab.levels import Levels, height_of
-from fab.manifest import read_manifest
+from fab.levels import height_of
 from fab.masks import unetched_outside
-from fab.units import format_length
-from fab.verify import read_level_map
 from sim.camera import Camera
 from sim.hankel import radial_profile, ring_count
 from sim.psf import PsfBank, psf_bank, radial_psf_bank
@@ -32,36 +26,6 @@ from sim.store import write_bank
 from sim.transfer import transfer_bank
 
 Say = Callable[[str], None]
-
-
-def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
-    """Level map that the combined GDS file of a mask order draws, `[y, x]`.
-
-    Args:
-        folder: the mask order.
-        drawing: what it should draw.
-
-    Raises:
-        InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
-    """
-    manifest = read_manifest(folder)
-    levels, grid = manifest.staircase(), manifest.grid()
-    alike = grid.shape == drawing.grid.shape and levels.count == drawing.levels.count
-    # The manifest rounds lengths to its units' last digit.
-    lengths = (grid.pitch_m, drawing.grid.pitch_m), (levels.step_m, drawing.levels.step_m)
-    if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
-        raise InputError(
-            str(folder),
-            f"the masks must be those of this run, {_told(drawing.grid, drawing.levels)}",
-            _told(grid, levels),
-            "Give the masks of this run (--masks).",
-        )
-    return read_level_map(folder / manifest.combined_gds, levels, pixel_edges(grid))
-
-
-def _told(grid: Grid, levels: Levels) -> str:
-    pixels = f"{grid.shape[0]} x {grid.shape[1]} pixels of {format_length(grid.pitch_m)}"
-    return f"{pixels} in {levels.count} levels of {format_length(levels.step_m)}"
 
 
 def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[str, np.ndarray]:

@@ -8,8 +8,11 @@ Every mistake in a file is an `InputError` that names the file, the key, the rul
 are told together. `spec_warnings` returns what is allowed but probably not meant.
 
     values      the kinds of value a spec holds: lengths, names, options
+    table       what all tables have in common
     models      the tables, one per section of the TOML
-    checks      rules that join several tables, and warnings
+    process     the tables of the process: errors, defects, limits of a good plate
+    variation   files of their own: a process, the errors of one plate
+    checks      rules that join several tables, and warnings; process_checks those of the process
     errors      what was wrong, in words a user can act on
     text        a spec as TOML and as JSON
 """
@@ -18,34 +21,42 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from doedesign.spec.checks import Problem, find_problems, spec_warnings
-from doedesign.spec.errors import SpecError, explain, key_as_written, spec_error
+from doedesign.spec.checks import find_problems, spec_warnings
+from doedesign.spec.errors import Problem, SpecError, explain, key_as_written, spec_error
 from doedesign.spec.models import (
     ColourSpec,
     DoeSpec,
     ObjectiveSpec,
     OpticsSpec,
     OptimizeSpec,
-    ProcessSpec,
     SceneSpec,
     SensorSpec,
     Spec,
 )
-from doedesign.spec.text import spec_digest, spec_to_json, spec_to_toml
+from doedesign.spec.process import DefectsSpec, ErrorsSpec, EtchSpec, LimitSpec, ProcessSpec, SpreadSpec
+from doedesign.spec.process_checks import process_problems, variation_problems
+from doedesign.spec.table import Table, toml_key
+from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
 from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
+from doedesign.spec.variation import ProcessFile, VariationFile
 from fab.errors import InputError
 from fab.files import explain_os_error
+from fab.process import Variation
 
 __all__ = [
     "HEIGHT_FILES",
     "OBJECTIVE_NAMES",
     "START_NAMES",
     "ColourSpec",
+    "DefectsSpec",
     "DoeSpec",
+    "ErrorsSpec",
+    "EtchSpec",
+    "LimitSpec",
     "ObjectiveSpec",
     "OpticsSpec",
     "OptimizeSpec",
@@ -55,14 +66,24 @@ __all__ = [
     "SensorSpec",
     "Spec",
     "SpecError",
+    "SpreadSpec",
+    "explain",
     "input_files",
+    "load_process",
     "load_spec",
+    "load_variation",
+    "process_from_json",
+    "process_to_toml",
     "spec_digest",
+    "spec_error",
     "spec_from_json",
     "spec_to_json",
     "spec_to_toml",
     "spec_warnings",
+    "variation_to_toml",
 ]
+
+_Model = TypeVar("_Model", bound=Table)
 
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
 
@@ -81,7 +102,7 @@ def load_spec(path: str | Path, overrides: Sequence[str] = ()) -> Spec:
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
-    raw = _read_toml(Path(path))
+    raw = _read_toml(Path(path), "a spec")
     keys = [_override(raw, text) for text in overrides]
     try:
         spec = Spec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
@@ -105,6 +126,62 @@ def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
     except ValidationError as error:
         raise spec_error(source, explain(error, data)) from None
     return _checked(spec, data, source, [])
+
+
+def load_process(path: str | Path) -> ProcessSpec:
+    """Read a process from the `[process]` table of a TOML file: a file of its own, or a whole spec.
+
+    Args:
+        path: the file. Other tables of a spec are passed over.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, has no process, or breaks a rule.
+    """
+    raw = _read_toml(Path(path), "a process")
+    others = {toml_key(name) for name in Spec.model_fields} - {"process"}
+    process = _model_of_toml(ProcessFile, {key: raw[key] for key in raw if key not in others}, str(path)).process
+    if problems := [p._replace(key=key_as_written(p.key, raw)) for p in process_problems(process)]:
+        raise spec_error(str(path), problems)
+    return process
+
+
+def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
+    """Make a process from plain values in SI units, as `ProcessSpec.model_dump` returns them.
+
+    Args:
+        data: the values by attribute.
+        source: where they came from, for the message.
+
+    Raises:
+        InputError: the values are not those of a process, or break a rule.
+    """
+    raw = {"process": data}
+    try:
+        process = ProcessFile.model_validate(raw).process
+    except ValidationError as error:
+        raise spec_error(source, explain(error, raw, ProcessFile)) from None
+    if problems := list(process_problems(process)):
+        raise spec_error(source, problems)
+    return process
+
+
+def load_variation(path: str | Path) -> Variation:
+    """Read the errors of one plate from TOML, as `variation_to_toml` writes them.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, or breaks a rule.
+    """
+    file = _model_of_toml(VariationFile, _read_toml(Path(path), "a variation"), str(path))
+    if problems := list(variation_problems(file)):
+        raise spec_error(str(path), problems)
+    return file.value()
+
+
+def _model_of_toml(model: type[_Model], raw: Mapping[str, Any], source: str) -> _Model:
+    try:
+        return model.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
+    except ValidationError as error:
+        raise spec_error(source, explain(error, raw, model)) from None
 
 
 def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
@@ -144,7 +221,8 @@ def _checked(spec: Spec, raw: Mapping[str, Any], source: str, overridden: Sequen
     return spec
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def _read_toml(path: Path, what: str) -> dict[str, Any]:
+    cure = f"Give {what} such as {_EXAMPLES[what]}."
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -152,14 +230,18 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
-        raise InputError(str(path), "a spec must be UTF-8 text", f"a foreign byte at {error.start}", _RESAVE) from error
+        raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(str(path), "a spec must be valid TOML", f'"{error}"', "Mend that line.") from error
+        raise InputError(str(path), f"{what} must be valid TOML", f'"{error}"', "Mend that line.") from error
     except RecursionError as error:
-        raise InputError(str(path), "a spec must be valid TOML", "brackets without end", _RESAVE) from error
+        raise InputError(str(path), f"{what} must be valid TOML", "brackets without end", cure) from error
 
 
-_RESAVE = "Give a spec such as examples/quick.toml."
+_EXAMPLES = {
+    "a spec": "examples/quick.toml",
+    "a process": "the [process] table of examples/automotive.toml",
+    "a variation": "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`",
+}
 
 
 def _override(raw: dict[str, Any], text: str) -> str:

@@ -5,33 +5,24 @@ A broken rule is a `Problem`; a doubt is a sentence. Neither changes the spec.
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
+from doedesign.spec.errors import Problem
 from doedesign.spec.models import Spec
+from doedesign.spec.process_checks import (
+    limit_problems,
+    limit_warnings,
+    printing_warning,
+    process_problems,
+    wafer_problem,
+)
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
 
-__all__ = ["Problem", "find_problems", "spec_warnings"]
+__all__ = ["find_problems", "spec_warnings"]
 
 _NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 _WAVE_TOLERANCE = 0.02
-
-
-class Problem(NamedTuple):
-    """One broken rule of a spec.
-
-    Attributes:
-        key: dotted TOML key, such as "doe.aperture".
-        rule: what must hold.
-        got: what came instead.
-        cure: what to do, a full sentence.
-    """
-
-    key: str
-    rule: str
-    got: str
-    cure: str
 
 
 def find_problems(spec: Spec) -> list[Problem]:
@@ -50,8 +41,15 @@ def find_problems(spec: Spec) -> list[Problem]:
         _source_sampling,
         _fresnel_sampling,
         _objectives,
+        _process,
+        wafer_problem,
+        limit_problems,
     )
     return [problem for rule in rules for problem in rule(spec)]
+
+
+def _process(spec: Spec) -> Iterator[Problem]:
+    return process_problems(spec.process)
 
 
 def _opening(spec: Spec) -> Iterator[Problem]:
@@ -196,7 +194,7 @@ def spec_warnings(spec: Spec) -> list[str]:
     Args:
         spec: a valid spec.
     """
-    rules = (_level_warning, _sensor_warning, _reach_warning, _disc_warning)
+    rules = (_level_warning, printing_warning, _sensor_warning, _reach_warning, _disc_warning, limit_warnings)
     return [warning for rule in rules for warning in rule(spec)]
 
 

@@ -4,22 +4,23 @@ Pydantic finds the mistakes; this file says them. Several mistakes are told at o
 """
 
 import re
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, get_args
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, get_args
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from doedesign.spec.checks import Problem
-from doedesign.spec.models import Spec, Table, toml_key
+from doedesign.spec.models import Spec
+from doedesign.spec.table import Table, toml_key
 from doedesign.spec.values import nearest
 from fab.errors import InputError
 
-__all__ = ["SpecError", "explain", "key_as_written", "spec_error"]
+__all__ = ["Problem", "SpecError", "explain", "key_as_written", "spec_error"]
 
 _SHORT_FORM = 'For example `wavelengths = ["656 nm", "589 nm", "486 nm"]`.'
 _COLOURS_KEY = re.compile(r"optics\.colours(\[\d+\])?.*")
+_SIGMA_KEY = re.compile(r"(process\.errors\.(\w+))\.sigma\b(.*)")
 _RULES = {
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
@@ -35,6 +36,22 @@ _RULES = {
     "too_short": "must not be empty",
     "too_long": "must have at most {max_length} entries",
 }
+
+
+class Problem(NamedTuple):
+    """One broken rule of a spec.
+
+    Attributes:
+        key: dotted TOML key, such as "doe.aperture".
+        rule: what must hold.
+        got: what came instead.
+        cure: what to do, a full sentence.
+    """
+
+    key: str
+    rule: str
+    got: str
+    cure: str
 
 
 class SpecError(InputError):
@@ -75,26 +92,27 @@ def _covered(key: str, overridden: Collection[str]) -> bool:
     return any(f"{dotted}.".startswith(f"{k}.") or k.startswith(f"{dotted}.") for k in overridden)
 
 
-def explain(error: ValidationError, raw: Mapping[str, Any]) -> list[Problem]:
+def explain(error: ValidationError, raw: Mapping[str, Any], root: type[Table] = Spec) -> list[Problem]:
     """Translate what pydantic found.
 
     Args:
-        error: the failed validation of `Spec`.
+        error: the failed validation.
         raw: the tables as they were read.
+        root: the model of the whole file.
     """
     found = error.errors(include_url=False)
     # A list whose entries are wrong is also called too short by pydantic; that says nothing new.
     inner = {details["loc"][:length] for details in found for length in range(len(details["loc"]))}
-    return [_problem(d, raw) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
+    return [_problem(d, raw, root) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
 
 
-def _problem(details: ErrorDetails, raw: Mapping[str, Any]) -> Problem:
+def _problem(details: ErrorDetails, raw: Mapping[str, Any], root: type[Table]) -> Problem:
     location, kind, context = details["loc"], details["type"], details.get("ctx", {})
     key = key_as_written(_dotted(location), raw)
     if kind == "extra_forbidden":
-        return _unknown(key, location)
+        return _unknown(key, location, root)
     if kind == "missing":
-        return _missing(key, location)
+        return _missing(key, location, root)
     got = _shown(details["input"])
     if kind == "spec":
         return Problem(key, context["rule"], got, context["cure"])
@@ -102,10 +120,10 @@ def _problem(details: ErrorDetails, raw: Mapping[str, Any]) -> Problem:
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ",").split(",")]
         return Problem(key, f"must be one of {', '.join(choices)}", got, nearest(details["input"], choices))
     rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
-    cure = _example(location) or "Change the value."
+    cure = _example(location, root) or "Change the value."
     if key == "optics.wavelengths":
         cure = _SHORT_FORM
-    elif kind == "tuple_type" and _table_at(location):
+    elif kind == "tuple_type" and _table_at(location, root):
         cure = f"Write [[{key}]] tables."
     return Problem(key, rule, got, cure)
 
@@ -118,16 +136,25 @@ def _dotted(location: Sequence[int | str]) -> str:
 
 
 def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
-    """Return a key as the file has it: a colour may have been made from the short form `optics.wavelengths`.
+    """Return a key as the file has it, which may use a short form.
+
+    A colour may have been made from `optics.wavelengths`, a sigma from `process.errors.overlay_x = "1 um"`.
 
     Args:
         key: dotted key of the full form, such as "optics.colours[1].wavelengths".
         raw: the tables as they were read.
     """
     optics = raw.get("optics")
-    if not isinstance(optics, Mapping) or "colours" in optics:
-        return key
-    return _COLOURS_KEY.sub(r"optics.wavelengths\1", key)
+    if isinstance(optics, Mapping) and "colours" not in optics:
+        key = _COLOURS_KEY.sub(r"optics.wavelengths\1", key)
+    return _SIGMA_KEY.sub(lambda found: found[1] + found[3] if _said_as_sigma_alone(found, raw) else found[0], key)
+
+
+def _said_as_sigma_alone(found: re.Match[str], raw: Mapping[str, Any]) -> bool:
+    value: Any = raw
+    for part in ("process", "errors", found[2]):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return not isinstance(value, Mapping)
 
 
 def _shown(value: object) -> str:
@@ -141,9 +168,9 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _table_at(location: Sequence[int | str]) -> type[Table] | None:
+def _table_at(location: Sequence[int | str], root: type[Table]) -> type[Table] | None:
     """Return the model of the table a location leads into, None where it leads to a value."""
-    table: type[Table] | None = Spec
+    table: type[Table] | None = root
     for part in location:
         if isinstance(part, int):
             continue
@@ -166,12 +193,21 @@ def _keys(table: type[Table]) -> list[str]:
     return [*keys, "wavelengths"] if "colours" in keys else keys
 
 
-def _unknown(key: str, location: Sequence[int | str]) -> Problem:
-    parent = _table_at(location[:-1])
+def _tables(root: type[Table], path: str = "") -> Iterator[tuple[str, type[Table]]]:
+    """Yield every table below one with its dotted key, outer ones first."""
+    inner = [(f"{path}.{toml_key(name)}".removeprefix("."), _model_of(f)) for name, f in root.model_fields.items()]
+    found = [(key, model) for key, model in inner if model and not model.inline]
+    yield from found
+    for key, model in found:
+        yield from _tables(model, key)
+
+
+def _unknown(key: str, location: Sequence[int | str], root: type[Table]) -> Problem:
+    parent = _table_at(location[:-1], root)
     name, keys = str(location[-1]), _keys(parent) if parent else []
     if key == "optics.wavelengths":
         return Problem(key, "the colours must be stated once", "`wavelengths` and `colours`", "Remove one of the two.")
-    homes = [toml_key(n) for n, f in Spec.model_fields.items() if (m := _model_of(f)) and name in _keys(m)]
+    homes = [home for home, model in _tables(root) if name in _keys(model)]
     cure = nearest(name, keys)
     if homes and not cure.startswith("Did"):
         cure = f"It belongs to [{homes[0]}]."
@@ -179,16 +215,16 @@ def _unknown(key: str, location: Sequence[int | str]) -> Problem:
     return Problem(key, f"must be a known key of {where}", f"`{name}`", cure)
 
 
-def _missing(key: str, location: Sequence[int | str]) -> Problem:
+def _missing(key: str, location: Sequence[int | str], root: type[Table]) -> Problem:
     if isinstance(location[-1], int):
-        return Problem(key, "must be given", "a shorter list", _example(location) or "Add the entry.")
-    cure = _SHORT_FORM if key == "optics.wavelengths" else _example(location) or f"Add a table [{key}]."
+        return Problem(key, "must be given", "a shorter list", _example(location, root) or "Add the entry.")
+    cure = _SHORT_FORM if key == "optics.wavelengths" else _example(location, root) or f"Add a table [{key}]."
     return Problem(key, "must be given", "nothing", cure)
 
 
-def _example(location: Sequence[int | str]) -> str:
+def _example(location: Sequence[int | str], root: type[Table]) -> str:
     """Return a sentence with an example of the value at a location, empty where there is none."""
     names = [part for part in location if isinstance(part, str)]
-    parent = _table_at(names[:-1]) if names else None
+    parent = _table_at(names[:-1], root) if names else None
     field = _field(parent, names[-1]) if parent else None
     return f"For example `{toml_key(names[-1])} = {field.examples[0]}`." if field and field.examples else ""

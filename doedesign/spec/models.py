@@ -2,24 +2,24 @@
 
 An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
 (`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
-Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
+Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both. The tables of the process are in
+`process`.
 """
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from doedesign.spec.process import LimitSpec, ProcessSpec
+from doedesign.spec.table import Table, unsaid
 from doedesign.spec.values import (
     FROM_TOML,
     Aperture,
-    ChromeOverlap,
     ColourName,
     Count,
     Defocus,
     FarDepth,
     FocalLength,
-    LevelCount,
-    LevelStep,
     Material,
     NearDepth,
     ObjectiveName,
@@ -40,29 +40,10 @@ __all__ = [
     "ObjectiveSpec",
     "OpticsSpec",
     "OptimizeSpec",
-    "ProcessSpec",
     "SceneSpec",
     "SensorSpec",
     "Spec",
-    "Table",
 ]
-
-
-def toml_key(attribute: str) -> str:
-    """Return the TOML key of an attribute: the name without its unit."""
-    return "objective" if attribute == "objectives" else attribute.removesuffix("_m")
-
-
-class Table(BaseModel, frozen=True):
-    """One table of a spec. Unknown keys are refused, values never change."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        allow_inf_nan=False,
-        alias_generator=toml_key,
-        validate_by_name=True,
-        validate_by_alias=False,
-    )
 
 
 class ColourSpec(Table, frozen=True):
@@ -144,21 +125,6 @@ class DoeSpec(Table, frozen=True):
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
     aperture_m: Aperture = Field(examples=['"4.44 mm"'])
     material: Material = Field(examples=['"fused_silica"'])
-
-
-class ProcessSpec(Table, frozen=True):
-    """What the fab lab makes.
-
-    Attributes:
-        levels: number of heights L, a power of two.
-        level_step_m: height of one level.
-        chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
-            little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
-    """
-
-    levels: LevelCount = Field(examples=["16"])
-    level_step_m: LevelStep = Field(examples=['"75 nm"'])
-    chrome_overlap_m: ChromeOverlap = 5e-6
 
 
 class SceneSpec(Table, frozen=True):
@@ -259,6 +225,7 @@ class Spec(Table, frozen=True):
         sensor: the sensor behind the lens.
         optimize: how the height map is found.
         objectives: what it is judged by; `[[objective]]` in TOML.
+        limits: when a plate is good; `[[limit]]` in TOML.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -269,3 +236,4 @@ class Spec(Table, frozen=True):
     sensor: SensorSpec
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
+    limits: tuple[LimitSpec, ...] = unsaid(())

@@ -1,18 +1,26 @@
-"""A spec as text: canonical JSON with SI numbers for machines, TOML with units for people."""
+"""Specs, processes and variations as text: canonical JSON with SI numbers for machines, TOML with units for people."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from doedesign.spec.models import Spec, Table, toml_key
+from doedesign.spec.models import Spec
+from doedesign.spec.process import ProcessSpec, SpreadSpec
+from doedesign.spec.table import Table, toml_key
+from doedesign.spec.values import angle_text
+from doedesign.spec.variation import ProcessFile, variation_file
 from fab.files import canonical_json, sha256_bytes
-from fab.units import format_length, parse_length
+from fab.process import Variation
+from fab.units import format_length, parse_angle, parse_length
 
-__all__ = ["spec_digest", "spec_to_json", "spec_to_toml"]
+__all__ = ["process_to_toml", "spec_digest", "spec_to_json", "spec_to_toml", "variation_to_toml"]
 
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
-    """Return a spec as plain dictionaries, lists, text and numbers in SI units, every default filled in."""
+    """Return a spec as plain dictionaries, lists, text and numbers in SI units.
+
+    Defaults are filled in, except of keys that may be left unsaid.
+    """
     return spec.model_dump(mode="json")
 
 
@@ -28,36 +36,62 @@ def spec_to_toml(spec: Spec, comments: Sequence[str] = ()) -> str:
         spec: the spec.
         comments: lines for the head of the file, for example the overrides that led to it.
     """
+    return _document(spec, comments)
+
+
+def process_to_toml(process: ProcessSpec, comments: Sequence[str] = ()) -> str:
+    """Write a process as a TOML file of its own, which `load_process` reads back to the same process."""
+    return _document(ProcessFile(process=process), comments)
+
+
+def variation_to_toml(variation: Variation, comments: Sequence[str] = ()) -> str:
+    """Write the errors of one plate as TOML, which `load_variation` reads back to the last bit; zeros are left out."""
+    return _document(variation_file(variation), comments)
+
+
+def _document(table: Table, comments: Sequence[str]) -> str:
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
-    lines += _table_lines(spec, "")
-    return "\n".join(lines).strip() + "\n"
+    return "\n".join(lines + _table_lines(table, "")).strip() + "\n"
 
 
 def _table_lines(table: Table, path: str) -> list[str]:
     values, tables = [], []
-    for name in type(table).model_fields:
-        value, key = getattr(table, name), toml_key(name)
+    for name, value in table.said().items():
+        key = toml_key(name)
         inner = f"{path}.{key}".removeprefix(".")
-        if isinstance(value, Table):
+        if isinstance(value, Table) and not value.inline:
             tables += ["", f"[{inner}]", *_table_lines(value, inner)]
-        elif isinstance(value, tuple) and value and isinstance(value[0], Table):
+        elif isinstance(value, tuple) and value and isinstance(value[0], Table) and not value[0].inline:
             for item in value:
                 tables += ["", f"[[{inner}]]", *_table_lines(item, inner)]
         elif name == "objectives":
             continue  # an array of tables that is empty is said by saying nothing
         else:
-            values.append(f"{key} = {_length_text(value) if name.endswith('_m') else _value_text(value)}")
+            values.append(f"{key} = {_text(name, value)}")
     return values + tables
 
 
-def _length_text(length_m: float | tuple[float, ...]) -> str:
-    if isinstance(length_m, tuple):
-        return f"[{', '.join(_length_text(item) for item in length_m)}]"
-    if length_m == float("inf"):
-        return '"inf"'
-    text = format_length(length_m)
-    # Twelve digits are for people; a length with more of them is written in full.
-    return f'"{text}"' if parse_length(text) == length_m else f'"{length_m!r} m"'
+def _text(name: str, value: Any) -> str:
+    """Write a value in the unit that an attribute's name ends in."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(_text(name, item) for item in value)}]"
+    if isinstance(value, SpreadSpec):
+        # Its parts have the unit of the error they belong to.
+        parts = [f"{key} = {_text(name, part)}" for key, part in value.said().items()]
+        return f"{{ {', '.join(parts)} }}" if "mean" in value.said() else _text(name, value.sigma)
+    if isinstance(value, Table):
+        return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.said().items())} }}"
+    if name.endswith("_m"):
+        return '"inf"' if value == float("inf") else _quantity_text(value, "m", format_length, parse_length)
+    if name.endswith("_rad"):
+        return _quantity_text(value, "rad", angle_text, parse_angle)
+    return _value_text(value)
+
+
+def _quantity_text(value: float, unit: str, text_of: Callable[[float], str], parse: Callable[[str], float]) -> str:
+    text = text_of(value)
+    # Twelve digits are for people; a number with more of them is written in full.
+    return f'"{text}"' if parse(text) == value else f'"{value!r} {unit}"'
 
 
 def _value_text(value: Any) -> str:

@@ -1,7 +1,7 @@
 """The kinds of value a spec holds, each with its range and the message for a value outside it.
 
-In TOML a length is text with a unit ("1.85 um"); in Python and JSON it is a number in metres. Which of the two
-is being read is told by the validation context: `FROM_TOML` for the former, nothing for the latter.
+In TOML a length is text with a unit ("1.85 um"); in Python and JSON it is a number in metres, and likewise for angles.
+Which of the two is being read is told by the validation context: `FROM_TOML` for the former, nothing for the latter.
 """
 
 import json
@@ -10,12 +10,12 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from fab.units import MM, NM, UM, format_length, parse_length
+from fab.units import MM, NM, UM, format_length, parse_angle, parse_length
 from sim.material import MATERIALS
 
 __all__ = [
@@ -42,8 +42,12 @@ __all__ = [
     "SpecName",
     "Start",
     "Wavelength",
+    "angle",
+    "angle_text",
     "broken",
+    "length",
     "nearest",
+    "share",
 ]
 
 FROM_TOML = "toml"
@@ -75,28 +79,80 @@ def nearest(name: object, choices: Sequence[str]) -> str:
     return f"Did you mean `{close[0]}`?" if close else f"Choose one of {', '.join(choices)}."
 
 
-def _length(low_m: float, high_m: float, *, infinite: bool = False) -> Callable[[Any, ValidationInfo], float]:
-    """Return the validator of a length between two bounds, in metres."""
+class _Unit(NamedTuple):
+    name: str
+    plural: str
+    parse: Callable[[str], float]
+    text: Callable[[float], str]
+
+    def read(self, text: Any) -> float:
+        value = self.parse(text)
+        number, _, name = text.strip().partition(" ")
+        # `parse` rounds to fifteen digits what a prefix has changed; without a prefix every digit counts.
+        return float(number) if name.strip() == self.name else value
+
+
+def angle_text(angle_rad: float) -> str:
+    """Write an angle in degrees, a small one in microradians, to twelve digits, which `parse_angle` reads back."""
+    return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
+
+
+_LENGTH = _Unit("m", "metres", parse_length, format_length)
+_ANGLE = _Unit("rad", "radians", parse_angle, angle_text)
+
+
+def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
+    if math.isinf(high):
+        return "must be finite" if math.isinf(low) else "must be finite and not negative"
+    return f"must lie between {text(low)} and {text(high)}"
+
+
+def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
+    """Return the validator of a length or an angle between two bounds, in SI units."""
 
     def validate(value: Any, info: ValidationInfo) -> float:
         if infinite and value == "inf":
             return math.inf
         if info.context == FROM_TOML:
             try:
-                metres = parse_length(value)
+                number = unit.read(value)
             except ValueError as error:
                 raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            metres = float(value)
+            number = float(value)
         else:
-            raise broken("must be a number of metres", "Give a number.")
+            raise broken(f"must be a number of {unit.plural}", "Give a number.")
         slack = 1e-12  # a bound itself, rounded on its way from text, is inside
-        if not (low_m * (1 - slack) <= metres <= high_m * (1 + slack) or (infinite and metres == math.inf)):
-            bounds = f"must lie between {format_length(low_m)} and {format_length(high_m)}"
-            raise broken(bounds + (', or be "inf"' if infinite else ""), "Check the unit.")
-        return metres
+        inside = low - slack * abs(low) <= number <= high + slack * abs(high)
+        if not (inside or (infinite and number == math.inf)):
+            rule = _range_rule(low, high, unit.text) + (', or be "inf"' if infinite else "")
+            raise broken(rule, "Check the unit.")
+        return number
 
-    return validate
+    return BeforeValidator(validate)
+
+
+def length(low_m: float, high_m: float, *, infinite: bool = False) -> BeforeValidator:
+    """Return the validator of a length between two bounds, metres; "inf" may be allowed."""
+    return _bounded(_LENGTH, low_m, high_m, infinite=infinite)
+
+
+def angle(low_rad: float, high_rad: float) -> BeforeValidator:
+    """Return the validator of an angle between two bounds, radians."""
+    return _bounded(_ANGLE, low_rad, high_rad)
+
+
+def share(low: float, high: float) -> BeforeValidator:
+    """Return the validator of a plain number between two bounds, such as a share of something."""
+
+    def validate(value: Any) -> float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise broken("must be a number", "Write 5 % as 0.05.")
+        if not low <= value <= high:
+            raise broken(_range_rule(low, high, "{:g}".format), "Write 5 % as 0.05.")
+        return float(value)
+
+    return BeforeValidator(validate)
 
 
 def _infinity_as_text(depth_m: float) -> float | str:
@@ -104,18 +160,18 @@ def _infinity_as_text(depth_m: float) -> float | str:
     return "inf" if math.isinf(depth_m) else depth_m
 
 
-Wavelength = Annotated[float, BeforeValidator(_length(200 * NM, 20 * UM))]
-Pitch = Annotated[float, BeforeValidator(_length(10 * NM, 1 * MM))]
-Aperture = Annotated[float, BeforeValidator(_length(1 * UM, 1.0))]
-FocalLength = Annotated[float, BeforeValidator(_length(10 * UM, 100.0))]
-LevelStep = Annotated[float, BeforeValidator(_length(0.1 * NM, 100 * UM))]
-ChromeOverlap = Annotated[float, BeforeValidator(_length(0.0, 1 * MM))]
-Defocus = Annotated[float, BeforeValidator(_length(-10 * MM, 10 * MM))]
-NearDepth = Annotated[float, BeforeValidator(_length(10 * UM, 1e6))]
+Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
+Pitch = Annotated[float, length(10 * NM, 1 * MM)]
+Aperture = Annotated[float, length(1 * UM, 1.0)]
+FocalLength = Annotated[float, length(10 * UM, 100.0)]
+LevelStep = Annotated[float, length(0.1 * NM, 100 * UM)]
+ChromeOverlap = Annotated[float, length(0.0, 1 * MM)]
+Defocus = Annotated[float, length(-10 * MM, 10 * MM)]
+NearDepth = Annotated[float, length(10 * UM, 1e6)]
 FarDepth = Annotated[
     float,
     Field(allow_inf_nan=True),
-    BeforeValidator(_length(10 * UM, 1e12, infinite=True)),
+    length(10 * UM, 1e12, infinite=True),
     PlainSerializer(_infinity_as_text, when_used="json"),
 ]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.commands.heights import level_map_from, levels_of_run, read_any_height
+from doedesign.drawing import level_map_from, levels_of_run, read_any_height
 from doedesign.runs import Run, begin_run, claim_run, finish_run
 from doedesign.spec import load_spec
 from fab.errors import InputError

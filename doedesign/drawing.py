@@ -1,6 +1,7 @@
-"""Height maps from wherever they come: a run, an EXR file, or a map the user brings."""
+"""What is to be drawn, from wherever it comes: a run, its mask files, an EXR file, or a map the user brings."""
 
 from dataclasses import dataclass
+from math import isclose
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,11 @@ from doedesign.spec import HEIGHT_FILES
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import HeightMap, read_height
+from fab.layout import pixel_edges
 from fab.levels import Levels, quantise
+from fab.manifest import read_manifest
+from fab.units import format_length
+from fab.verify import read_level_map
 
 
 @dataclass(frozen=True)
@@ -117,3 +122,33 @@ def level_map_from(
     # What a mask shop takes in a name; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
     return LevelMap(level, levels, height.grid, height.aperture_m, name, source)
+
+
+def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
+    """Level map that the combined GDS file of a mask order draws, `[y, x]`.
+
+    Args:
+        folder: the mask order.
+        drawing: what it should draw.
+
+    Raises:
+        InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
+    """
+    manifest = read_manifest(folder)
+    levels, grid = manifest.staircase(), manifest.grid()
+    alike = grid.shape == drawing.grid.shape and levels.count == drawing.levels.count
+    # The manifest rounds lengths to its units' last digit.
+    lengths = (grid.pitch_m, drawing.grid.pitch_m), (levels.step_m, drawing.levels.step_m)
+    if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
+        raise InputError(
+            str(folder),
+            f"the masks must be those of this run, {_told(drawing.grid, drawing.levels)}",
+            _told(grid, levels),
+            "Give the masks of this run (--masks).",
+        )
+    return read_level_map(folder / manifest.combined_gds, levels, pixel_edges(grid))
+
+
+def _told(grid: Grid, levels: Levels) -> str:
+    pixels = f"{grid.shape[0]} x {grid.shape[1]} pixels of {format_length(grid.pitch_m)}"
+    return f"{pixels} in {levels.count} levels of {format_length(levels.step_m)}"

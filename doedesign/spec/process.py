@@ -1,0 +1,283 @@
+"""The process in a spec: what is asked of the fab lab, how far it strays, and when a plate is good enough.
+
+Every key besides levels and level step may be left out: `stock` names a set of usual numbers, each key that is given
+replaces one of them, and without a stock process what is not given is zero. `ProcessSpec.filled` says what then holds.
+The keys of `[process.errors]` are those of `fab.process.ERRORS` without the unit.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    TypeAdapter,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
+
+from doedesign.spec.table import Table, unsaid
+from doedesign.spec.values import (
+    ChromeOverlap,
+    ColourName,
+    FarDepth,
+    LevelCount,
+    LevelStep,
+    angle,
+    broken,
+    length,
+    nearest,
+    share,
+)
+from fab.process import ERRORS, Error, Spread
+from fab.stock import IDEAL, STOCK, Stock
+from fab.units import MM, NM, UM
+
+__all__ = ["DefectsSpec", "ErrorsSpec", "EtchSpec", "LimitSpec", "ProcessSpec", "Quantity", "SpreadSpec"]
+
+Quantity = Literal["zeroth_order", "strehl", "throughput", "outside_window", "ring_to_disc", "far_spot"]
+
+# The largest mean or standard deviation of an error that can be meant, by its unit; some have a limit of their own.
+_LARGEST = {"1": 0.5, "m": 100 * UM, "rad": math.radians(45)}
+_LARGEST_OF = {"rotation_rad": math.radians(1), "magnification": 0.01, "roughness_m": 1 * UM}
+
+Etch = Annotated[float, length(0.1 * NM, 1 * MM)]
+Feature = Annotated[float, length(0.0, 1 * MM)]
+Place = Annotated[float, length(-1.0, 1.0)]
+Radius = Annotated[float, length(1 * MM, 1.0)]
+DefectRadius = Annotated[float, length(1 * NM, 1 * MM)]
+Density = Annotated[float, share(0.0, 1e4)]
+Chance = Annotated[float, share(0.0, 1.0)]
+
+
+class EtchSpec(Table, frozen=True):
+    """One etch.
+
+    Attributes:
+        mask: the mask, k = 0 for the shallowest.
+        depth_m: its depth; always 2^k level steps, and checked where it is given.
+    """
+
+    inline: ClassVar[bool] = True
+
+    mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
+    depth_m: Etch | None = unsaid()
+
+
+class SpreadSpec(Table, frozen=True):
+    """How one error is distributed, in the SI unit that the error's name ends in.
+
+    In TOML `overlay_x = "0.5 um"` is short for `overlay_x = { sigma = "0.5 um" }`.
+
+    Attributes:
+        mean: its mean; a tuple holds one value per mask, a number is for all masks.
+        sigma: its standard deviation, likewise.
+    """
+
+    inline: ClassVar[bool] = True
+
+    mean: float | tuple[float, ...] = unsaid(0.0)
+    sigma: float | tuple[float, ...] = unsaid(0.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sigma_alone(cls, value: Any) -> Any:
+        return value if isinstance(value, Mapping | SpreadSpec) else {"sigma": value}
+
+    def spreads(self, count: int) -> tuple[Spread, ...]:
+        """Return mean and standard deviation of each of `count` errors, one per mask or one for the plate."""
+        means, sigmas = (value if isinstance(value, tuple) else (value,) * count for value in (self.mean, self.sigma))
+        return tuple(Spread(mean, sigma) for mean, sigma in zip(means, sigmas, strict=True))
+
+
+def quantity_of(error: Error, low: float, high: float) -> Any:
+    """Return the type of a value of an error between two bounds, SI units."""
+    of_unit = {"1": share, "m": length, "rad": angle}[error.unit]
+    return Annotated[float, of_unit(low, high)]
+
+
+def _for_plate(value_type: Any) -> Any:
+    def refuse_list(value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            raise broken("must be one value, for it concerns the whole plate", "Remove the brackets.")
+        return value
+
+    return Annotated[value_type, BeforeValidator(refuse_list)]
+
+
+def _for_masks(value_type: Any) -> Any:
+    """Return the type of one value for all masks or a list of one per mask."""
+    list_type: Any = tuple[value_type, ...]
+    one, each = TypeAdapter(value_type), TypeAdapter(list_type)
+
+    def validate(value: Any, info: ValidationInfo) -> float | tuple[float, ...]:
+        adapter = each if isinstance(value, list | tuple) else one
+        return adapter.validate_python(value, context=info.context)
+
+    return Annotated[Any, PlainValidator(validate)]
+
+
+def _spread_type(name: str, error: Error) -> type[SpreadSpec]:
+    largest = _LARGEST_OF.get(name, _LARGEST[error.unit])
+    of = _for_masks if error.per_mask else _for_plate
+    mean = of(quantity_of(error, 0.0 if error.one_sided else -largest, largest))
+    sigma = of(quantity_of(error, 0.0, largest))
+    fields: dict[str, Any] = {"mean": (mean, unsaid(0.0)), "sigma": (sigma, unsaid(0.0))}
+    model = create_model(f"_spread_of_{name}", __base__=SpreadSpec, __module__=__name__, **fields)
+    globals()[model.__name__] = model  # a spec is found again by its classes' names where it is sent to another process
+    return model
+
+
+_SPREADS: dict[str, Any] = {name: (_spread_type(name, error) | None, unsaid()) for name, error in ERRORS.items()}
+_Errors = create_model("_Errors", __base__=Table, __module__=__name__, **_SPREADS)
+
+
+class ErrorsSpec(_Errors, frozen=True):
+    """How far the process strays: a `SpreadSpec` or None for each error of `fab.process.ERRORS`, under its name."""
+
+    def given(self) -> dict[str, SpreadSpec]:
+        """Return the errors that are given, by their name in `ERRORS`."""
+        return self.said()
+
+
+# Densities are per mm2 in a spec, where one per cm2 is 0.01, and per m2 elsewhere.
+_PER_MM2 = {"particles_per_m2": "particles_per_mm2", "pinholes_per_m2": "pinholes_per_mm2"}
+
+
+class DefectsSpec(Table, frozen=True):
+    """Rare events; see `fab.process.Defects`.
+
+    Attributes:
+        particles_per_mm2: particles per mm2 and etch that keep an etch off a disc.
+        particle_radius_m: their mean radius.
+        pinholes_per_mm2: pinholes per mm2 of chrome.
+        pinhole_radius_m: their mean radius.
+        missed: chance that an etch is forgotten.
+        doubled: chance that an etch is done twice.
+    """
+
+    particles_per_mm2: Density | None = unsaid()
+    particle_radius_m: DefectRadius | None = unsaid()
+    pinholes_per_mm2: Density | None = unsaid()
+    pinhole_radius_m: DefectRadius | None = unsaid()
+    missed: Chance | None = unsaid()
+    doubled: Chance | None = unsaid()
+
+    @classmethod
+    def from_si(cls, values: Mapping[str, float]) -> "DefectsSpec":
+        """Return the spec of numbers by their name in `fab.process.Defects`."""
+        per_mm2 = {_PER_MM2[name]: value / 1e6 for name, value in values.items() if name in _PER_MM2}
+        return cls.model_validate(per_mm2 | {name: value for name, value in values.items() if name not in _PER_MM2})
+
+    def in_si(self) -> dict[str, float]:
+        """Return what is given, by its name in `fab.process.Defects`."""
+        said = self.said()
+        per_m2 = {name: said.pop(key) * 1e6 for name, key in _PER_MM2.items() if key in said}
+        return per_m2 | said
+
+
+def _stock_name(name: str) -> str:
+    if name not in STOCK:
+        raise broken("must be a known process", nearest(name, tuple(STOCK)))
+    return name
+
+
+class ProcessSpec(Table, frozen=True):
+    """What the fab lab makes, and how well.
+
+    Attributes:
+        levels: number of heights L, a power of two.
+        level_step_m: height of one level.
+        chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
+            little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
+        stock: a process of `fab.stock.STOCK` that stands in for what is not given here.
+        etches: the etches in the order in which they are done, each mask once; shallow to deep where none is given.
+        tone: what polygons mean on the plates, "clear" (dark-field plate) or "dark".
+        minimum_line_m: narrowest line the lithography prints.
+        minimum_space_m: narrowest gap it prints.
+        die_m: where on the wafer the DOE lies (y, x).
+        wafer_radius_m: radius of the wafer.
+        errors: how far the process strays.
+        defects: rare events.
+    """
+
+    levels: LevelCount = Field(examples=["16"])
+    level_step_m: LevelStep = Field(examples=['"75 nm"'])
+    chrome_overlap_m: ChromeOverlap = 5e-6
+    stock: Annotated[str, AfterValidator(_stock_name)] | None = unsaid()
+    etches: tuple[EtchSpec, ...] = unsaid(())
+    tone: Literal["clear", "dark"] | None = unsaid()
+    minimum_line_m: Feature | None = unsaid()
+    minimum_space_m: Feature | None = unsaid()
+    die_m: tuple[Place, Place] | None = unsaid()
+    wafer_radius_m: Radius | None = unsaid()
+    errors: ErrorsSpec = unsaid(ErrorsSpec())
+    defects: DefectsSpec = unsaid(DefectsSpec())
+
+    @property
+    def masks(self) -> int:
+        """Number of etch masks."""
+        return self.levels.bit_length() - 1
+
+    def filled(self) -> "ProcessSpec":
+        """Return the process with everything given: by itself, by its stock process, or as the ideal process has it."""
+        stock = STOCK[self.stock] if self.stock else IDEAL
+        usual = {
+            "tone": stock.tone,
+            "minimum_line_m": stock.minimum_line_m.value,
+            "minimum_space_m": stock.minimum_space_m.value,
+            "die_m": (0.0, 0.0),
+            "wafer_radius_m": stock.wafer_radius_m.value,
+            "etches": tuple(EtchSpec(mask=mask) for mask in range(self.masks)),
+        }
+        tables = {"errors": _filled_errors(self.errors, stock), "defects": _filled_defects(self.defects, stock)}
+        return self.model_copy(update=usual | self.said() | tables)
+
+
+def _filled_errors(errors: ErrorsSpec, stock: Stock) -> ErrorsSpec:
+    usual = {name: {"mean": typical.mean, "sigma": typical.sigma} for name, typical in stock.errors.items()}
+    return ErrorsSpec.model_validate(usual | errors.given())
+
+
+def _filled_defects(defects: DefectsSpec, stock: Stock) -> DefectsSpec:
+    usual = DefectsSpec.from_si({name: figure.value for name, figure in stock.defects.items()})
+    return usual.model_copy(update=defects.said())
+
+
+class LimitSpec(Table, frozen=True):
+    """One condition of a good plate: it must hold for every colour and depth it applies to.
+
+    Attributes:
+        quantity: what is limited, a column of the prediction's table.
+        min: smallest value of a good plate.
+        max: largest value of a good plate.
+        colour: the colour channel it applies to; all where none is given.
+        depth_m: the depth it applies to, one of `scene`; all that have the quantity where none is given.
+    """
+
+    quantity: Quantity = Field(examples=['"zeroth_order"'])
+    min: Annotated[float, Field(strict=True, ge=0)] | None = unsaid()
+    max: Annotated[float, Field(strict=True, ge=0)] | None = unsaid()
+    colour: ColourName | None = unsaid()
+    depth_m: FarDepth | None = unsaid()
+
+    @field_validator("min", "max")
+    @classmethod
+    def _a_share(cls, value: float | None, info: ValidationInfo) -> float | None:
+        quantity = info.data.get("quantity", "ring_to_disc")
+        if value is not None and value > 1 and quantity != "ring_to_disc":
+            raise broken(f"must lie between 0 and 1, for {quantity} is a share", "Write 5 % as 0.05.")
+        return value
+
+    @model_validator(mode="after")
+    def _limits_something(self) -> "LimitSpec":
+        if self.min is None and self.max is None:
+            raise broken("must state min, max or both", "For example `max = 0.05`.")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise broken(f"min must not exceed max, {self.min:g} > {self.max:g}", "Exchange them.")
+        return self

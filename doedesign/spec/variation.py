@@ -1,0 +1,125 @@
+"""Files of their own beside the spec: a process, and the errors of one plate.
+
+    [variation]
+    depth_scale = [0.02, 0.02, 0.01, 0.0]
+    overlay_x = ["0.3 um", "-0.1 um", "0 um", "0.2 um"]
+    repeats = [0, 0, -1, 0]
+
+    [[particle]]
+    mask = 2
+    x = "0.1 mm"
+    y = "-0.3 mm"
+    radius = "4 um"
+
+Keys are those of `fab.process.ERRORS` without the unit; what is not said is zero.
+"""
+
+import math
+from typing import Annotated, Any
+
+from pydantic import Field, create_model
+
+from doedesign.spec.process import ProcessSpec, quantity_of
+from doedesign.spec.table import Table, unsaid
+from doedesign.spec.values import length
+from fab.process import ERRORS, Disc, Error, MaskDisc, Variation
+
+__all__ = ["ProcessFile", "VariationFile", "variation_file"]
+
+Place = Annotated[float, length(-1.0, 1.0)]
+Radius = Annotated[float, length(0.0, 1.0)]
+
+
+class ProcessFile(Table, frozen=True):
+    """A file that holds a process.
+
+    Attributes:
+        process: the process.
+    """
+
+    process: ProcessSpec
+
+
+def _error_type(error: Error) -> tuple[Any, Any]:
+    value = quantity_of(error, 0.0 if error.one_sided else -math.inf, math.inf)
+    return (tuple[value, ...], unsaid(())) if error.per_mask else (value, unsaid(0.0))
+
+
+_VALUES: dict[str, Any] = {name: _error_type(error) for name, error in ERRORS.items()}
+_Values = create_model("_Values", __base__=Table, __module__=__name__, **_VALUES)
+
+
+class VariationSpec(_Values, frozen=True):
+    """The errors of one plate, under their names in `fab.process.ERRORS`.
+
+    Attributes, besides these:
+        repeats: how often each mask was etched more than once: -1 missed, 1 doubled.
+        seed: which roughness, of all with the same statistics.
+    """
+
+    repeats: tuple[Annotated[int, Field(strict=True, ge=-1, le=9)], ...] = unsaid(())
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = unsaid(0)
+
+
+class PinholeSpec(Table, frozen=True):
+    """A pinhole in the chrome; see `fab.process.Disc`."""
+
+    x_m: Place = Field(examples=['"0.1 mm"'])
+    y_m: Place = Field(examples=['"0.1 mm"'])
+    radius_m: Radius = Field(examples=['"2 um"'])
+
+
+class ParticleSpec(Table, frozen=True):
+    """A particle that kept one etch off a disc; see `fab.process.MaskDisc`."""
+
+    mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
+    x_m: Place = Field(examples=['"0.1 mm"'])
+    y_m: Place = Field(examples=['"0.1 mm"'])
+    radius_m: Radius = Field(examples=['"4 um"'])
+
+
+class VariationFile(Table, frozen=True):
+    """A file that holds the errors of one plate.
+
+    Attributes:
+        variation: the errors.
+        particles: `[[particle]]` in TOML.
+        pinholes: `[[pinhole]]` in TOML.
+    """
+
+    variation: VariationSpec
+    particles: tuple[ParticleSpec, ...] = unsaid(())
+    pinholes: tuple[PinholeSpec, ...] = unsaid(())
+
+    def value(self) -> Variation:
+        """Return the errors as the physics takes them."""
+        return Variation(
+            **self.variation.said(),
+            particles=tuple(MaskDisc(p.mask, p.y_m, p.x_m, p.radius_m) for p in self.particles),
+            pinholes=tuple(Disc(p.y_m, p.x_m, p.radius_m) for p in self.pinholes),
+        )
+
+
+def variation_file(variation: Variation) -> VariationFile:
+    """Return the file that says what a variation is.
+
+    Args:
+        variation: errors as numbers of any kind that `float` takes.
+
+    Raises:
+        ValueError: a value that is not finite, or an error below zero that never is.
+    """
+    errors = {name: getattr(variation, name) for name in ERRORS}
+    plain = {name: tuple(map(float, v)) if ERRORS[name].per_mask else float(v) for name, v in errors.items()}
+    return VariationFile.model_validate(
+        {
+            "variation": {**plain, "repeats": tuple(map(int, variation.repeats)), "seed": int(variation.seed)},
+            "particles": [
+                {"mask": int(p.mask), "y_m": float(p.y_m), "x_m": float(p.x_m), "radius_m": float(p.radius_m)}
+                for p in variation.particles
+            ],
+            "pinholes": [
+                {"y_m": float(p.y_m), "x_m": float(p.x_m), "radius_m": float(p.radius_m)} for p in variation.pinholes
+            ],
+        }
+    )

@@ -1,0 +1,154 @@
+"""Draws of a process: which errors a plate comes back with.
+
+Every sampler works on scores, the number of standard deviations by which each error strays from its mean, one column
+per error that varies (`varying`). `draw_at` turns a row of scores into a `Variation`; `normal_draw` needs nothing but a
+seed and a number, so any draw of a study can be repeated alone.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import hadamard
+from scipy.stats import norm, qmc
+
+from fab.process import ERRORS, Disc, MaskDisc, Process, Variation, variation_of
+
+__all__ = [
+    "corner_scores",
+    "draw_at",
+    "normal_draw",
+    "normal_scores",
+    "one_at_a_time_scores",
+    "sobol_scores",
+    "source_of",
+    "varying",
+]
+
+_ALL_CORNERS = 6  # errors up to which every combination of signs is tried
+
+
+def varying(process: Process) -> tuple[str, ...]:
+    """Flat names of the errors with a standard deviation above zero, in the order of `ERRORS`."""
+    keys = list(ERRORS)
+    names = [name for name, spread in process.spreads.items() if spread.sigma > 0]
+    return tuple(sorted(names, key=lambda name: (keys.index(_key(name)), name)))
+
+
+def _key(name: str) -> str:
+    return name.partition("[")[0]
+
+
+def source_of(name: str) -> str:
+    """Group of a flat error name, such as "overlay"."""
+    return ERRORS[_key(name)].source
+
+
+def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **rest: object) -> Variation:
+    """The plate whose errors stray by these scores.
+
+    Args:
+        process: the process.
+        scores: one per name of `varying(process)`, standard deviations from the mean.
+        seed: seed of the roughness.
+        rest: `repeats`, `particles`, `pinholes`.
+
+    One-sided errors are the absolute value of mean + score * sigma (a folded normal distribution).
+    """
+    strayed = dict(zip(varying(process), (float(s) for s in scores), strict=True))
+    values = {}
+    for name, spread in process.spreads.items():
+        value = spread.mean + strayed.get(name, 0.0) * spread.sigma
+        values[name] = abs(value) if ERRORS[_key(name)].one_sided else value
+    return variation_of(process.masks, values, seed=seed, **rest)
+
+
+def normal_scores(process: Process, seed: int, index: int) -> NDArray[np.float64]:
+    """Scores of draw `index`: independent standard normals from the stream (seed, index)."""
+    return np.random.default_rng([seed, index]).standard_normal(len(varying(process)))
+
+
+def normal_draw(process: Process, seed: int, index: int, plate_m: float) -> Variation:
+    """Draw number `index` of a Monte-Carlo study, rare events included.
+
+    Args:
+        process: the process.
+        seed: seed of the study.
+        index: number of the draw; the result depends on nothing else.
+        plate_m: side of the square on which particles and pinholes fall.
+    """
+    # A second stream, so that rare events do not shift the scores.
+    rng = np.random.default_rng([seed, index, 1])
+    scores = normal_scores(process, seed, index)
+    events = _events(process, rng, plate_m)
+    return draw_at(process, scores, int(rng.integers(2**31)), **events)
+
+
+def _events(process: Process, rng: np.random.Generator, side_m: float) -> dict[str, object]:
+    defects, area = process.defects, side_m**2
+    chances = rng.random(process.masks)
+    repeats = np.where(chances < defects.missed, -1, np.where(chances > 1 - defects.doubled, 1, 0))
+    particles = []
+    for mask in range(process.masks):
+        for disc in _discs(rng, defects.particles_per_m2 * area, defects.particle_radius_m, side_m):
+            particles.append(MaskDisc(mask, *disc))
+    pinholes = _discs(rng, defects.pinholes_per_m2 * area, defects.pinhole_radius_m, side_m)
+    return {
+        "repeats": tuple(int(r) for r in repeats) if repeats.any() else (),
+        "particles": tuple(particles),
+        "pinholes": tuple(pinholes),
+    }
+
+
+def _discs(rng: np.random.Generator, mean_count: float, radius_m: float, side_m: float) -> list[Disc]:
+    places = (rng.random((rng.poisson(mean_count), 2)) - 0.5) * side_m
+    return [
+        Disc(float(y), float(x), float(r))
+        for (y, x), r in zip(places, rng.exponential(radius_m, len(places)), strict=True)
+    ]
+
+
+def corner_scores(process: Process, reach: float = 2.0) -> NDArray[np.float64]:
+    """Worst-case corners: every varying error at `reach` standard deviations to one side or the other.
+
+    Up to six errors give every combination of signs; more give the rows of a Hadamard matrix and their opposites, in
+    which every pair of errors meets in all four combinations equally often.
+
+    Returns:
+        `[corner, error]` scores.
+    """
+    count = len(varying(process))
+    if count <= _ALL_CORNERS:
+        return reach * np.array(list(itertools.product((-1.0, 1.0), repeat=count))).reshape(2**count, count)
+    size = 2 ** math.ceil(math.log2(count + 1))
+    signs = hadamard(size)[:, 1 : count + 1].astype(np.float64)
+    return reach * np.concatenate([signs, -signs])
+
+
+def sobol_scores(process: Process, count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Quasi-random normal scores from a scrambled Sobol sequence.
+
+    Args:
+        process: the process.
+        count: number of draws; a power of two keeps the sequence balanced.
+        seed: seed of the scrambling.
+
+    Returns:
+        `[draw, error]` scores.
+    """
+    errors = len(varying(process))
+    points = qmc.Sobol(errors, rng=np.random.default_rng(seed)).random_base2(math.ceil(math.log2(max(count, 1))))
+    # A point on the border would be an infinite score.
+    return norm.ppf(np.clip(points[:count], 2.0**-33, 1 - 2.0**-33))
+
+
+def one_at_a_time_scores(process: Process, reaches: Sequence[float] = (-1.0, 1.0)) -> NDArray[np.float64]:
+    """Each varying error alone at each of some scores, all others at their mean.
+
+    Returns:
+        `[error * reach, error]` scores, reaches of the first error first.
+    """
+    count = len(varying(process))
+    return np.repeat(np.eye(count), len(reaches), axis=0) * np.tile(np.asarray(reaches, np.float64), count)[:, None]

@@ -1,0 +1,137 @@
+"""One DOE cell with displaced masks: where within the cell what is etched, and what the cell does to light from afar.
+
+A mask that lies off by a fraction of a cell, or prints its openings too wide, moves all its edges, so every cell is cut
+along a few lines, the same ones in all cells of a small tile (`Cuts`). Between the lines the depth is constant. The
+depth of every piece of every cell is one matrix product of the masks' states with what each etch takes away
+(`piece_depths`), and its light needs one exponential.
+
+A lens does not see the pieces. It sees how much light a cell passes and, to its first and second moments, from where
+within the cell: exp(-2 pi i u x) over a cell is a short series of Legendre polynomials, sum (2q+1) (-i)^q j_q(pi u)
+P_q(2x), and of the plane waves that reach the sensor at most half a turn fits into a cell. The cell's mean alone is off
+by 15 % in the PSF of a plate with 0.5 um of overlay; with the moments up to second order it is 0.3 %. `moment_filter`
+turns moments into values of the neighbouring cells that have the same far field, so that the transform of one number
+per cell stays what it was.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.special import spherical_jn
+
+# Moments kept: degree along y and along x, up to a total of two.
+DEGREES = ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
+FILTER_REACH = 10  # cells to either side
+
+
+class Cuts(NamedTuple):
+    """Lines that cut every cell of a tile along one axis.
+
+    Attributes:
+        edges: where they are, in cells from the cell's lower side, increasing, with 0 and 1 at the ends.
+        state: `[mask, segment]` 0, 1 or 2: the segment lies before, between or behind the two lines of that mask.
+        low: `[mask, state]` offset in cells of the lowest mask pixel that a piece in that state sees.
+        high: the same for the highest.
+        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's two lines, ascending.
+    """
+
+    edges: Float[Array, " segment+1"]
+    state: Int[Array, "mask segment"]
+    low: Int[Array, "mask 3"]
+    high: Int[Array, "mask 3"]
+    line: Int[Array, "mask 2"]
+
+
+def cuts(shift: Float[Array, " mask"], bias: Float[Array, " mask"]) -> Cuts:
+    """Cut a cell where masks are shifted and their openings widened.
+
+    Args:
+        shift: displacement of every mask along this axis, in cells.
+        bias: how far every edge of an opening moves outward, in cells, between -1/2 and 1/2.
+
+    A point of the wafer lies in the printed opening if any mask pixel within the bias of it (measured along x and along
+    y) is open, or, for a negative bias, if all of them are: the square keeps the corners of rectangles square.
+    """
+    reach = jnp.abs(bias)
+    lines = jnp.stack([shift - reach, shift + reach], axis=1)
+    whole = jnp.floor(lines)
+    # A line just below a whole number can round up to a fraction of 1, which belongs to the next cell.
+    fraction = jnp.clip(lines - whole, 0.0, 1.0)
+    number = whole.astype(jnp.int32)
+    masks = shift.shape[0]
+    flat = fraction.reshape(-1)
+    order = jnp.argsort(flat)  # stable: equal lines keep their order, so an unbiased mask's lower line comes first
+    rank = jnp.argsort(order).reshape(masks, 2)
+    edges = jnp.concatenate([jnp.zeros(1), flat[order], jnp.ones(1)])
+    segments = jnp.arange(2 * masks + 1)
+    behind = segments[None, None, :] > rank[:, :, None]
+    state = behind.sum(axis=1).astype(jnp.int32)
+    # Behind the lower line a piece sees one more pixel above, behind the upper line one less below.
+    lower_first = rank[:, 0] < rank[:, 1]
+    high = -number[:, 0, None] - 1 + jnp.stack([0 * rank[:, 0], lower_first, 1 + 0 * rank[:, 0]], axis=1)
+    low = -number[:, 1, None] - 1 + jnp.stack([0 * rank[:, 0], ~lower_first, 1 + 0 * rank[:, 0]], axis=1)
+    return Cuts(edges, state, low.astype(jnp.int32), high.astype(jnp.int32), jnp.sort(rank, axis=1))
+
+
+def whole_cell(masks: int) -> Cuts:
+    """No cuts: every mask lies where it was drawn."""
+    same = jnp.zeros((masks, 3), jnp.int32)
+    none = jnp.zeros((masks, 2), jnp.int32)
+    return Cuts(jnp.array([0.0, 1.0]), jnp.zeros((masks, 1), jnp.int32), same, same, none)
+
+
+def axis_moments(edges: Float[Array, " segment+1"], parts: int) -> Float[Array, "part degree segment"]:
+    """Integral of the Legendre polynomials P0, P1, P2 over every segment, for each of `parts` equal parts of the cell.
+
+    Over its own part a whole cell gives (1, 0, 0).
+    """
+    start = jnp.arange(parts)[:, None] / parts
+    x = jnp.clip((edges[None, :] - start) * parts, 0.0, 1.0)
+    powers = jnp.stack([x, x * (x - 1), x * (x - 1) * (2 * x - 1)], axis=1)
+    return jnp.diff(powers, axis=-1)
+
+
+def axis_values(points: Float[Array, " point"], parts: int) -> Float[Array, "part degree point"]:
+    """Legendre polynomials P0, P1, P2 at points of the cell, times the parts per length; zero outside each part."""
+    start = jnp.arange(parts)[:, None] / parts
+    x = (points[None, :] - start) * parts
+    inside = (x >= 0) & ((x < 1) | ((x <= 1) & (start + 1 / parts >= 1)))
+    values = jnp.stack([jnp.ones_like(x), 2 * x - 1, 6 * x * x - 6 * x + 1], axis=1)
+    return parts * jnp.where(inside[:, None, :], values, 0.0)
+
+
+def plane_moments(
+    along_y: Float[Array, "part degree a"], along_x: Float[Array, "part degree b"]
+) -> Float[Array, "moment a b"]:
+    """Products of moments along both axes for `DEGREES`, one row per (part y, part x, degree)."""
+    rows = [jnp.einsum("pa,rb->prab", along_y[:, degree_y], along_x[:, degree_x]) for degree_y, degree_x in DEGREES]
+    stacked = jnp.stack(rows, axis=2)
+    return stacked.reshape(-1, along_y.shape[-1], along_x.shape[-1])
+
+
+def point_moments(at_y: Float[Array, "part degree q"], at_x: Float[Array, "part degree q"]) -> Float[Array, "moment q"]:
+    """The same for points, one product per point."""
+    rows = [at_y[:, None, degree_y] * at_x[None, :, degree_x] for degree_y, degree_x in DEGREES]
+    return jnp.stack(rows, axis=2).reshape(-1, at_y.shape[-1])
+
+
+def moment_filter(degree: int, band: float) -> Float[np.ndarray, " tap"]:
+    """Weights on the cells -10 ... 10 from a moment's own whose far field is that of the moment.
+
+    Args:
+        degree: 1 or 2.
+        band: highest |u| that matters, in waves per cell, below 1/2.
+
+    Least squares for (2q+1) (-i)^q j_q(pi u) / j_0(pi u) over the band; the weights are real, odd or even like their
+    degree, and have no effect on the axis, so that they leave the mean of a plate alone.
+    """
+    u = np.linspace(0, band, 400)
+    target = (2 * degree + 1) * spherical_jn(degree, np.pi * u) / spherical_jn(0, np.pi * u)
+    angle = 2 * np.pi * u[:, None] * np.arange(1, FILTER_REACH + 1)
+    if degree == 1:
+        # sum w_m exp(-2 pi i u m) of odd weights is -2 i sum w_m sin.
+        half = np.linalg.lstsq(2 * np.sin(angle), target, rcond=None)[0]
+        return np.concatenate([-half[::-1], [0.0], half])
+    half = np.linalg.lstsq(2 * np.cos(angle) - 2, -target, rcond=None)[0]
+    return np.concatenate([half[::-1], [-2 * half.sum()], half])

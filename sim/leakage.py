@@ -1,0 +1,97 @@
+"""How much light passes a plate as if it were flat, and where it goes.
+
+The mean of a plate's transmission over the clear aperture, c0 = <t>, is its 0th order: the field c0 behind the whole
+aperture images like the bare lens. What is left, t - c0, is diffracted; the two are orthogonal over the aperture, so
+their powers add to that of the plate, though in any one pixel they interfere.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from sim.camera import Camera, Colour, source_path_m, wrapped_waves
+from sim.psf import plan_propagation
+from sim.pupil import SurfaceRows, surface_pupil
+from sim.surface import Surface
+
+
+def mean_transmission(surface: Surface) -> Complex[np.ndarray, " w"]:
+    """Mean transmission c0 over the open aperture, weighted by every cell's open share, per wavelength."""
+    coverage = np.asarray(surface.coverage, np.float64)
+    return _over(np.asarray(surface.transmission), coverage) / coverage.sum()
+
+
+def _over(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+    return np.einsum("wyx,yx->w", values, coverage, dtype=np.complex128)
+
+
+def zeroth_order(surface: Surface) -> Float[np.ndarray, " w"]:
+    """Fraction |<t>|^2 of the light that passes as if the plate were flat, per wavelength."""
+    return np.abs(mean_transmission(surface)) ** 2
+
+
+def strehl(surface: Surface, nominal: Surface) -> Float[np.ndarray, " w"]:
+    """Overlap |<t conj(t_nominal)>|^2 with the field the design means to make, per wavelength.
+
+    Args:
+        surface: the plate.
+        nominal: the plate exactly as drawn, on the DOE's own grid; where the plate is finer, its cells are repeated.
+    """
+    parts = surface.grid.shape[0] // nominal.grid.shape[0]
+    meant = np.repeat(np.repeat(np.conj(np.asarray(nominal.transmission)), parts, axis=1), parts, axis=2)
+    coverage = np.asarray(surface.coverage, np.float64)
+    return np.abs(_over(np.asarray(surface.transmission) * meant, coverage) / coverage.sum()) ** 2
+
+
+class SplitPsf(NamedTuple):
+    """One PSF by origin, energies per pixel; leaked + diffracted + interference is the plate's PSF.
+
+    Attributes:
+        leaked: of the 0th order alone: |c0|^2 times the PSF of the bare lens.
+        diffracted: of everything else.
+        interference: twice the real part of one field times the other's conjugate; its sum over an unbounded sensor
+            is zero.
+    """
+
+    leaked: Float[np.ndarray, "y x"]
+    diffracted: Float[np.ndarray, "y x"]
+    interference: Float[np.ndarray, "y x"]
+
+    @property
+    def total(self) -> Float[np.ndarray, "y x"]:
+        """PSF of the plate."""
+        return self.leaked + self.diffracted + self.interference
+
+
+def split_psf(camera: Camera, surface: Surface, colour: Colour, depth_m: float) -> SplitPsf:
+    """Split the PSF of one colour and depth into the light that leaked and the light that was diffracted.
+
+    Args:
+        camera: lens, sensor and substrate.
+        surface: the plate, with the colour's wavelengths.
+        colour: colour channel.
+        depth_m: source depth, metres.
+
+    Returns:
+        energies per unit power incident on the clear aperture, Fresnel loss included. The three transforms are taken
+        independently of each other: that they fit is a check, not an assumption.
+    """
+    own = replace(camera, grid=surface.grid)
+    path = source_path_m(own, depth_m)
+    means = mean_transmission(surface)
+    parts = np.zeros((3, camera.window, camera.window))
+    for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+        plan = plan_propagation(own, wavelength, depth_m)
+        source = jnp.asarray(wrapped_waves(path, wavelength))
+        mean = jnp.complex64(means[surface.wavelengths_m.index(wavelength)])
+        whole = surface.at(wavelength)
+        fields = (jnp.full_like(whole, mean), whole - mean, whole)
+        factor = weight * camera.transmission(wavelength)
+        for i, field in enumerate(fields):
+            rows = SurfaceRows(field, source, surface.coverage)
+            parts[i] += factor * np.asarray(plan.energy(surface_pupil, rows, None))
+    leaked, diffracted, total = parts
+    return SplitPsf(leaked, diffracted, total - leaked - diffracted)
