@@ -33,7 +33,8 @@ class Cuts(NamedTuple):
         state: `[mask, segment]` 0, 1 or 2: the segment lies before, between or behind the two lines of that mask.
         low: `[mask, state]` offset in cells of the lowest mask pixel that a piece in that state sees.
         high: the same for the highest.
-        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's two lines, ascending.
+        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's two lines, shift - |bias| and
+            shift + |bias|; modulo one cell, either may come first.
     """
 
     edges: Float[Array, " segment+1"]
@@ -71,7 +72,7 @@ def cuts(shift: Float[Array, " mask"], bias: Float[Array, " mask"]) -> Cuts:
     lower_first = rank[:, 0] < rank[:, 1]
     high = -number[:, 0, None] - 1 + jnp.stack([0 * rank[:, 0], lower_first, 1 + 0 * rank[:, 0]], axis=1)
     low = -number[:, 1, None] - 1 + jnp.stack([0 * rank[:, 0], ~lower_first, 1 + 0 * rank[:, 0]], axis=1)
-    return Cuts(edges, state, low.astype(jnp.int32), high.astype(jnp.int32), jnp.sort(rank, axis=1))
+    return Cuts(edges, state, low.astype(jnp.int32), high.astype(jnp.int32), rank)
 
 
 def whole_cell(masks: int) -> Cuts:

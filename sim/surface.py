@@ -22,6 +22,7 @@ How each error enters:
 * particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, and pinholes.
 """
 
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from typing import NamedTuple
@@ -399,8 +400,8 @@ def _tile_moments(
         along_y = cuts((relief.shift_m[:, 0] + relief.growth * middle_y + relief.turn * middle_x) / pitch, bias)
         along_x = cuts((relief.shift_m[:, 1] + relief.growth * middle_x - relief.turn * middle_y) / pitch, bias)
         around = _STATES if plan.corners else range(3)
-        kinds = jnp.stack(
-            [_mask_states(states[k], along_y, along_x, k, bias[k], around, plan) for k in range(plan.masks)]
+        kinds = jax.lax.map(
+            lambda k: _mask_states(states[k], along_y, along_x, k, bias[k], around, plan), jnp.arange(plan.masks)
         )
         own = slice(-around[0], 3 - around[0])
         pieces = kinds[:, own, own]
@@ -461,16 +462,37 @@ def _light_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) 
 
 def _turned(light: Float[Array, "... 2 w c"]) -> Float[Array, "... 2 w c"]:
     """The light times i."""
-    return jnp.concatenate([-light[..., 1:, :, :], light[..., :1, :, :]], axis=-3)
+    return jnp.flip(light, -3) * jnp.array([-1.0, 1.0])[:, None, None]
 
 
-def _times(light: Float[Array, "... 2 w c"], factor: Complex[Array, "... w c"]) -> Float[Array, "... 2 w c"]:
-    """The light times complex numbers."""
-    return light * factor.real[..., None, :, :] + _turned(light) * factor.imag[..., None, :, :]
+class _Pair(NamedTuple):
+    """Complex numbers as two real arrays, for loops that the compiler can vectorise."""
+
+    real: Array
+    imaginary: Array
+
+    def times(self, other: "_Pair") -> "_Pair":
+        return _Pair(
+            self.real * other.real - self.imaginary * other.imaginary,
+            self.real * other.imaginary + self.imaginary * other.real,
+        )
+
+    def plus(self, other: "_Pair", factor: Array) -> "_Pair":
+        return _Pair(self.real + factor * other.real, self.imaginary + factor * other.imaginary)
+
+    def each(self, work: Callable[..., Array]) -> "_Pair":
+        return _Pair(work(self.real), work(self.imaginary))
+
+
+def _weighted(weights: Float[Array, "m ..."], values: Float[Array, "... w c"]) -> Float[Array, "m w c"]:
+    """Sum over pieces (or lines, or crossings) of values times each row of weights."""
+    rows, rest = weights.shape[0], values.shape[-2:]
+    product = jnp.dot(weights.reshape(rows, -1), values.reshape(-1, np.prod(rest)), precision=_PRECISION)
+    return product.reshape(rows, *rest)
 
 
 def _summed(weights: Float[Array, "m ..."], light: Float[Array, "... 2 w c"]) -> Float[Array, "m 2 w c"]:
-    """Sum over pieces (or lines, or crossings) of their light times each row of weights."""
+    """The same for both parts of light."""
     rows, rest = weights.shape[0], light.shape[-3:]
     product = jnp.dot(weights.reshape(rows, -1), light.reshape(-1, np.prod(rest)), precision=_PRECISION)
     return product.reshape(rows, *rest)
@@ -485,7 +507,7 @@ def _mask_states(
     state: Float[Array, "side side"],
     along_y: Cuts,
     along_x: Cuts,
-    mask: int,
+    mask: Int[Array, ""],
     bias: Float[Array, ""],
     kinds: range,
     plan: _Plan,
@@ -501,23 +523,18 @@ def _mask_states(
         kinds: the states along either axis.
         plan: for the width of the halo.
     """
+    cell, within = (np.array(part) for part in zip(*(divmod(kind, 2) for kind in kinds), strict=True))
 
-    def joined(first: Array, second: Array) -> Array:
-        return jnp.where(bias >= 0, jnp.maximum(first, second), jnp.minimum(first, second))
-
-    def seen(along: Cuts, kind: int) -> tuple[Array, Array]:
-        cell, within = divmod(kind, 2)
+    def seen(along: Cuts) -> tuple[Array, Array]:
         return plan.reach + along.low[mask, within] + cell, plan.reach + along.high[mask, within] + cell
 
-    def columns(first: Array) -> Array:
-        return jax.lax.dynamic_slice(state, (0, first), (state.shape[0], _TILE))
+    def joined(of: Array, pixels: tuple[Array, Array], axis: int) -> Array:
+        first, second = (jax.lax.dynamic_slice_in_dim(of, pixel, _TILE, axis) for pixel in pixels)
+        return jnp.where(bias >= 0, jnp.maximum(first, second), jnp.minimum(first, second))
 
-    across = jnp.stack([joined(*map(columns, seen(along_x, kind))) for kind in kinds])
-
-    def rows(first: Array) -> Array:
-        return jax.lax.dynamic_slice(across, (0, first, 0), (len(kinds), _TILE, _TILE))
-
-    return jnp.stack([joined(*map(rows, seen(along_y, kind))) for kind in kinds])
+    # Loops compile to copies of rows; side by side in one expression, every element would look for its piece.
+    across = jax.lax.map(lambda pixels: joined(state, pixels, 1), seen(along_x))
+    return jax.lax.map(lambda pixels: joined(across, pixels, 1), seen(along_y))
 
 
 def _walls(
@@ -564,8 +581,7 @@ def _walls(
 
 # Where the middle of the area between a square corner and its rounding lies, along each axis, in radii.
 _CORNER_MIDDLE = (1 / 2 - np.pi / 4 * (1 - 4 / (3 * np.pi))) / (1 - np.pi / 4)
-# Sides of a crossing (y, x) and lines that cross (first or second of the mask's along y, along x), 16 in all.
-_SIDE_Y, _SIDE_X, _LINE_Y, _LINE_X = np.indices((2, 2, 2, 2)).reshape(4, -1)
+_SIDE_Y, _SIDE_X = np.indices((2, 2)).reshape(2, -1)  # of a crossing: 0 below the line, 1 above
 
 
 def _corners(
@@ -588,49 +604,97 @@ def _corners(
     # Openings that touch at a corner: rounding takes from both what it gives to both gaps, unless the bias has clearly
     # joined or parted them.
     apart = jnp.clip(2 * jnp.abs(bias) / jnp.maximum(radius, 1e-6), 0.0, 1.0)
-    # Light gained where mask k's etch is missing (added), per wavelength: factor - 1.
-    full = -rates[:, None] * relief.depth_m[None, :]
-    there, back = cis(full) - 1.0, cis(-full) - 1.0
     shared = _shared_corners(along_y, along_x, bias, radius)
-    weights, gained, earlier = [], [], []
+    segments_x = along_x.state.shape[1]
+
+    def looked_at(mask_and_opening: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+        k, opening = mask_and_opening
+        crossing = _crossings(kinds[k], along_y, along_x, k, opening, bias[k], _CORNER_MIDDLE * radius)
+        amount = crossing.odd * jnp.where(crossing.touching, apart[k], 1.0)
+        return crossing.y, crossing.x, amount, light[crossing.row * segments_x + crossing.column]
+
+    # A loop, because its results exist: fused into what follows, they would be computed again for every colour.
+    masks, openings = np.indices((plan.masks, 2)).reshape(2, -1)
+    ys, xs, amounts, found = jax.lax.map(looked_at, (masks, openings > 0))
+    total, earlier = jnp.zeros(()), []
     for k in range(plan.masks):
-        y, piece_y, low_y, outer_y = _beside(along_y, k, _LINE_Y, _SIDE_Y, _CORNER_MIDDLE * radius)
-        x, piece_x, low_x, outer_x = _beside(along_x, k, _LINE_X, _SIDE_X, _CORNER_MIDDLE * radius)
-        own, other_y, other_x, far = (
-            kinds[k, low_y + (_SIDE_Y ^ dy), low_x + (_SIDE_X ^ dx)] for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
-        )
-        corners = [kinds[k, outer_y + dy, outer_x + dx] for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
-        touching = (corners[0] == corners[1]) & (corners[2] == corners[3]) & (corners[0] != corners[2])
-        odd = (own != other_y) & (own != other_x) & (own != far)
-        amount = odd * jnp.where(touching, apart[k], 1.0)
-        gain = jnp.where(own[:, None], back[None, :, k, None], there[None, :, k, None]) * amount[:, None]
-        changed = jnp.ones((), jnp.complex64)
+        # What the masks before this one change on each side, and with it the light that this one finds there.
+        changed = _Pair(jnp.ones(()), jnp.zeros(()))
         for other, before in enumerate(earlier):
-            changed = changed * (1 + shared[k, other] * before)
-        gained.append(_times(light[piece_y * along_x.state.shape[1] + piece_x], changed * gain))
-        values_y, values_x = axis_values(y, plan.parts), axis_values(x, plan.parts)
-        weights.append(point_moments(values_y, values_x))
-        # All crossings of one side together: a cell has a corner of this mask on that side at one of them.
-        per_side = gain.reshape(4, 4, *gain.shape[1:]).sum(1) / jnp.maximum(odd.reshape(4, 4, 1, -1).sum(1), 1)
-        earlier.append(jnp.repeat(per_side, 4, axis=0))
-    return (1 - np.pi / 4) * radius**2 * _summed(jnp.concatenate(weights, axis=1), jnp.concatenate(gained))
+            changed = changed.plus(changed.times(before), shared[k, other])
+        gains = []
+        for opening in range(2):
+            at = 2 * k + opening
+            # Light gained where this mask's etch is missing from an opening, or added to a gap: factor - 1.
+            phase = 2 * jnp.pi * (2 * opening - 1) * rates * relief.depth_m[k]
+            gain = _Pair(jnp.cos(phase) - 1, jnp.sin(phase)).each(
+                lambda part, a=amounts[at]: part[:, None] * a[:, None]
+            )
+            gained = changed.times(gain).times(_Pair(found[at, :, 0], found[at, :, 1]))
+            points = point_moments(axis_values(ys[at], plan.parts), axis_values(xs[at], plan.parts))
+            total = total + jnp.stack([_weighted(points, gained.real), _weighted(points, gained.imaginary)], axis=1)
+            gains.append(gain)
+        # On one side a cell has an odd opening or an odd gap of this mask, not both.
+        earlier.append(gains[0].plus(gains[1], jnp.ones(())))
+    return (1 - np.pi / 4) * radius**2 * total
+
+
+class _Crossings(NamedTuple):
+    """The crossings of a mask's lines seen from each of four sides, in the cells where those sides lie.
+
+    Attributes:
+        y: `[side]` middle of the area that rounding changes, in cells.
+        x: the same along x.
+        row: `[side]` segment there along y.
+        column: the same along x.
+        odd: `[side, cell]` whether the mask is open there (closed, for gaps) and not on the other three sides.
+        touching: `[side, cell]` whether two openings touch here at their corners.
+    """
+
+    y: Array
+    x: Array
+    row: Array
+    column: Array
+    odd: Array
+    touching: Array
+
+
+def _crossings(
+    kinds: Bool[Array, "j i c"], along_y: Cuts, along_x: Cuts, mask: Array, opening: Array, bias: Array, step: Array
+) -> _Crossings:
+    """Crossings where an odd opening (or an odd gap) may lie."""
+    y, row, low_y, outer_y = _beside(along_y, mask, _SIDE_Y, opening, bias, step)
+    x, column, low_x, outer_x = _beside(along_x, mask, _SIDE_X, opening, bias, step)
+    own, other_y, other_x, far = (
+        kinds[low_y + (_SIDE_Y ^ dy), low_x + (_SIDE_X ^ dx)] for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
+    )
+    corners = [kinds[outer_y + dy, outer_x + dx] for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
+    touching = (corners[0] == corners[1]) & (corners[2] == corners[3]) & (corners[0] != corners[2])
+    odd = (own == opening) & (own != other_y) & (own != other_x) & (own != far)
+    return _Crossings(y, x, row, column, odd, touching)
 
 
 def _beside(
-    along: Cuts, mask: int, line: Int[np.ndarray, " q"], side: Int[np.ndarray, " q"], step: Array
+    along: Cuts, mask: Array, side: Int[np.ndarray, " side"], opening: Array, bias: Array, step: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Points `step` beside a mask's lines (side 0 below, 1 above), in the cells where they lie.
+    """Points `step` to one side of a mask's lines, in the cells where they lie.
+
+    An opening above its line (or a gap below it) begins at shift - bias, all others at shift + bias.
 
     Returns:
         their places in those cells, the segments there, and the entries of `_STATES` of the mask below each line and
         below both lines.
     """
-    at = along.edges[1 + along.line[mask]][line] + (2 * side - 1) * step
+    upper = (side != opening) ^ (bias < 0)
+    rank = along.line[mask]
+    line = jnp.where(upper, rank[1], rank[0])
+    second = (line == rank.max()).astype(jnp.int32)
+    at = along.edges[1 + line] + (2 * side - 1) * step
     cell = jnp.floor(at).astype(jnp.int32)
     at = at - cell
     segment = jnp.clip(jnp.searchsorted(along.edges, at, side="right") - 1, 0, along.state.shape[1] - 1)
     below_both = -2 * cell - _STATES[0]
-    return at, segment, below_both + line, below_both
+    return at, segment, below_both + second, below_both
 
 
 def _shared_corners(along_y: Cuts, along_x: Cuts, bias: Array, radius: Array) -> Float[Array, "mask mask"]:
@@ -654,19 +718,21 @@ def _strip_values(moments: Float[Array, "tile moment 2 w t t"], plan: _Plan) -> 
     # [degree, 2, w, (row, part), (tile, column, part)]
     moments = jnp.transpose(moments, (3, 4, 5, 6, 1, 0, 7, 2))
     values = moments.reshape(len(DEGREES), 2, lines, _TILE * parts, count * _TILE * parts)
-    values = jax.lax.complex(values[:, 0], values[:, 1])
-    if not plan.cut:
-        return jnp.pad(values[0], ((0, 0), (reach, reach), (0, 0)))
-    first, second = (moment_filter(q, plan.band) for q in (1, 2))
-    of = dict(zip(DEGREES, values, strict=True))
-    even = of[0, 0] + _filtered(of[0, 1], first, 2) + _filtered(of[0, 2], second, 2)
-    odd = of[1, 0] + _filtered(of[1, 1], first, 2)
+    values = values.reshape(len(DEGREES), 2 * lines, *values.shape[-2:])
     spill = ((0, 0), (reach, reach), (0, 0))
-    wide = _filtered(jnp.pad(odd, spill), first, 1) + _filtered(jnp.pad(of[2, 0], spill), second, 1)
-    return jnp.pad(even, spill) + wide
+    if not plan.cut:
+        total = jnp.pad(values[0], spill)
+    else:
+        first, second = (moment_filter(q, plan.band) for q in (1, 2))
+        of = dict(zip(DEGREES, values, strict=True))
+        even = of[0, 0] + _filtered(of[0, 1], first, 2) + _filtered(of[0, 2], second, 2)
+        odd = of[1, 0] + _filtered(of[1, 1], first, 2)
+        wide = _filtered(jnp.pad(odd, spill), first, 1) + _filtered(jnp.pad(of[2, 0], spill), second, 1)
+        total = jnp.pad(even, spill) + wide
+    return jax.lax.complex(*total.reshape(2, lines, *total.shape[1:]))
 
 
-def _filtered(values: Complex[Array, "w v u"], weights: Float[np.ndarray, " tap"], axis: int) -> Array:
+def _filtered(values: Float[Array, "n v u"], weights: Float[np.ndarray, " tap"], axis: int) -> Float[Array, "n v u"]:
     """Convolution along an axis; beyond the ends there is nothing."""
     reach, size = len(weights) // 2, values.shape[axis]
     padded = jnp.pad(values, [(reach, reach) if a == axis else (0, 0) for a in range(values.ndim)])

@@ -1,0 +1,204 @@
+"""Frames of a camera: one exposure as its file holds it, with what the file says about its pixels.
+
+OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit grey PNG, and camera RAW by way of rawpy (the
+extra `raw`). Eight bits are refused unless asked for: two of a PSF's five decades. Of a RAW mosaic the pixels of one
+colour are taken as they lie; the others are marked as not valid, nothing is interpolated. The first row of a picture is
+its top, so rows are turned over; arrays here have row 0 at the lowest y.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Num
+
+from fab.errors import InputError
+from fab.files import explain_os_error
+
+Channel = Literal["red", "green", "blue"]
+
+FRAME_FILES = (".exr", ".tif", ".tiff", ".png")
+RAW_FILES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+
+_MOST_PIXELS = 1 << 28
+_CHANNELS = ("red", "green", "blue")
+_CURE = "Write the file again from its source."
+
+
+class Frame(NamedTuple):
+    """One exposure as its file holds it.
+
+    Attributes:
+        counts: `[y, x]` values, row 0 at the lowest y.
+        valid: `[y, x]` pixels that carry the chosen colour.
+        clipped_at: value at which the file says its pixels are full; None if it does not say.
+        black: value that the file gives to no light at all.
+        step: smallest difference of two values; 0 for floats.
+    """
+
+    counts: Float[np.ndarray, "y x"]
+    valid: Bool[np.ndarray, "y x"]
+    clipped_at: float | None = None
+    black: float = 0.0
+    step: float = 0.0
+
+
+def read_frame(
+    path: str | Path, *, channel: Channel | None = None, pixel_m: float | None = None, allow_8bit: bool = False
+) -> Frame:
+    """Read one exposure.
+
+    Args:
+        path: the file, one of `FRAME_FILES` or `RAW_FILES`.
+        channel: which colour to take of a picture in colour, or of a RAW mosaic.
+        pixel_m: pixel pitch, metres; checked against an EXR file that knows its own.
+        allow_8bit: take files of 8 bits per pixel.
+
+    Raises:
+        InputError: the file is missing, of another kind, broken, of too few bits, in colours where no channel is named,
+            or holds values that are not finite; or rawpy is not installed.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in FRAME_FILES + RAW_FILES:
+        kinds = ", ".join(FRAME_FILES + RAW_FILES)
+        raise InputError(str(path), f"an image must be one of {kinds}", suffix or "no suffix", "Convert it first.")
+    if suffix == ".exr":
+        return _read_exr(path, channel, pixel_m)
+    reader = {".png": _read_png}.get(suffix, _read_tiff if suffix in FRAME_FILES else _read_raw)
+    frame = _guarded(path, lambda: reader(path, channel, allow_8bit))
+    if not np.isfinite(frame.counts).all():
+        raise InputError(str(path), "every pixel must be finite", "NaN or infinity", _CURE)
+    return frame
+
+
+def _guarded(path: Path, read: Callable[[], Frame]) -> Frame:
+    try:
+        return read()
+    except InputError:
+        raise
+    except OSError as error:
+        if error.errno is None:
+            raise InputError(str(path), "the file must be whole and of its kind", str(error), _CURE) from error
+        raise explain_os_error(error, path) from error
+    # The libraries raise what they like on a damaged file; all of it means the same to the user.
+    except Exception as error:
+        got = str(error) or type(error).__name__
+        raise InputError(str(path), "the file must be whole and hold one image", got, _CURE) from error
+
+
+def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> Frame:
+    from sim.store import read_bank
+
+    # Of a foreign file only the values are wanted; its pitch is whatever was given.
+    bank = read_bank(path, pixel_m or 1.0)
+    if len(bank.depths_m) > 1:
+        rule = "a measured PSF must hold one depth"
+        raise InputError(str(path), rule, f"a bank of {len(bank.depths_m)}", "Give one file per depth.")
+    counts = bank.energy[:, 0]
+    if len(counts) > 1:
+        if bank.colours != ("R", "G", "B"):
+            got = f"the colours {', '.join(bank.colours)}"
+            raise InputError(str(path), "a measured PSF must have one colour, or red, green, blue", got, "Keep one.")
+        counts = counts[[_CHANNELS.index(_named(path, channel))]]
+    return _frame(counts[0], clipped_at=None)
+
+
+def _read_tiff(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        if len(file.pages) != 1 or len(page.shape) not in (2, 3) or not 0 < np.prod(page.shape) <= _MOST_PIXELS:
+            got = f"{len(file.pages)} pages of shape {page.shape}"
+            raise InputError(str(path), "the file must hold one image", got, "Give one file per exposure.")
+        values = page.asarray()
+    if values.ndim == 3:
+        if values.shape[2] != 3:
+            raise InputError(str(path), "an image must be grey or RGB", f"shape {values.shape}", "Keep one channel.")
+        values = values[:, :, _CHANNELS.index(_named(path, channel))]
+    return _frame(_deep_enough(path, values, allow_8bit)[::-1])
+
+
+def _read_png(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+    from PIL import Image
+
+    with Image.open(path, formats=["PNG"]) as image:
+        image.verify()  # reading the pixels skips their checksum
+    with Image.open(path, formats=["PNG"]) as image:
+        if image.mode not in ("L", "I;16", "I;16B", "I"):
+            got = f"colours (mode {image.mode})"
+            raise InputError(str(path), "a PNG must be grey", got, "Save a TIFF, which keeps 16 bits of each colour.")
+        values = np.asarray(image)
+    # 16 bits come as 32 where the library has no such mode.
+    narrow = values.astype(np.uint16) if values.dtype == np.int32 else values
+    return _frame(_deep_enough(path, narrow, allow_8bit)[::-1])
+
+
+def _read_raw(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+    try:
+        import rawpy
+    except ImportError as error:
+        cure = "pip install 'doedesign[raw]', or convert the file to 16-bit TIFF without any processing."
+        raise InputError(str(path), "camera RAW needs rawpy", "no such package", cure) from error
+    path.stat()  # a missing file in the system's own words
+    with rawpy.imread(str(path)) as raw:
+        counts = np.array(raw.raw_image_visible)
+        colours = np.array(raw.raw_colors_visible)
+        names = raw.color_desc.decode()
+        mosaic = len(set(names[: raw.num_colors])) > 1 and int(colours.max()) > 0
+        black, white = float(np.mean(raw.black_level_per_channel)), float(raw.white_level)
+    if counts.ndim != 2 or not 0 < counts.size <= _MOST_PIXELS:
+        raise InputError(str(path), "a RAW image must hold one value per pixel", counts.shape, "Give the sensor's own.")
+    valid = np.ones(counts.shape, bool)
+    if mosaic:
+        letter = _named(path, channel)[0].upper()
+        valid = np.isin(colours, [i for i, name in enumerate(names) if name == letter])
+    return _frame(counts[::-1], valid[::-1], clipped_at=white, black=black)
+
+
+def _named(path: Path, channel: Channel | None) -> Channel:
+    if channel is None:
+        rule = "of a picture in colour one channel must be chosen"
+        raise InputError(str(path), rule, "none", 'Set channel = "green", the one that sees the probe.')
+    return channel
+
+
+def _deep_enough(path: Path, values: Num[np.ndarray, "y x"], allow_8bit: bool) -> Num[np.ndarray, "y x"]:
+    if values.dtype.kind not in "fu":
+        raise InputError(str(path), "pixels must be counts or floats", values.dtype, "Save 16-bit counts.")
+    if values.dtype.itemsize == 1 and not allow_8bit:
+        cure = "Save 16 bits; or set allow_8bit = true and expect little."
+        raise InputError(str(path), "a measured PSF needs 16 bits per pixel", "8 bits", cure)
+    return values
+
+
+def _frame(
+    values: Num[np.ndarray, "y x"],
+    valid: Bool[np.ndarray, "y x"] | None = None,
+    clipped_at: float | None = None,
+    black: float = 0.0,
+) -> Frame:
+    step = 0.0
+    if values.dtype.kind == "u":
+        # Converters of 12 bits often fill the upper bits of 16.
+        step = float(np.gcd.reduce(np.unique(values)) or 1)
+        clipped_at = clipped_at or _implied_clip(values, valid)
+    counts = np.ascontiguousarray(values, dtype=np.float32)
+    return Frame(counts, np.ones(counts.shape, bool) if valid is None else valid, clipped_at, black, step)
+
+
+def _implied_clip(values: Num[np.ndarray, "y x"], valid: Bool[np.ndarray, "y x"] | None) -> float:
+    """Value at which unsigned counts are full: that of their type, or of a converter with fewer bits if many are there.
+
+    A dozen pixels at exactly 4095, or at 4095 x 16, are no accident.
+    """
+    full = float(np.iinfo(values.dtype).max)
+    highest = int(values.max())
+    bits = highest >> ((highest & -highest).bit_length() - 1) if highest else 0
+    if bits.bit_length() >= 8 and bits & (bits + 1) == 0:
+        used = values if valid is None else values[valid]
+        if np.count_nonzero(used == highest) >= 12:
+            return float(highest)
+    return full

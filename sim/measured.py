@@ -1,0 +1,260 @@
+"""Measured PSFs: from the frames of a camera to one image with known noise.
+
+A lab photographs a point source through the plate: several exposures, each with a dark frame. Here the frames
+(`sim.frames`) are freed of their dark level, merged to one image of high dynamic range, freed of the background, and
+cut to a window round the light. Nothing is ever interpolated: the window moves by whole pixels, what remains of the
+offset is told, and the model moves instead. Pixels that say nothing (saturated in every exposure, another colour of a
+mosaic, beyond the frame's edge) stay, marked as not valid.
+
+Noise. A pixel of one exposure has the variance read² + dark's + step² / 12 + signal / gain, in counts². Exposures are
+weighted by its inverse, taken from a first estimate of the signal, so the merged variance is `floor + slope * signal`
+with known coefficients, whatever the signal is thought to be; a fit can use its model's.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import gaussian_filter
+
+from fab.errors import InputError
+from sim.frames import Frame
+
+_BORDER = 0.05  # of the shorter side: where a frame should hold background alone
+_SEARCH = 1024  # samples per side on which the light is looked for
+
+
+class Noise(NamedTuple):
+    """What a pixel adds by itself.
+
+    Attributes:
+        gain_e: electrons per count.
+        read_e: electrons, standard deviation of a reading.
+    """
+
+    gain_e: float
+    read_e: float
+
+
+class MeasuredPsf(NamedTuple):
+    """A merged image.
+
+    Attributes:
+        rate: `[y, x]` counts per unit of exposure.
+        floor: variance of `rate` without light.
+        slope: variance of `rate` per unit of light.
+        valid: pixels that say something.
+    """
+
+    rate: Float[np.ndarray, "y x"]
+    floor: Float[np.ndarray, "y x"]
+    slope: Float[np.ndarray, "y x"]
+    valid: Bool[np.ndarray, "y x"]
+
+    def variance(self, signal: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+        """Variance of `rate` where the light is `signal`; what is below zero is no light."""
+        return self.floor + self.slope * np.maximum(signal, 0.0)
+
+
+def merge_exposures(
+    frames: Sequence[Frame],
+    exposures: Sequence[float],
+    darks: Sequence[Frame | float],
+    noise: Noise,
+    *,
+    clipped_at: float | None = None,
+    dark_count: int = 1,
+    names: Sequence[str] = (),
+) -> MeasuredPsf:
+    """Merge exposures of the same scene into one image per unit of exposure.
+
+    Args:
+        frames: exposures of equal shape.
+        exposures: how long each was, in any unit.
+        darks: for each a frame without light of the same length, or the level of black in counts.
+        noise: gain and read noise.
+        clipped_at: value from which a pixel is full; by default what each file says.
+        dark_count: frames that every dark frame is the mean of.
+        names: what the frames are called in messages.
+
+    Raises:
+        InputError: frames of different shapes, an exposure that is not positive, a dark frame brighter than its image,
+            or an image that is saturated everywhere.
+    """
+    names = tuple(names) or tuple(f"image {i}" for i in range(len(frames)))
+    shape = frames[0].counts.shape
+    lights, floors, usable = [], [], []
+    for frame, exposure, dark, name in zip(frames, exposures, darks, names, strict=True):
+        if frame.counts.shape != shape:
+            got = f"{frame.counts.shape} against {shape}"
+            raise InputError(
+                name, "all exposures of an image must have the same size", got, "Give frames of one camera."
+            )
+        if not 0 < exposure < np.inf:
+            raise InputError(name, "an exposure must be positive", exposure, "Give its length.")
+        light, floor = _without_dark(frame, dark, noise, dark_count, name)
+        lights.append(light)
+        floors.append(floor)
+        top = frame.clipped_at if clipped_at is None else clipped_at
+        usable.append(frame.valid if top is None else np.logical_and(frame.valid, frame.counts < top - frame.step / 2))
+    times = np.asarray(exposures, np.float64)[:, None, None]
+    used = np.stack(usable)
+    valid = used.any(axis=0)
+    if valid.sum() < 0.01 * sum(frame.valid.sum() for frame in frames) / len(frames):
+        raise InputError(names[int(np.argmin(exposures))], "some pixels must not be saturated", "hardly any", _SHORTER)
+    return _merged(np.stack(lights), np.stack(floors), used, times, noise.gain_e)._replace(valid=valid)
+
+
+_SHORTER = "Add a shorter exposure, or check `saturation`."
+
+
+def _without_dark(
+    frame: Frame, dark: Frame | float, noise: Noise, dark_count: int, name: str
+) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
+    """Counts above black, and their variance without light."""
+    read = (noise.read_e / noise.gain_e) ** 2 + frame.step**2 / 12
+    if isinstance(dark, float | int):
+        light = frame.counts.astype(np.float64) - dark
+        floor = np.full(light.shape, read)
+    else:
+        if dark.counts.shape != frame.counts.shape:
+            got = f"{dark.counts.shape} against {frame.counts.shape}"
+            raise InputError(name, "a dark frame must have its image's size", got, "Take it with the same settings.")
+        light = frame.counts.astype(np.float64) - dark.counts
+        # Electrons that heat sets free are as noisy as those of light; where a dark frame is bright, both frames are.
+        heat = np.maximum(dark.counts - np.median(dark.counts[frame.valid]), 0) / noise.gain_e
+        floor = (read + heat) * (1 + 1 / dark_count)
+    if not light[frame.valid].mean() > 0:
+        got = f"a mean of {light[frame.valid].mean():.4g} counts above dark"
+        raise InputError(name, "an image must be brighter than its dark frame", got, "Check which is which.")
+    return light, floor
+
+
+def _merged(
+    light: Float[np.ndarray, "n y x"],
+    floor: Float[np.ndarray, "n y x"],
+    used: Bool[np.ndarray, "n y x"],
+    times: Float[np.ndarray, "n 1 1"],
+    gain_e: float,
+) -> MeasuredPsf:
+    """Mean of the rates, weighted by their inverse variance; zero where nothing is usable."""
+    total = np.maximum((used * times).sum(axis=0), np.finfo(float).tiny)
+    first = np.maximum((used * light).sum(axis=0) / total, 0.0)
+    weight = used * times**2 / (floor + first * times / gain_e)
+    share = weight / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
+    return MeasuredPsf(
+        rate=(share * light / times).sum(axis=0),
+        floor=(share**2 * floor / times**2).sum(axis=0),
+        slope=(share**2 / (times * gain_e)).sum(axis=0),
+        valid=np.asarray(used.any(axis=0)),
+    )
+
+
+def without_background(psf: MeasuredPsf) -> tuple[MeasuredPsf, float]:
+    """Take off the level of the frame's border, and return it.
+
+    A mean over the outer twentieth of the frame without outliers. Where the PSF reaches the border this takes light
+    away, too: a fit should leave an offset free.
+    """
+    rows, columns = psf.rate.shape
+    wide = max(2, round(_BORDER * min(rows, columns)))
+    border = psf.valid.copy()
+    border[wide : rows - wide, wide : columns - wide] = False
+    values = psf.rate[border if border.any() else psf.valid]
+    middle = np.median(values)
+    spread = 1.4826 * np.median(np.abs(values - middle))
+    level = float(values[np.abs(values - middle) <= max(3 * spread, np.finfo(float).tiny)].mean())
+    # Its light is gone, its noise is not.
+    return psf._replace(rate=psf.rate - level, floor=psf.floor + psf.slope * max(level, 0.0)), level
+
+
+def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
+    """Where the point about which the light is most symmetric lies: row and column, pixel centres at whole numbers.
+
+    The peak of the image's convolution with itself, of the root of the intensity so that disc and ring count
+    beside a bright spot. Good to a few pixels of a large frame; a comparison with the model does the rest.
+
+    Raises:
+        InputError: no light above the noise.
+    """
+    factor = max(1, -(-max(psf.rate.shape) // _SEARCH))
+    share = _sums(psf.valid.astype(np.float64), factor)
+    light, floor = (_sums(np.where(psf.valid, values, 0.0), factor) for values in (psf.rate, psf.floor))
+    # Pixels of another colour lie among their neighbours; where whole regions are full, the light is brightest.
+    seen = gaussian_filter(share, 1.5)
+    dense = seen > 0.02 * factor**2
+    smooth = np.where(dense, gaussian_filter(light, 1.5) / np.maximum(seen, 1e-3), psf.rate[psf.valid].max())
+    # That filter leaves a fifth of white noise.
+    quiet = np.sqrt(np.median(floor[share > 0] / share[share > 0] ** 2)) / 5
+    clear = np.sqrt(np.where(smooth > 6 * quiet, np.maximum(smooth, 0.0), 0.0))
+    if not clear.any():
+        raise InputError("image", "there must be light above the noise", "none", "Expose longer, or check the files.")
+    size = tuple(cast(int, next_fast_len(2 * count, real=True)) for count in clear.shape)
+    folded = np.asarray(irfft2(np.square(np.asarray(rfft2(clear, size))), size))
+    top, left = (int(i) for i in np.unravel_index(np.argmax(folded), size))
+    peak = (top + _vertex(folded[:, left], top), left + _vertex(folded[top], left))
+    # A bin's middle lies (factor - 1) / 2 pixels beyond its first one.
+    row, column = (factor * place / 2 + (factor - 1) / 2 for place in peak)
+    return row, column
+
+
+def _sums(values: Float[np.ndarray, "y x"], factor: int) -> Float[np.ndarray, "v u"]:
+    """Sums over squares of `factor` pixels; the last ones are filled up with zeros."""
+    padded = np.pad(values, [(0, -size % factor) for size in values.shape])
+    rows, columns = (size // factor for size in padded.shape)
+    return padded.reshape(rows, factor, columns, factor).sum(axis=(1, 3))
+
+
+def _vertex(values: Float[np.ndarray, " n"], at: int) -> float:
+    """Where between its neighbours the parabola through a peak has its vertex."""
+    low, peak, high = values[at - 1], values[at], values[(at + 1) % len(values)]
+    bend = low - 2 * peak + high
+    return float((low - high) / (2 * bend)) if bend < 0 else 0.0
+
+
+def cut_window(psf: MeasuredPsf, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
+    """Cut a square of whole pixels whose middle is nearest to a point.
+
+    Args:
+        psf: the image.
+        centre: row and column of the point, pixel centres at whole numbers.
+        window: pixels per side.
+
+    Returns:
+        the square, pixels beyond the frame not valid, and where in it the point lies: pixels from its middle (y, x).
+
+    Raises:
+        InputError: the frame is smaller than the window.
+    """
+    if min(psf.rate.shape) < window:
+        rule = f"an image must have at least the window's {window} pixels per side"
+        raise InputError("image", rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
+    corner = [place - (window - 1) / 2 for place in centre]
+    starts = [round(place) for place in corner]
+    cut = MeasuredPsf(*(_square(values, starts, window) for values in psf))
+    return cut, (corner[0] - starts[0], corner[1] - starts[1])
+
+
+def _square(values: Any, starts: Sequence[int], window: int) -> Any:
+    out = np.zeros((window, window), values.dtype)
+    spans = [(max(start, 0), min(start + window, size)) for start, size in zip(starts, values.shape, strict=True)]
+    if all(low < high for low, high in spans):
+        (y0, y1), (x0, x1) = spans
+        out[y0 - starts[0] : y1 - starts[0], x0 - starts[1] : x1 - starts[1]] = values[y0:y1, x0:x1]
+    return out
+
+
+def binned(psf: MeasuredPsf, factor: int) -> MeasuredPsf:
+    """Add squares of `factor` x `factor` pixels; one that lacks a pixel is not valid.
+
+    Raises:
+        ValueError: the sides are no multiple of `factor`.
+    """
+    if any(size % factor for size in psf.rate.shape):
+        raise ValueError(f"the sides must be multiples of {factor}, but the shape is {psf.rate.shape}")
+    whole = _sums((~psf.valid).astype(np.float64), factor) == 0
+    rate, floor, slope = (_sums(values, factor) for values in psf[:3])
+    # Variances add; a shot-noise slope applies to the sum of signals.
+    return MeasuredPsf(rate, floor, slope / factor**2, whole)
