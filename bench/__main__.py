@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-TABLES = ("bench.psf", "bench.step", "bench.masks")
+TABLES = ("bench.psf", "bench.step", "bench.masks", "bench.plate")
 
 
 def main() -> int:

@@ -1,12 +1,15 @@
 """From a spec to the values the physics works on. The only file that knows both."""
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from doedesign.spec import DefectsSpec, ProcessSpec, Spec, process_from_json
+from doedesign.spec import DefectsSpec, ProcessSpec, Spec, load_process, process_from_json
+from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import ERRORS, Defects, Process, Spread, error_names
+from fab.units import format_length
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -55,6 +58,20 @@ def process_of(spec: ProcessSpec) -> Process:
         name=spec.stock or ("custom" if spreads or any(defects[key] for key in _EVENTS) else "ideal"),
         **{key: getattr(full, key) for key in _SHARED},
     )
+
+
+def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> Process:
+    """The process of a design: that of a file where one is given, else that of its spec.
+
+    Raises:
+        InputError: the file cannot be read, or is for another staircase.
+    """
+    made = process_of(spec if file is None else load_process(file))
+    if (made.levels.count, made.levels.step_m) != (levels.count, levels.step_m):
+        rule = f"must be for {levels.count} levels of {format_length(levels.step_m)}"
+        got = f"{made.levels.count} of {format_length(made.levels.step_m)}"
+        raise InputError(str(file or "process"), rule, got, "Give a process for this design.")
+    return made
 
 
 def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Spread]]:

@@ -103,8 +103,8 @@ def masks(
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
     """
-    from doedesign.drawing import level_map_from
     from doedesign.commands.masks import write_masks
+    from doedesign.drawing import level_map_from
 
     drawing = level_map_from(
         source,
@@ -143,16 +143,41 @@ def psf(
     masks: Path | None = None,
     depths: tuple[str, ...] = (),
     field_deg: tuple[float, float] = (0.0, 0.0),
+    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    process: Path | None = None,
+    variation: Path | None = None,
+    seed: int | None = None,
+    draw: str = "normal/0",
     json_: AsJson = False,
 ) -> None:
     """Compute PSF banks and pictures of the continuous, the quantised and the drawn design.
+
+    With --fabricated, those of one plate as the process makes it: with the errors of --variation, those of --seed, or
+    each at its mean.
 
     Args:
         run: Run folder.
         masks: Its mask order; masks/NAME by default.
         depths: Source depths, such as "5 cm" or inf; the spec's by default.
         field_deg: Field angles along y and x in degrees.
+        fabricated: Predict a plate as fabricated, into RUN/fabricated.
+        process: TOML file with a [process] table; the run's own by default.
+        variation: TOML file with the errors of the plate.
+        seed: Draw the errors of the plate from the process.
+        draw: Which draw of the seed, as in a tolerance study.
     """
+    if fabricated:
+        if depths or any(field_deg):
+            option = "--depths" if depths else "--field-deg"
+            cure = "Leave it out; the depths are those of the spec, on the axis."
+            raise InputError(option, "does not go with --fabricated", "a value", cure)
+        from doedesign.commands.fabricated import fabricated as predict
+
+        folder = predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, say=_say)
+        _print_paths([folder, *sorted(folder.iterdir())], json_)
+        return
+    if process is not None or variation is not None or seed is not None:
+        raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
     from math import inf, radians
 
     from doedesign.commands.psf import psf as work

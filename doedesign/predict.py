@@ -106,9 +106,10 @@ def plate_rows(drawn: Drawn, surface: Surface, bank: PsfBank) -> list[dict[str, 
     Returns:
         rows with `colour`, `depth_m` (None for infinity), `zeroth_order` |<t>|^2, `strehl` (overlap with the field the
         design means to make), `throughput` (energy in the sensor window per unit incident on the clear aperture,
-        Fresnel loss included), `outside_window` (transmitted, but scattered beyond the window or between light-sensitive
-        squares), `chrome` (change of the transmitted power by chrome that is not where it should be), and for near
-        depths `ring_to_disc`, for far ones `far_spot`. The zeroth order and the Strehl ratio do not depend on depth.
+        Fresnel loss included), `outside_window` (transmitted, but scattered beyond the window or between
+        light-sensitive squares), `chrome` (change of the transmitted power by chrome that is not where it should be),
+        and for near depths `ring_to_disc`, for far ones `far_spot`. The zeroth order and the Strehl ratio do not depend
+        on depth.
     """
     camera = drawn.camera
     lines = surface.wavelengths_m

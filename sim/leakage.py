@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.psf import plan_propagation
+from sim.psf import pixel_energy, plan_propagation
 from sim.pupil import SurfaceRows, surface_pupil
 from sim.surface import Surface
 
@@ -47,23 +47,30 @@ def strehl(surface: Surface, nominal: Surface) -> Float[np.ndarray, " w"]:
 
 
 class SplitPsf(NamedTuple):
-    """One PSF by origin, energies per pixel; leaked + diffracted + interference is the plate's PSF.
+    """One PSF by origin, energies per pixel.
 
     Attributes:
+        total: of the plate.
         leaked: of the 0th order alone: |c0|^2 times the PSF of the bare lens.
         diffracted: of everything else.
-        interference: twice the real part of one field times the other's conjugate; its sum over an unbounded sensor
-            is zero.
     """
 
+    total: Float[np.ndarray, "y x"]
     leaked: Float[np.ndarray, "y x"]
     diffracted: Float[np.ndarray, "y x"]
-    interference: Float[np.ndarray, "y x"]
 
     @property
-    def total(self) -> Float[np.ndarray, "y x"]:
-        """PSF of the plate."""
-        return self.leaked + self.diffracted + self.interference
+    def interference(self) -> Float[np.ndarray, "y x"]:
+        """Twice the real part of one field times the other's conjugate; over an unbounded sensor it sums to zero."""
+        return self.total - self.leaked - self.diffracted
+
+    def excess(self) -> float:
+        """How far interference goes beyond what two fields can do, 2 sqrt(leaked diffracted), per brightest pixel.
+
+        Zero up to rounding, or the three do not belong together.
+        """
+        most = 2 * np.sqrt(np.maximum(self.leaked, 0) * np.maximum(self.diffracted, 0))
+        return float(np.max(np.abs(self.interference) - most) / np.max(self.total))
 
 
 def split_psf(camera: Camera, surface: Surface, colour: Colour, depth_m: float) -> SplitPsf:
@@ -77,21 +84,19 @@ def split_psf(camera: Camera, surface: Surface, colour: Colour, depth_m: float) 
 
     Returns:
         energies per unit power incident on the clear aperture, Fresnel loss included. The three transforms are taken
-        independently of each other: that they fit is a check, not an assumption.
+        independently of each other: that they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
     own = replace(camera, grid=surface.grid)
     path = source_path_m(own, depth_m)
     means = mean_transmission(surface)
-    parts = np.zeros((3, camera.window, camera.window))
+    parts = np.zeros((3, camera.window, camera.window), np.float32)
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
         plan = plan_propagation(own, wavelength, depth_m)
         source = jnp.asarray(wrapped_waves(path, wavelength))
         mean = jnp.complex64(means[surface.wavelengths_m.index(wavelength)])
         whole = surface.at(wavelength)
-        fields = (jnp.full_like(whole, mean), whole - mean, whole)
         factor = weight * camera.transmission(wavelength)
-        for i, field in enumerate(fields):
+        for i, field in enumerate((whole, jnp.full_like(whole, mean), whole - mean)):
             rows = SurfaceRows(field, source, surface.coverage)
-            parts[i] += factor * np.asarray(plan.energy(surface_pupil, rows, None))
-    leaked, diffracted, total = parts
-    return SplitPsf(leaked, diffracted, total - leaked - diffracted)
+            parts[i] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
+    return SplitPsf(*parts)

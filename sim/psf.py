@@ -57,7 +57,8 @@ def plan_propagation(
 
 
 @eqx.filter_jit
-def _energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
+def pixel_energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
+    """`plan.energy`, compiled once per shape."""
     return plan.energy(pupil, rows, shared)
 
 
@@ -105,7 +106,7 @@ def psf_bank(
             plan = plan_propagation(camera, wavelength, depth, propagation, sampling)
             rate = jnp.float32(camera.waves_per_metre(wavelength, field_rad))
             rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
-            energy[c, d] += factor * np.asarray(_energy(plan, phase_pupil, rows, rate))
+            energy[c, d] += factor * np.asarray(pixel_energy(plan, phase_pupil, rows, rate))
             on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
 
@@ -140,7 +141,7 @@ def surface_bank(
                 source = jnp.asarray(wrapped_waves(path, wavelength))
                 rows = SurfaceRows(surface.at(wavelength), source, surface.coverage)
                 factor = weight * camera.transmission(wavelength)
-                energy[c, d] += factor * np.asarray(_energy(plan, surface_pupil, rows, None))
+                energy[c, d] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
                 on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
 

@@ -31,6 +31,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int, UInt8
 
 from fab.errors import InputError
@@ -161,7 +162,7 @@ def as_fabricated(
     """
     levels = process.levels
     lines = wavelengths_m or tuple(dict.fromkeys(w for c in camera.colours for w in c.wavelengths_m))
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(variation))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(variation))
     rates = jnp.asarray([camera.waves_per_metre(w) for w in lines], jnp.float32)
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))

@@ -82,7 +82,7 @@ def psf(
     near, far = _near_and_far(run.spec, depths_m)
     designs = designs_of(run, masks, say)
     total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
-    _require_own(run.path("psf"))
+    require_own(run.path("psf"))
     with alone_in(run.folder), atomic_folder(run.path("psf")) as fresh:
         with meter("PSFs", total) as progress:
             done = count(1)
@@ -108,7 +108,7 @@ def _near_and_far(spec: Spec, depths_m: Sequence[float]) -> tuple[tuple[float, .
     return near, far
 
 
-def _require_own(folder: Path) -> None:
+def require_own(folder: Path) -> None:
     """Refuse to replace a folder that holds more than an earlier call wrote."""
     if (folder / MANIFEST_NAME).is_file():
         listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}

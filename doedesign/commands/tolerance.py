@@ -18,9 +18,10 @@ from doedesign.report.pictures import (
 )
 from doedesign.runs import open_run
 from doedesign.spec import variation_to_toml
-from doedesign.tolerance.analysis import QUANTITIES, Table, good_plates, limit_text, obeys, yield_of
+from doedesign.tolerance.analysis import QUANTITIES, limit_text, obeys, yield_of
 from doedesign.tolerance.budget import Budget
-from doedesign.tolerance.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys
+from doedesign.tolerance.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
+from doedesign.tolerance.pool import Work, evaluate_here, predicted_bank
 from doedesign.tolerance.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerance.studies import FORMAT, Plates, Study, study
 from fab.errors import InputError
@@ -79,9 +80,7 @@ class Found(NamedTuple):
 
 
 def _found(asked: Study, plan: Plan) -> Found:
-    # First the plate as drawn: a limit that speaks of none of its colours and depths is told at once.
-    good_plates(asked.plates([NOMINAL]).table, asked.limits)
-    asked.plates(plan.keys(asked))
+    asked.plates(plan.keys(asked))  # all at once, so that no worker waits between two questions
     return Found(
         asked.plates([NOMINAL]),
         asked.plates([EXPECTED]),
@@ -143,13 +142,17 @@ def one_draw(run_folder: Path, key: str, as_json: bool, **settings: Any) -> str:
         InputError: no such plate, or something that cannot be used.
     """
     asked = study(open_run(run_folder), quiet=True, **{**settings, "workers": 1})
-    variation, plates = asked.variation(key), asked.plates([key])
+    variation = asked.variation(key)
+    asked.plates([key])
+    rows = asked.journal.finished[key]
     if as_json:
-        return json.dumps({"key": key, "variation": vars(variation), "rows": _plain(plates.rows)}, sort_keys=True)
+        return json.dumps({"key": key, "variation": vars(variation), "rows": rows}, sort_keys=True)
     lines = [f"draw {key} of {asked.drawn.name}, seed {asked.seed}"]
-    for row in plates.rows:
-        numbers = ", ".join(f"{name} {row[name]:.6g}" for name in QUANTITIES if name in row)
-        lines.append(f"{row['colour']} at {row['depth_m']:g} m: {numbers}")
+    for row in rows:
+        found = {name: math.inf if row[name] is None else row[name] for name in QUANTITIES if name in row}
+        place = "infinity" if row["depth_m"] is None else format_length(row["depth_m"])
+        numbers = ", ".join(f"{name} {value:.6g}" for name, value in found.items())
+        lines.append(f"{row['colour']} at {place}: {numbers}")
     return variation_to_toml(variation, lines)
 
 
@@ -217,9 +220,9 @@ def _plain(value: Any) -> Any:
 
 
 def _write(folder: Path, asked: Study, plan: Plan, found: Found, results: Mapping[str, Any]) -> None:
-    every = asked.plates(plan.keys(asked)).table
-    write_atomic(folder / "draws.csv", _csv(_draw_lines(every)))
-    write_atomic(folder / "errors.csv", _csv(_error_lines(asked, every.keys)))
+    keys = plan.keys(asked)
+    write_atomic(folder / "draws.csv", _csv(_draw_lines(asked, keys)))
+    write_atomic(folder / "errors.csv", _csv(_error_lines(asked, keys)))
     write_atomic(folder / "results.json", canonical_json(results))
     pictures = _draw(folder, asked, found)
     digests = {name: sha256_file(folder / name) for name in ("draws.csv", "errors.csv", "results.json", *pictures)}
@@ -229,8 +232,6 @@ def _write(folder: Path, asked: Study, plan: Plan, found: Found, results: Mappin
 
 def _draw(folder: Path, asked: Study, found: Found) -> list[str]:
     """Draw what was found; returns the names of the pictures."""
-    from doedesign.predict import predict
-
     drawn, plates = asked.drawn, found.plates
     draw_histograms(folder / "histograms.png", drawn.camera, plates.table, found.nominal.table, asked.limits)
     draw_yield(folder / "yield.png", plates.table, asked.limits)
@@ -244,20 +245,25 @@ def _draw(folder: Path, asked: Study, found: Found) -> list[str]:
     if found.budget is not None:
         draw_budget(folder / "budget.png", found.budget)
         names.append("budget.png")
-    for name, key in (("nominal_psf.png", NOMINAL), ("worst_psf.png", plates.worst)):
-        bank = predict(drawn, asked.process, asked.variation(key)).bank
-        draw_psfs(folder / name, drawn.camera, bank, drawn.near_m, drawn.far_m)
-        names.append(name)
+    shown = {NOMINAL: "nominal_psf.png", plates.worst: "worst_psf.png"}
+    # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
+    work = Work(predicted_bank, drawn, asked.process)
+    for key, bank in evaluate_here(work, {key: asked.variation(key) for key in shown}, 1):
+        draw_psfs(folder / shown[key], drawn.camera, bank, drawn.near_m, drawn.far_m)
+        names.append(shown[key])
     return names
 
 
-def _draw_lines(table: Table) -> Iterable[Sequence[object]]:
-    """One line per plate, colour and depth; empty where a row has no such number."""
-    yield ("key", "colour", "depth_m", *table.values)
-    for i, key in enumerate(table.keys):
-        for j, (colour, depth) in enumerate(table.places):
-            numbers = (float(values[i, j]) for values in table.values.values())
-            yield (key, colour, depth, *("" if math.isnan(number) else number for number in numbers))
+def _draw_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]:
+    """One line per plate, colour and depth, with every number that was found; empty where a row has no such number."""
+    plates = asked.journal.finished
+    numbers = list(dict.fromkeys(name for row in plates[keys[0]] for name in row if name not in ("colour", "depth_m")))
+    yield ("key", "colour", "depth_m", *sorted(numbers))
+    for key in keys:
+        for row in plates[key]:
+            depth = "inf" if row["depth_m"] is None else row["depth_m"]
+            values = ("inf" if row.get(name, "") is None else row.get(name, "") for name in sorted(numbers))
+            yield (key, row["colour"], depth, *values)
 
 
 def _error_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]:
@@ -302,7 +308,8 @@ def _sigmas(budget: Budget) -> str:
     named: dict[str, set[float]] = {}
     for name, sigma in budget.sigmas.items():
         named.setdefault(name.partition("[")[0], set()).add(sigma)
-    return "".join(f", sigma of {key} {_sigma_text(key, max(of))}" for key, of in named.items() if len(of) == 1)
+    alike = {key: of.pop() for key, of in named.items() if len(of) == 1}
+    return "".join(f", sigma of {short_name(key)} {_sigma_text(key, sigma)}" for key, sigma in alike.items())
 
 
 def _sigma_text(key: str, sigma: float) -> str:

@@ -1,0 +1,102 @@
+"""One plate as fabricated at full size, from its masks to its PSFs, against the PSFs of the plate as drawn.
+
+    python -m bench.plate            minutes
+    python -m bench.plate --quick    N = 600; the targets are for the full size
+
+A draw of the stock process `contact_aligner`, every error at once: 2400 x 2400 cells, 16 levels, three colours, a near
+and a far depth. Both take their turn in every round; the table gives the median of the ratios within rounds. Then draws
+of a tolerance study on one worker and on two, and four draws against eight: their rates leave out the start.
+"""
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bench.reference import wrapped_map
+from doedesign.build import camera_of, process_of
+from doedesign.predict import Drawn, predict
+from doedesign.spec import load_spec
+from doedesign.tolerance.pool import Work, evaluate_here, predicted_rows
+from fab.levels import Levels, height_of, quantise
+from fab.masks import unetched_outside
+from fab.process import Process
+from fab.sampling import normal_draw
+from sim.psf import psf_bank
+
+SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
+TARGET_RATIO, TARGET_PEAK_GB, TARGET_SPEEDUP = 6.0, 4.0, 1.7
+
+
+def make_task(cells: int) -> tuple[Drawn, Process]:
+    """The automotive camera with a plate of so many cells, and the contact aligner."""
+    aperture = f"doe.aperture={cells * 1.85} um"
+    spec = load_spec(SPEC, (f"doe.samples={cells}", aperture, "process.stock=contact_aligner"))
+    camera, levels = camera_of(spec), Levels(spec.process.levels, spec.process.level_step_m)
+    full = levels.count * levels.step_m
+    height = np.mod(wrapped_map(cells, smooth_cells=4.0), full)
+    level = quantise(height, levels)
+    level = unetched_outside(level, levels, camera.grid, spec.doe.aperture_m)
+    drawn = Drawn("bench", level, levels, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
+    return drawn, process_of(spec.process)
+
+
+def time_draws(drawn: Drawn, process: Process, rounds: int) -> None:
+    """Print draw against nominal bank."""
+    height = height_of(drawn.level, drawn.levels).astype(np.float32)
+    side = max(drawn.camera.grid.extent_m)
+    draw_s, bank_s, ratios = [], [], []
+    for index in range(rounds + 1):
+        start = time.perf_counter()
+        predict(drawn, process, normal_draw(process, 0, index, side))
+        middle = time.perf_counter()
+        psf_bank(drawn.camera, height, drawn.depths_m)
+        end = time.perf_counter()
+        if index:  # the first round compiles
+            draw_s.append(middle - start)
+            bank_s.append(end - middle)
+            ratios.append(draw_s[-1] / bank_s[-1])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    ratio, cells = float(np.median(ratios)), drawn.camera.grid.shape[0]
+    print(f"Plate as fabricated, N = {cells}, 16 levels, 3 colours, 2 depths, every error of a contact aligner")
+    print(f"  draw {np.median(draw_s):6.2f} s    PSFs of the plate as drawn {np.median(bank_s):6.2f} s")
+    verdict = "ok" if ratio <= TARGET_RATIO else "missed"
+    print(f"  ratio {ratio:5.2f}  (target <= {TARGET_RATIO:g}: {verdict}; {min(ratios):.2f}-{max(ratios):.2f})")
+    print(f"  peak {peak:6.2f} GB  (target < {TARGET_PEAK_GB:g}: {'ok' if peak < TARGET_PEAK_GB else 'missed'})")
+
+
+def seconds_of(drawn: Drawn, process: Process, count: int, workers: int) -> float:
+    """Seconds that `count` draws take after each worker has compiled its first ones."""
+    side = max(drawn.camera.grid.extent_m)
+    plates = {f"normal/{i}": normal_draw(process, 0, i, side) for i in range(count + 2 * workers)}
+    begun = 0.0
+    for done, _ in enumerate(evaluate_here(Work(predicted_rows, drawn, process), plates, workers), 1):
+        if done == 2 * workers:
+            begun = time.perf_counter()
+    return time.perf_counter() - begun
+
+
+def time_workers(drawn: Drawn, process: Process) -> None:
+    """Print the rates of one worker and of two, and of four and of eight draws."""
+    one, two = (seconds_of(drawn, process, 8, workers) for workers in (1, 2))
+    half = seconds_of(drawn, process, 4, 1)
+    speedup, growth = one / two, one / half
+    print(f"  8 draws, N = {drawn.camera.grid.shape[0]}: one worker {one:.1f} s, two workers {two:.1f} s")
+    verdict = "ok" if speedup >= TARGET_SPEEDUP else "missed"
+    print(f"  two workers / one {speedup:5.2f}  (target >= {TARGET_SPEEDUP:g}: {verdict})")
+    print(f"  8 draws / 4 draws {growth:5.2f}  (linear: 2)")
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--quick", action="store_true", help="a small plate, in a minute")
+    quick = parser.parse_args().quick
+    time_draws(*make_task(600 if quick else 2400), rounds=3)
+    time_workers(*make_task(600))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""`doedesign psf --fabricated`: the PSFs of one plate as the process makes it, and where its light goes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from doedesign.build import process_for
+from doedesign.commands.psf import Say, require_own
+from doedesign.predict import Drawn, drawn_of, plate_rows
+from doedesign.progress import meter
+from doedesign.report.pictures import draw_psfs, draw_split
+from doedesign.runs import alone_in, open_run
+from doedesign.spec import load_variation, variation_to_toml
+from doedesign.tolerance.draws import EXPECTED, variation_at
+from fab.errors import CheckFailed, InputError
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
+from fab.process import Process, Variation
+from sim.leakage import SplitPsf, split_psf
+from sim.psf import PsfBank, surface_bank
+from sim.store import write_bank
+from sim.surface import as_fabricated
+
+# Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand.
+_MOST_EXCESS = 1e-3
+
+
+def fabricated(
+    run_folder: Path,
+    masks: Path | None = None,
+    *,
+    process: Path | None = None,
+    variation: Path | None = None,
+    seed: int | None = None,
+    draw: str = "normal/0",
+    say: Say = lambda _: None,
+) -> Path:
+    """Write the PSF bank, the metrics and pictures of one plate as fabricated into RUN/fabricated.
+
+    Args:
+        run_folder: a finished run.
+        masks: its mask order, whose files are read; `masks/NAME` if there is one, else the run's own map.
+        process: TOML file with a [process] table; the run's own process by default.
+        variation: TOML file with the errors of the plate.
+        seed: take the errors from this seed of the process instead.
+        draw: which draw of the seed, as in a tolerance study.
+        say: told what is going on.
+
+    Returns:
+        the folder. With neither a variation nor a seed the plate has every error at the process's mean.
+
+    Raises:
+        InputError: something that cannot be read, or errors beyond the model.
+        CheckFailed: leaked and diffracted light do not make up the plate's.
+    """
+    run = open_run(run_folder)
+    drawn = drawn_of(run, masks)
+    made_by = process_for(drawn.levels, run.spec.process, process)
+    plate, source = _plate(drawn, made_by, variation, seed, draw)
+    say(f"plate: {source}")
+    folder = run.path("fabricated")
+    require_own(folder)
+    with alone_in(run.folder), atomic_folder(folder) as fresh:
+        _write(fresh, drawn, made_by, plate, source, say)
+    return folder
+
+
+def _plate(drawn: Drawn, process: Process, file: Path | None, seed: int | None, draw: str) -> tuple[Variation, str]:
+    if file is not None and seed is not None:
+        raise InputError("--seed", "a plate has one source of errors", "also --variation", "Leave one of them out.")
+    if file is not None:
+        return load_variation(file), f"errors of {file.name}"
+    key = EXPECTED if seed is None else draw
+    errors = variation_at(process, seed or 0, max(drawn.camera.grid.extent_m), key)
+    if seed is not None:
+        return errors, f"draw {key} of seed {seed} of the process {process.name}"
+    return errors, f"every error of the process {process.name} at its mean"
+
+
+def _write(folder: Path, drawn: Drawn, process: Process, plate: Variation, source: str, say: Say) -> None:
+    camera = drawn.camera
+    surface = as_fabricated(drawn.level, camera, process, plate)
+    total = len(drawn.depths_m) * len(camera.colours)
+    splits: dict[tuple[int, int], SplitPsf] = {}
+    with meter("PSFs", total) as progress:
+        for d, depth in enumerate(drawn.depths_m):
+            for c, colour in enumerate(camera.colours):
+                splits[c, d] = split_psf(camera, surface, colour, depth)
+                progress.advance(len(splits))
+    excess = max(split.excess() for split in splits.values())
+    if excess > _MOST_EXCESS:
+        raise CheckFailed([f"leaked and diffracted light miss the plate's by {excess:.1e} of its brightest pixel"])
+    meant = as_fabricated(drawn.level, camera, process, Variation())
+    nominal = surface_bank(camera, meant, drawn.depths_m)
+    bank = _bank(drawn, splits)
+    say("writing bank and pictures")
+    rows = {"nominal": plate_rows(drawn, meant, nominal), "fabricated": plate_rows(drawn, surface, bank)}
+    for row in rows["fabricated"]:
+        d = bank.depths_m.index(float("inf") if row["depth_m"] is None else row["depth_m"])
+        row["split"] = _sums(splits[bank.colours.index(row["colour"]), d])
+    write_bank(folder / "fabricated.exr", bank, {"design": drawn.name, "plate": source})
+    (folder / "variation.toml").write_text(variation_to_toml(plate, [source]), encoding="utf-8")
+    (folder / "metrics.json").write_bytes(canonical_json(rows))
+    draw_psfs(folder / "fabricated_psf.png", camera, bank, drawn.near_m, drawn.far_m)
+    orders = [
+        tuple(
+            next(r["zeroth_order"] for r in rows[name] if r["colour"] == colour) for name in ("nominal", "fabricated")
+        )
+        for colour in bank.colours
+    ]
+    draw_split(folder / "leakage.png", camera, nominal, splits, 0, orders)
+    digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
+    manifest = {
+        "format": "doedesign fabricated 1",
+        "run": drawn.name,
+        "level_map_sha256": drawn.digest(),
+        "plate": source,
+        "results_sha256": digests,
+    }
+    (folder / MANIFEST_NAME).write_bytes(canonical_json(manifest))
+
+
+def _bank(drawn: Drawn, splits: dict[tuple[int, int], SplitPsf]) -> PsfBank:
+    camera = drawn.camera
+    energy = np.stack(
+        [np.stack([splits[c, d].total for d in range(len(drawn.depths_m))]) for c in range(len(camera.colours))]
+    )
+    return PsfBank(energy, tuple(c.name for c in camera.colours), drawn.depths_m, camera.pixel_m)
+
+
+def _sums(split: SplitPsf) -> dict[str, Any]:
+    """Energy in the window by origin; the three sum to the throughput."""
+    parts = {"leaked": split.leaked, "diffracted": split.diffracted, "interference": split.interference}
+    return {name: float(part.sum(dtype=np.float64)) for name, part in parts.items()}
