@@ -1,0 +1,30 @@
+"""The plate that comes back from the cleanroom, as light sees it. The only model of the process.
+
+`as_fabricated` takes what is drawn (a level map, split into masks here), a process and the errors of one plate
+(`fab.process.Variation`) and returns the transmission of every DOE cell. Nothing is oversampled: displaced and widened
+masks cut each cell into a few pieces of constant depth whose light is added exactly (`sim.cell`), rounded corners
+and tilted walls add what they change at the vertices and along the lines between the pieces, and slow errors
+(uniformity, rotation, magnification) are constants of tiles of 32 x 32 cells. Everything is differentiable in every
+floating-point error.
+
+How each error enters:
+
+* depth, missed and doubled etches, uniformity: the depth a mask takes away; the bottom profile follows the top's.
+* overlay, rotation, magnification, line width: where the masks' edges lie. A mask pixel narrower than twice a negative
+  bias is lost, a gap narrower than twice a positive one closes.
+* corner rounding: (1 - pi/4) r^2 of area at every corner of an opening or an island; two openings that touch at a
+  corner neither merge nor part.
+* side walls: floors are narrower than the drawn opening by depth x tan(angle) at each wall, depth falls linearly.
+* etch lag: an opening of width w loses the share lag x depth / w of its depth; w is the shorter of its runs along x and
+  y as drawn.
+* roughness: a random height for every cell with the given rms and correlation length; what varies within a cell is
+  light lost to angles beyond the sensor, exp(-variance / 2) of the amplitude.
+* particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, and pinholes.
+
+Reading order: `relief` (the errors as numbers), `pieces` (what is open where, and its light), `edges` (walls and
+corners), `tiles` (the whole plate), `plate` (the way in).
+"""
+
+from sim.surface.plate import Surface, as_fabricated
+
+__all__ = ["Surface", "as_fabricated"]

@@ -1,0 +1,141 @@
+"""From a level map and the errors of a process to a plate: `as_fabricated`."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Complex, Float, UInt8
+
+from fab.grid import Grid
+from fab.levels import height_of
+from fab.masks import planes
+from fab.polygons import run_lengths
+from fab.process import MaskDisc, Process, Variation
+from sim.aperture import circle_coverage, displaced_circle_coverage
+from sim.camera import Camera
+from sim.pupil import cis
+from sim.roughness import cell_share
+from sim.surface.relief import plan_of, relief_of, require_possible
+from sim.surface.tiles import transmission_of
+
+
+class Surface(eqx.Module):
+    """A plate with its chrome.
+
+    Attributes:
+        transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
+            that of the plate within `sim.cell`'s accuracy, and its mean is the plate's.
+        coverage: `[y, x]` open share of every cell.
+        grid: the cells: those of the DOE, or a whole number of parts of them where the sensor sees waves too
+            oblique for moments.
+        wavelengths_m: vacuum wavelengths.
+    """
+
+    transmission: Complex[Array, "w y x"]
+    coverage: Float[Array, "y x"]
+    grid: Grid = eqx.field(static=True)
+    wavelengths_m: tuple[float, ...] = eqx.field(static=True)
+
+    def at(self, wavelength_m: float) -> Complex[Array, "y x"]:
+        """Transmission at one of the wavelengths."""
+        return self.transmission[self.wavelengths_m.index(wavelength_m)]
+
+
+def as_fabricated(
+    level_map: UInt8[np.ndarray, "y x"],
+    camera: Camera,
+    process: Process,
+    variation: Variation,
+    wavelengths_m: tuple[float, ...] | None = None,
+) -> Surface:
+    """Predict the plate that the masks of a level map and a process with given errors make.
+
+    Args:
+        level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.masks.unetched_outside`).
+        camera: DOE grid, clear aperture and material; the sensor says how oblique the light is that matters.
+        process: depths of the etches and where on the wafer the DOE lies.
+        variation: the errors; `Variation()` gives the nominal plate bit for bit.
+        wavelengths_m: vacuum wavelengths; all lines of the camera by default.
+
+    Returns:
+        the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
+
+    Raises:
+        InputError: an edge moves by half a cell or more through line-width bias, corners are rounded by more than
+            half a cell, a mask is shifted by more than 8 cells, or an error has the wrong number of masks.
+    """
+    levels = process.levels
+    lines = wavelengths_m or tuple(dict.fromkeys(w for c in camera.colours for w in c.wavelengths_m))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(variation))
+    rates = jnp.asarray([camera.waves_per_metre(w) for w in lines], jnp.float32)
+    if not traced and variation.nominal:
+        height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
+        flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
+        return Surface(flat, jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)), camera.grid, lines)
+    if not traced:
+        require_possible(camera.grid, process, variation)
+    plan = plan_of(camera, process, variation, min(lines), traced)
+    etched = planes(level_map, levels)
+    for particle in variation.particles:
+        _keep_off(etched, particle, camera.grid)
+    widths = _opening_widths(etched) if traced or variation.etch_lag else None
+    relief = relief_of(camera.grid, process, variation, traced)
+    transmission = transmission_of(_packed(etched), widths, relief, rates, plan)
+    loss = _subcell_loss(variation, camera.grid.pitch_m, rates, traced)
+    if loss is not None:
+        transmission = transmission * loss[:, None, None]
+    grid = _refined(camera.grid, plan.parts)
+    return Surface(transmission, _coverage(grid, camera, variation, traced), grid, lines)
+
+
+def _flat(height_m: Array, rate: Array) -> Array:
+    return cis(height_m * rate)
+
+
+def _refined(grid: Grid, parts: int) -> Grid:
+    return grid if parts == 1 else Grid((grid.shape[0] * parts, grid.shape[1] * parts), grid.pitch_m / parts)
+
+
+def _packed(etched: UInt8[np.ndarray, "mask y x"]) -> UInt8[np.ndarray, "y x"]:
+    """All masks of a pixel in one number, bit k for mask k."""
+    out = np.zeros(etched.shape[1:], np.uint8)
+    for mask, plane in enumerate(etched):
+        out |= plane << np.uint8(mask)
+    return out
+
+
+def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: Grid) -> None:
+    """Close the mask pixels whose centres a particle covers, in place."""
+    rows = np.flatnonzero(np.abs(grid.axis_m("y") - particle.y_m) <= particle.radius_m)
+    columns = np.flatnonzero(np.abs(grid.axis_m("x") - particle.x_m) <= particle.radius_m)
+    y, x = grid.axis_m("y")[rows] - particle.y_m, grid.axis_m("x")[columns] - particle.x_m
+    inside = np.hypot(y[:, None], x[None, :]) <= particle.radius_m
+    etched[particle.mask][np.ix_(rows, columns)] &= ~inside
+
+
+def _opening_widths(etched: UInt8[np.ndarray, "mask y x"]) -> UInt8[np.ndarray, "mask y x"]:
+    """Width in pixels of the opening that every open pixel belongs to: the shorter of its runs, at most 255."""
+    return np.stack([np.minimum(run_lengths(plane), run_lengths(plane.T).T) for plane in etched])
+
+
+def _subcell_loss(variation: Variation, pitch_m: float, rates: Array, traced: bool) -> Array | None:
+    """Amplitude left after the roughness within a cell."""
+    if not traced and not variation.roughness_m:
+        return None
+
+    rest = 1.0 - cell_share(jnp.asarray(variation.correlation_m, jnp.float32) / pitch_m)
+    return jnp.exp(-0.5 * rest * (2 * jnp.pi * rates * variation.roughness_m) ** 2)
+
+
+def _coverage(grid: Grid, camera: Camera, variation: Variation, traced: bool) -> Array:
+    chrome = (variation.chrome_y_m, variation.chrome_x_m, variation.chrome_diameter_m)
+    if traced or any(chrome):
+        diameter = camera.aperture_m + variation.chrome_diameter_m
+        coverage = displaced_circle_coverage(grid, diameter, chrome[:2])
+    else:
+        coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
+    for hole in variation.pinholes:
+        light = circle_coverage(grid, 2 * hole.radius_m, (hole.y_m, hole.x_m))
+        coverage = jnp.maximum(coverage, jnp.asarray(light))
+    return coverage

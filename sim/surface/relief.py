@@ -1,0 +1,195 @@
+"""What all tiles of a plate share: a process and its errors as the numbers that the physics needs."""
+
+from dataclasses import fields
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.process import Process, Variation
+from fab.units import format_length
+from sim.camera import Camera
+from sim.roughness import cell_roughness
+
+SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
+jax.tree_util.register_dataclass(
+    Variation,
+    data_fields=[f.name for f in fields(Variation) if f.name not in SETTINGS],
+    meta_fields=list(SETTINGS),
+)
+
+_BAND = 0.46  # waves per cell up to which second moments and their filters do
+
+
+class Relief(NamedTuple):
+    """What all tiles share; leaves that are None are not needed.
+
+    Attributes:
+        depth_m: `[mask]` depth of every etch.
+        shift_m: `[mask, (y, x)]` displacement of every mask at the middle of the DOE.
+        turn: `[mask]` rotation, radians.
+        growth: `[mask]` magnification.
+        bias_m: `[mask]` growth of openings per edge.
+        corner_m: radius of corners.
+        slope: tangent of the walls' angle.
+        lag: share of depth lost per depth over width.
+        bowl: uniformity: depth share per r² (metres²).
+        tilt: `[(y, x)]` depth share per metre.
+        rough_m: `[y, x]` height of the roughness, or None.
+        height_m: height of the blank surface above the deepest nominal floor.
+    """
+
+    depth_m: Array
+    shift_m: Array
+    turn: Array
+    growth: Array
+    bias_m: Array
+    corner_m: Array
+    slope: Array
+    lag: Array
+    bowl: Array
+    tilt: Array
+    rough_m: Array | None
+    height_m: Array
+
+
+class Plan(NamedTuple):
+    """What a compiled surface depends on besides its arrays. Hashable."""
+
+    grid: Grid
+    masks: int
+    die_m: tuple[float, float]
+    parts: int
+    reach: int
+    band: float
+    cut: bool
+    corners: bool
+    walls: bool
+
+
+def effective_bias(relief: Relief) -> Float[Array, " mask"]:
+    """Growth of openings per edge, a tilted wall counted as an upright one in the middle of its slope."""
+    return relief.bias_m - relief.depth_m * relief.slope / 2
+
+
+# Cells by which a mask may lie off; under a derivative the errors are not known when the halo is chosen.
+_MOST, _TRACED_REACH = 8, 3
+
+
+def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> Plan:
+    """What has to be computed for these errors; everything that may be, where they are not known yet (`traced`).
+
+    Raises:
+        InputError: masks lie off by more than the model looks.
+    """
+    grid = camera.grid
+    reach = _TRACED_REACH
+    cut = corners = walls = True
+    if not traced:
+        corners, walls = variation.corner_radius_m > 0, variation.sidewall_rad > 0
+        shifts = np.abs(_corner_shifts_m(grid, process, variation))
+        widened = bool(variation.common_cd_bias_m) or any(variation.cd_bias_m)
+        cut = bool(shifts.max() > 0 or widened or corners or walls)
+        # Half a cell for the bias, and a cell more for corners seen from the next one.
+        reach = int(np.ceil(shifts.max() / grid.pitch_m)) + 2
+        if reach > _MOST + 2:
+            rule = f"masks may lie off by at most {_MOST} cells, {format_length(_MOST * grid.pitch_m)}"
+            raise InputError("variation.overlay", rule, format_length(float(shifts.max())), "Align better.")
+    needed = _widest_band(camera, shortest_m)
+    parts = int(np.ceil(needed / _BAND - 1e-9)) if cut else 1
+    return Plan(
+        grid, process.masks, process.die_m, parts, reach, min(needed / parts, _BAND), cut, corners, walls
+    )  # fmt: skip
+
+
+def _widest_band(camera: Camera, wavelength_m: float) -> float:
+    """Highest wave number on the sensor, in waves per DOE cell, with a margin for its last pixels."""
+    half = (camera.window / 2 + 1) * camera.pixel_m
+    return half * camera.grid.pitch_m / (wavelength_m * camera.sensor_distance_m)
+
+
+def _per_mask(value: tuple[float, ...], masks: int) -> Array:
+    return jnp.asarray(jnp.stack([jnp.asarray(v, jnp.float32) for v in value]) if value else jnp.zeros(masks))
+
+
+def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.ndarray:
+    """Largest displacements of every mask over the DOE."""
+    zeros = (0.0,) * process.masks
+    half_y, half_x = (extent / 2 for extent in grid.extent_m)
+    y, x = (abs(d) + half for d, half in zip(process.die_m, (half_y, half_x), strict=True))
+    turn, growth = (np.abs(v or zeros) for v in (variation.rotation_rad, variation.magnification))
+    return np.stack(
+        [
+            np.abs(variation.overlay_y_m or zeros) + growth * y + turn * x,
+            np.abs(variation.overlay_x_m or zeros) + growth * x + turn * y,
+        ]
+    )
+
+
+def relief_of(grid: Grid, process: Process, variation: Variation, traced: bool) -> Relief:
+    """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
+    masks = process.masks
+    per_mask = partial(_per_mask, masks=masks)
+    repeats = np.asarray(variation.repeats or (0,) * masks)
+    nominal = np.asarray(process.depths_m())
+    scale = (1.0 + variation.common_depth_scale) * (1.0 + per_mask(variation.depth_scale))
+    y, x = process.die_m
+    turn, growth = per_mask(variation.rotation_rad), per_mask(variation.magnification)
+    shift = jnp.stack(
+        [
+            per_mask(variation.overlay_y_m) + growth * y + turn * x,
+            per_mask(variation.overlay_x_m) + growth * x - turn * y,
+        ],
+        axis=1,
+    )
+    radius = process.wafer_radius_m
+    tilt = jnp.stack([jnp.asarray(variation.linear_nonuniformity_y), jnp.asarray(variation.linear_nonuniformity_x)])
+    rough = None
+    if traced or variation.roughness_m:
+        rough = cell_roughness(grid, variation.roughness_m, variation.correlation_m, variation.seed)
+    return Relief(
+        depth_m=jnp.asarray((nominal * (1 + repeats)).astype(np.float32)) * scale,
+        shift_m=shift,
+        turn=turn,
+        growth=growth,
+        bias_m=jnp.asarray(variation.common_cd_bias_m, jnp.float32) + per_mask(variation.cd_bias_m),
+        corner_m=jnp.asarray(variation.corner_radius_m, jnp.float32),
+        slope=jnp.tan(jnp.asarray(variation.sidewall_rad, jnp.float32)),
+        lag=jnp.asarray(variation.etch_lag, jnp.float32),
+        bowl=jnp.asarray(variation.radial_nonuniformity, jnp.float32) / radius**2,
+        tilt=tilt / radius,
+        rough_m=rough,
+        height_m=jnp.float32(process.levels.count - 1) * jnp.float32(process.levels.step_m),
+    )
+
+
+def require_possible(grid: Grid, process: Process, variation: Variation) -> None:
+    """Refuse errors that the model does not describe.
+
+    Raises:
+        InputError: naming the error, its bound and its value.
+    """
+    pitch_m, masks = grid.pitch_m, process.masks
+    for name in [f.name for f in fields(Variation) if f.name not in SETTINGS] + ["repeats"]:
+        value = getattr(variation, name)
+        if isinstance(value, tuple) and value and len(value) != masks:
+            rule = f"must have one value per mask, {masks}"
+            raise InputError(f"variation.{name}", rule, len(value), "Add or remove values.")
+    relief = relief_of(grid, process, variation, traced=False)
+    limits = {
+        "cd_bias": float(jnp.abs(effective_bias(relief)).max()),
+        "corner_radius": variation.corner_radius_m,
+    }
+    for name, value in limits.items():
+        if value >= pitch_m / 2 * (1 + 1e-9):
+            rule = f"must stay below half a cell, {format_length(pitch_m / 2)}"
+            cure = "Such a process loses single pixels: draw coarser cells, or reduce the error."
+            raise InputError(f"variation.{name}", rule, format_length(value), cure)
+    if not 0 <= variation.sidewall_rad < np.pi / 4:
+        rule = "must lie between 0 and 45 degrees from the vertical"
+        raise InputError("variation.sidewall", rule, f"{np.degrees(variation.sidewall_rad):.3g} deg", "Mend it.")

@@ -1,0 +1,153 @@
+"""The transmission of a whole plate, tile by tile: moments of every cell, and their filters across cells."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, UInt8
+
+from sim.cell import (
+    DEGREES,
+    FILTER_REACH,
+    axis_moments,
+    cuts,
+    moment_filter,
+    plane_moments,
+    whole_cell,
+)
+from sim.surface.edges import corners, walls
+from sim.surface.pieces import PRECISION, STATES, TILE, light_of, mask_states, summed
+from sim.surface.relief import Plan, Relief, effective_bias
+
+
+@partial(jax.jit, static_argnames=("plan",))
+def transmission_of(
+    etched: UInt8[Array, "y x"],
+    widths: UInt8[Array, "mask y x"] | None,
+    relief: Relief,
+    rates: Float[Array, " w"],
+    plan: Plan,
+) -> Complex[Array, "w v u"]:
+    """Transmission of every cell, tile by tile, with the far field of the whole plate within the band."""
+    ny, nx = plan.grid.shape
+    count_y, count_x = -(-ny // TILE), -(-nx // TILE)
+    halo = ((plan.reach, plan.reach + count_y * TILE - ny), (plan.reach, plan.reach + count_x * TILE - nx))
+    etched = jnp.pad(etched, halo)
+    widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))
+    rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after - plan.reach) for _, after in halo])
+
+    def tile(start_y: Array, start_x: Array) -> Array:
+        side = TILE + 2 * plan.reach
+        bits = jax.lax.dynamic_slice(etched, (start_y, start_x), (side, side))
+        masks = (bits[None] >> jnp.arange(plan.masks, dtype=jnp.uint8)[:, None, None]) & 1
+        states = masks.astype(jnp.float32)
+        if widths is not None:
+            width = jax.lax.dynamic_slice(widths, (0, start_y, start_x), (plan.masks, side, side)).astype(jnp.float32)
+            lost = relief.lag * relief.depth_m[:, None, None] / (jnp.maximum(width, 1.0) * plan.grid.pitch_m)
+            states = states * jnp.clip(1.0 - lost, 0.0, 1.0)
+        bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
+        return _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
+
+    def strip(start_y: Array) -> Array:
+        starts = jnp.arange(count_x) * TILE
+        moments = jax.lax.map(jax.checkpoint(lambda start_x: tile(start_y, start_x)), starts)
+        return _strip_values(moments, plan)
+
+    strips = jax.lax.map(strip, jnp.arange(count_y) * TILE)
+    return _joined(strips)[:, : ny * plan.parts, : nx * plan.parts]
+
+
+def _tile_moments(
+    states: Float[Array, "mask side side"],
+    relief: Relief,
+    bump: Float[Array, "t t"] | None,
+    start: tuple[Array, Array],
+    rates: Float[Array, " w"],
+    plan: Plan,
+) -> Float[Array, "moment 2 w t t"]:
+    """Moments of the transmission of one tile's cells (`sim.cell.plane_moments` says which)."""
+    pitch, tile = plan.grid.pitch_m, TILE
+    ny, nx = plan.grid.shape
+    middle_y = (start[0] + (tile - ny) / 2) * pitch
+    middle_x = (start[1] + (tile - nx) / 2) * pitch
+    if plan.cut:
+        bias = effective_bias(relief) / pitch
+        along_y = cuts((relief.shift_m[:, 0] + relief.growth * middle_y + relief.turn * middle_x) / pitch, bias)
+        along_x = cuts((relief.shift_m[:, 1] + relief.growth * middle_x - relief.turn * middle_y) / pitch, bias)
+        around = STATES if plan.corners else range(3)
+        kinds = jax.lax.map(
+            lambda k: mask_states(states[k], along_y, along_x, k, bias[k], around, plan), jnp.arange(plan.masks)
+        )
+        own = slice(-around[0], 3 - around[0])
+        pieces = kinds[:, own, own]
+    else:
+        along_y = along_x = whole_cell(plan.masks)
+        inner = states[:, plan.reach : plan.reach + tile, plan.reach : plan.reach + tile]
+        pieces = kinds = jnp.broadcast_to(inner[:, None, None], (plan.masks, 3, 3, tile, tile))
+    chosen_y, chosen_x = (jax.nn.one_hot(c.state, 3, axis=1) for c in (along_y, along_x))
+    taken = relief.depth_m[:, None, None, None, None] * jnp.einsum("kia,kjb->kijab", chosen_y, chosen_x)
+    segments = along_y.state.shape[1], along_x.state.shape[1]
+    taken = jnp.transpose(taken, (3, 4, 0, 1, 2)).reshape(segments[0] * segments[1], -1)
+    depth = jnp.dot(taken, pieces.reshape(-1, tile * tile), precision=PRECISION)
+    axis = (jnp.arange(tile) - (tile - 1) / 2) * pitch
+    y, x = middle_y + plan.die_m[0] + axis[:, None], middle_x + plan.die_m[1] + axis[None, :]
+    uniform = 1.0 + relief.bowl * (y * y + x * x) + relief.tilt[0] * y + relief.tilt[1] * x
+    depth = depth * uniform.reshape(-1)
+    height = relief.height_m - depth
+    if bump is not None:
+        height = height + bump.reshape(-1)
+    light = light_of(height, rates)
+    weights = plane_moments(axis_moments(along_y.edges, plan.parts), axis_moments(along_x.edges, plan.parts))
+    moments = summed(weights, light)
+    if plan.walls:
+        moments = moments + walls(light, depth, along_y, along_x, relief, rates, plan)
+    if plan.corners:
+        kinds = kinds.reshape(*kinds.shape[:3], -1) > 0
+        moments = moments + corners(light, kinds, along_y, along_x, relief, rates, plan)
+    return moments.reshape(*moments.shape[:3], tile, tile)
+
+
+def _strip_values(moments: Float[Array, "tile moment 2 w t t"], plan: Plan) -> Complex[Array, "w v u"]:
+    """One row of tiles as values of its cells, with what spills to the cells `FILTER_REACH` above and below."""
+    count, _, _, lines = moments.shape[:4]
+    parts, reach = plan.parts, FILTER_REACH
+    moments = moments.reshape(count, parts, parts, len(DEGREES), 2, lines, TILE, TILE)
+    # [degree, 2, w, (row, part), (tile, column, part)]
+    moments = jnp.transpose(moments, (3, 4, 5, 6, 1, 0, 7, 2))
+    values = moments.reshape(len(DEGREES), 2, lines, TILE * parts, count * TILE * parts)
+    values = values.reshape(len(DEGREES), 2 * lines, *values.shape[-2:])
+    spill = ((0, 0), (reach, reach), (0, 0))
+    if not plan.cut:
+        total = jnp.pad(values[0], spill)
+    else:
+        first, second = (moment_filter(q, plan.band) for q in (1, 2))
+        of = dict(zip(DEGREES, values, strict=True))
+        even = of[0, 0] + _filtered(of[0, 1], first, 2) + _filtered(of[0, 2], second, 2)
+        odd = of[1, 0] + _filtered(of[1, 1], first, 2)
+        wide = _filtered(jnp.pad(odd, spill), first, 1) + _filtered(jnp.pad(of[2, 0], spill), second, 1)
+        total = jnp.pad(even, spill) + wide
+    return jax.lax.complex(*total.reshape(2, lines, *total.shape[1:]))
+
+
+def _filtered(values: Float[Array, "n v u"], weights: Float[np.ndarray, " tap"], axis: int) -> Float[Array, "n v u"]:
+    """Convolution along an axis; beyond the ends there is nothing."""
+    reach, size = len(weights) // 2, values.shape[axis]
+    padded = jnp.pad(values, [(reach, reach) if a == axis else (0, 0) for a in range(values.ndim)])
+    shifted = (
+        jax.lax.slice_in_dim(padded, 2 * reach - tap, 2 * reach - tap + size, axis=axis) * jnp.float32(weight)
+        for tap, weight in enumerate(weights)
+        if weight
+    )
+    return sum(shifted, jnp.zeros_like(values))
+
+
+def _joined(strips: Complex[Array, "strip w v u"]) -> Complex[Array, "w y u"]:
+    """Strips side by side, what spills from each added to its neighbours."""
+    reach = FILTER_REACH
+    main = strips[:, :, reach:-reach]
+    # Above the last strip and below the first one nothing is kept.
+    from_next = jnp.concatenate([strips[1:, :, :reach], jnp.zeros_like(strips[:1, :, :reach])])
+    from_last = jnp.concatenate([jnp.zeros_like(strips[:1, :, -reach:]), strips[:-1, :, -reach:]])
+    main = main.at[:, :, -reach:].add(from_next).at[:, :, :reach].add(from_last)
+    return jnp.moveaxis(main, 0, 1).reshape(strips.shape[1], -1, strips.shape[3])
