@@ -3,7 +3,8 @@
 Reading order, from the user's words to the result:
 
     spec            a TOML spec as frozen tables, its rules, its words for every mistake, its digest
-    build           a spec's camera and levels, as values the physics works on
+    build           a spec's camera, levels and process, as values the physics works on
+    drawing         what is to be drawn: level maps of runs, mask files, maps of the user's own
     parametrize     free parameters -> heights the process can make
     starts          baseline designs by name: flat, random, fresnel, ring
     patterns        target images: spots, areas, pictures
@@ -11,6 +12,9 @@ Reading order, from the user's words to the result:
     problem         spec -> loss of one step, ready to differentiate
     optimize        the loop
     evaluate        the table of numbers every design gets
+    predict         what a drawn design will do once it is made
+    tolerance       what a process that strays makes of a design, and how far it may stray
+    calibrate       the process errors that explain measured PSFs
     runs            run folders: manifest, checkpoint, resume
     report          pictures
     commands        the work behind each command

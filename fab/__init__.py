@@ -9,6 +9,9 @@ Map of the package, in the order the work flows:
     height    HeightMap, and the reader of maps a user brings (.npy, .tif, .png)
     levels    Levels: height <-> level number
     masks     level map <-> bit planes, one plane per etch mask
+    process   Process, Variation: what a lab does and how far it strays; one plate's errors
+    sampling  draws of a process: Monte-Carlo, corners, Sobol, one at a time
+    stock     numbers of named processes, each with its source
     polygons  bitmap <-> rectangles (numba), circles as annulus sectors
     layout    Layer, Shapes, Layout: the geometry of a mask set in integer database units
     stream    GDSII and OASIS files
