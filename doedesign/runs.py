@@ -9,6 +9,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.evaluate`
         *.png                   pictures
+        psf/, fabricated/, tolerance/, calibrate/   what later commands found
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
@@ -38,7 +39,7 @@ FORMAT = "doedesign run 1"
 CHECKPOINT = "checkpoint.npz"
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
-_UNFINISHED = re.compile(r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|psf\.new)\.[a-z0-9_]{8}")
+_UNFINISHED = re.compile(r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated)\.new)\.[a-z0-9_]{8}")
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def whole_cell(masks: int) -> Cuts:
     return Cuts(jnp.array([0.0, 1.0]), jnp.zeros((masks, 1), jnp.int32), same, same, none)
 
 
-def axis_moments(edges: Float[Array, " segment+1"], parts: int) -> Float[Array, "part degree segment"]:
+def axis_moments(edges: Float[Array, " edge"], parts: int) -> Float[Array, "part degree edge-1"]:
     """Integral of the Legendre polynomials P0, P1, P2 over every segment, for each of `parts` equal parts of the cell.
 
     Over its own part a whole cell gives (1, 0, 0).

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.psf import pixel_energy, plan_propagation
+from sim.psf import pixel_energy, plan_propagation, surface_energy
 from sim.pupil import SurfaceRows, surface_pupil
 from sim.surface import Surface
 
@@ -96,7 +96,8 @@ def split_psf(camera: Camera, surface: Surface, colour: Colour, depth_m: float) 
         mean = jnp.complex64(means[surface.wavelengths_m.index(wavelength)])
         whole = surface.at(wavelength)
         factor = weight * camera.transmission(wavelength)
-        for i, field in enumerate((whole, jnp.full_like(whole, mean), whole - mean)):
+        parts[0] += factor * surface_energy(plan, camera, surface, wavelength, source)
+        for i, field in ((1, jnp.full_like(whole, mean)), (2, whole - mean)):
             rows = SurfaceRows(field, source, surface.coverage)
             parts[i] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
     return SplitPsf(*parts)

@@ -139,11 +139,25 @@ def surface_bank(
             for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
                 plan = plan_propagation(own, wavelength, depth)
                 source = jnp.asarray(wrapped_waves(path, wavelength))
-                rows = SurfaceRows(surface.at(wavelength), source, surface.coverage)
                 factor = weight * camera.transmission(wavelength)
-                energy[c, d] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
+                energy[c, d] += factor * surface_energy(plan, camera, surface, wavelength, source)
                 on_psf()
     return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
+
+
+def surface_energy(
+    plan: FarField | DirectPath, camera: Camera, surface: Surface, wavelength_m: float, source_waves: Array
+) -> Float[np.ndarray, "v u"]:
+    """Pixel energies of a plate for one wavelength and source, without Fresnel loss.
+
+    A plate exactly as drawn takes the way of `psf_bank`, so that both agree to the last bit.
+    """
+    if surface.height_m is not None:
+        rows = PhaseRows(surface.height_m, source_waves, surface.coverage)
+        rate = jnp.float32(camera.waves_per_metre(wavelength_m))
+        return np.asarray(pixel_energy(plan, phase_pupil, rows, rate))
+    field = SurfaceRows(surface.at(wavelength_m), source_waves, surface.coverage)
+    return np.asarray(pixel_energy(plan, surface_pupil, field, None))
 
 
 def pupil_field(

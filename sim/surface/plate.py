@@ -30,12 +30,14 @@ class Surface(eqx.Module):
         grid: the cells: those of the DOE, or a whole number of parts of them where the sensor sees waves too
             oblique for moments.
         wavelengths_m: vacuum wavelengths.
+        height_m: `[y, x]` height of every cell where that says all about the plate: exactly as drawn.
     """
 
     transmission: Complex[Array, "w y x"]
     coverage: Float[Array, "y x"]
     grid: Grid = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
+    height_m: Float[Array, "y x"] | None = None
 
     def at(self, wavelength_m: float) -> Complex[Array, "y x"]:
         """Transmission at one of the wavelengths."""
@@ -72,7 +74,8 @@ def as_fabricated(
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
-        return Surface(flat, jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)), camera.grid, lines)
+        coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+        return Surface(flat, coverage, camera.grid, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan = plan_of(camera, process, variation, min(lines), traced)
