@@ -5,7 +5,8 @@
 masks cut each cell into a few pieces of constant depth whose light is added exactly (`sim.cell`), rounded corners
 and tilted walls add what they change at the vertices and along the lines between the pieces, and slow errors
 (uniformity, rotation, magnification) are constants of tiles of 32 x 32 cells. Everything is differentiable in every
-floating-point error.
+floating-point error, except where edges of two masks coincide (there the light itself has a kink) and, for rounded
+corners, where the edge of another mask passes the corner (a jump of a small part of a small term).
 
 How each error enters:
 
