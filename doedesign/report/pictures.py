@@ -6,6 +6,7 @@ draw_mtf("mtf.png", camera, bank, near_m, far_m, lens_bank)
 draw_histograms("histograms.png", camera, plates.table, nominal.table, limits)
 """
 
+from doedesign.report.calibration import draw_check, draw_estimates, draw_family, draw_fitted_psfs
 from doedesign.report.curves import draw_encircled, draw_history, draw_mtf
 from doedesign.report.height import draw_height
 from doedesign.report.pattern import draw_pattern
@@ -16,7 +17,11 @@ from doedesign.report.tolerance import draw_budget, draw_changes, draw_histogram
 __all__ = [
     "draw_budget",
     "draw_changes",
+    "draw_check",
     "draw_encircled",
+    "draw_estimates",
+    "draw_family",
+    "draw_fitted_psfs",
     "draw_height",
     "draw_histograms",
     "draw_history",

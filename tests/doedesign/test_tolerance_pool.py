@@ -1,0 +1,247 @@
+"""Worker processes and the folder of finished plates: nothing that was finished is lost, and numbers do not depend on
+who computed them.
+
+Plates here are a few sums, so that what is tested is the machinery around them.
+"""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from doedesign.tolerance import Study, study
+from doedesign.tolerance.draws import normal_keys
+from doedesign.tolerance.pool import default_workers
+from fab.errors import InputError
+from fab.process import variation_of
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def fakes():
+    """Worker processes look for modules where this process does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(HERE)
+        yield import_module("tolerance_fakes")
+
+
+@pytest.fixture
+def ask(fakes: ModuleType) -> Callable[..., Study]:
+    def make(name: object = "fake", **settings: Any) -> Study:
+        usual = {"process": fakes.process(), "evaluate": fakes.rows, "quiet": True, "workers": 1}
+        return study(fakes.drawn(name), **{**usual, **settings})
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def right(fakes: ModuleType) -> dict[str, Any]:
+    """The rows of 40 plates, computed here."""
+    asked = study(fakes.drawn(), process=fakes.process(), evaluate=fakes.rows, quiet=True)
+    return {
+        key: json.loads(json.dumps(fakes.rows(asked.drawn, asked.process, asked.variation(key))))
+        for key in normal_keys(40)
+    }
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Study], fakes: ModuleType, right: dict):
+    asked = ask(workers=2)
+    asked.monte_carlo(40)
+    assert asked.journal.finished == right
+    set_up = ask(evaluate=fakes.settings, workers=2)
+    with pytest.raises(KeyError):  # these rows are no numbers of a plate
+        set_up.monte_carlo(8).table.worst("strehl")
+    for (row,) in set_up.journal.finished.values():
+        assert row["OMP_NUM_THREADS"] == "1"
+        assert row["JAX_PLATFORMS"] == "cpu"
+        assert "multi_thread_eigen=false" in row["XLA_FLAGS"]
+        assert row["pid"] != os.getpid()
+    assert os.environ.get("OMP_NUM_THREADS") is None  # this process is as it was
+    assert sys.modules["__main__"].__spec__ is not None or hasattr(sys.modules["__main__"], "__file__")
+
+
+def test_a_worker_that_dies_loses_no_plate(ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path):
+    asked = ask(tmp_path, evaluate=fakes.rows_or_death_once, workers=2, out=tmp_path / "out")
+    asked.monte_carlo(12)
+    assert asked.journal.finished == {key: right[key] for key in normal_keys(12)}
+    assert sorted(line["key"] for line in lines(tmp_path / "out" / "draws.jsonl")) == sorted(normal_keys(12))
+    # 12 plates, the one that died, and at most two others that were under way with it.
+    assert 13 <= len((tmp_path / "plates").read_text().splitlines()) <= 15
+
+
+def test_a_plate_that_kills_its_worker_again_and_again_is_named(
+    ask: Callable[..., Study], fakes: ModuleType, monkeypatch: pytest.MonkeyPatch
+):
+    asked = ask(evaluate=fakes.rows_or_death, workers=2)
+    deadly = variation_of(2, {"overlay_x_m[0]": fakes.DEADLY})
+    real = Study.variation
+    monkeypatch.setattr(Study, "variation", lambda self, key: deadly if key == "normal/4" else real(self, key))
+    with pytest.raises(InputError, match=r"draw normal/4: a worker must live through a draw.*--workers"):
+        asked.monte_carlo(10)
+    assert set(asked.journal.finished) == set(normal_keys(10)) - {"normal/4"}
+
+
+def test_a_plate_beyond_the_model_is_a_bad_plate(ask: Callable[..., Study], fakes: ModuleType, tmp_path: Path):
+    asked = ask(evaluate=fakes.refused, limits=["strehl >= 0"], out=tmp_path / "out")
+    plates = asked.monte_carlo(40)
+    beyond = asked.beyond(normal_keys(40))
+    assert 5 < len(beyond) < 40
+    assert set(beyond.values()) == {"overlay_x: must stay below 0.5 um, but got more"}
+    assert plates.yield_ is not None
+    assert plates.yield_.good == 40 - len(beyond)
+    assert plates.worst not in beyond
+    assert {row["key"] for row in plates.rows} == set(normal_keys(40)) - set(beyond)
+    assert all(math.isfinite(found["max"]) for found in plates.statistics())
+    # They are kept like the others.
+    again = ask(evaluate=fakes.refused, limits=["strehl >= 0"], out=tmp_path / "out")
+    assert again.monte_carlo(40).yield_ == plates.yield_
+    assert again.beyond(normal_keys(40)) == beyond
+    # Only a study that has no plate to show is none.
+    with pytest.raises(InputError, match=r"draw normal/\d+: must be within what can be evaluated.*0.5 um.*Lower"):
+        asked.plates(sorted(beyond)[:2])
+
+
+def test_a_mistake_in_a_function_of_ones_own_is_named(
+    ask: Callable[..., Study], fakes: ModuleType, monkeypatch: pytest.MonkeyPatch
+):
+    with pytest.raises(ZeroDivisionError) as caught:
+        ask(evaluate=fakes.broken).monte_carlo(2)
+    assert caught.value.__notes__ == ["in draw normal/0"]  # one worker takes them in their order
+    with pytest.raises(InputError, match="evaluate: must be a function at the top of a module"):
+        ask(evaluate=lambda *_: []).monte_carlo(1)
+    monkeypatch.setattr(fakes.rows, "__module__", "not_there")
+    with pytest.raises(ModuleNotFoundError, match="not_there"):
+        ask().monte_carlo(1)
+
+
+def test_a_study_goes_on_where_it_was(ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path):
+    ask(tmp_path, evaluate=fakes.marked_rows, out=tmp_path / "out").monte_carlo(3)
+    path = tmp_path / "out" / "draws.jsonl"
+    with open(path, "ab") as stream:
+        stream.write(b'{"key": "normal/3", "rows": [{"col')  # a run that was killed while it wrote
+    again = ask(tmp_path, evaluate=fakes.marked_rows, out=tmp_path / "out")
+    again.monte_carlo(5)
+    assert again.journal.finished == {key: right[key] for key in normal_keys(5)}
+    assert [line["key"] for line in lines(path)] == normal_keys(5)
+    assert len(lines(tmp_path / "plates")) == 5  # none was computed twice
+
+
+def test_a_folder_keeps_one_study(ask: Callable[..., Study], fakes: ModuleType, tmp_path: Path):
+    out = tmp_path / "out"
+    ask(out=out).monte_carlo(1)
+    for other, what in (
+        (ask(out=out, seed=1), "seed"),
+        (ask(out=out, process=fakes.process(overlay_x_m=1e-6)), "process"),
+        (ask("other", out=out), "design"),
+        (ask(out=out, evaluate=fakes.slow_rows), "evaluate"),
+    ):
+        with pytest.raises(InputError, match=rf"one with another {what}.*Choose another --out"):
+            other.monte_carlo(1)
+    # Limits judge plates, they do not make them.
+    assert ask(out=out, limits=["strehl >= 0"]).monte_carlo(1).yield_ is not None
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "letter.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"new or empty folder.*letter\.txt"):
+        ask(out=tmp_path / "foreign").monte_carlo(1)
+    with ask(out=out).journal.open(), pytest.raises(InputError, match="only one process"):
+        ask(out=out).monte_carlo(2)
+
+
+def test_a_damaged_line_is_named(ask: Callable[..., Study], tmp_path: Path):
+    (tmp_path / "out").mkdir()
+    ask(out=tmp_path / "out").monte_carlo(1)
+    path = tmp_path / "out" / "draws.jsonl"
+    path.write_bytes(b"[1]\n" + path.read_bytes())
+    with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished plate.*Remove"):
+        ask(out=tmp_path / "out").monte_carlo(2)
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {here!r})
+import tolerance_fakes as fakes
+from doedesign.tolerance import study
+asked = study(fakes.drawn({name!r}), process=fakes.process(), evaluate=fakes.marked_rows, workers=2, out={out!r})
+asked.monte_carlo(400)
+"""
+
+
+def started(folder: Path) -> subprocess.Popen[str]:
+    """A script of a user's, without `if __name__ == "__main__"`, that has finished a few plates."""
+    script = folder / "script.py"
+    script.write_text(SCRIPT.format(here=str(HERE), name=str(folder), out=str(folder / "out")))
+    process = subprocess.Popen(
+        [sys.executable, script],
+        env={**os.environ, "TMPDIR": str(folder)},  # what a killed process leaves there goes with the test
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while len(lines_so_far(folder / "out" / "draws.jsonl")) < 8:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return process
+
+
+def lines_so_far(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines() if path.exists() else []
+
+
+def alive(pid: int) -> bool:
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] not in ("Z", "X")
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc to see which processes live")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+def test_a_run_that_is_stopped_keeps_its_plates_and_its_workers_end(
+    how: signal.Signals, ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path
+):
+    process = started(tmp_path)
+    workers = {line["pid"] for line in lines(tmp_path / "plates")}
+    assert len(workers) == 2
+    process.send_signal(how)
+    _, said = process.communicate(timeout=20)
+    assert process.returncode != 0
+    assert ("KeyboardInterrupt" in said) == (how == signal.SIGINT)
+    assert "SpawnProcess" not in said  # no worker cries out
+    deadline = time.monotonic() + 10
+    while any(alive(pid) for pid in workers):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    kept = [json.loads(line)["key"] for line in lines_so_far(tmp_path / "out" / "draws.jsonl") if line.endswith(b"}")]
+    assert len(kept) >= 8
+    again = ask(tmp_path, evaluate=fakes.marked_rows, out=tmp_path / "out", workers=2)
+    again.monte_carlo(20)
+    assert {key: again.journal.finished[key] for key in normal_keys(20)} == {key: right[key] for key in normal_keys(20)}
+    assert set(kept) <= set(again.journal.finished)
+
+
+def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest.MonkeyPatch):
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 1e3)
+    assert default_workers(2400**2) == cores
+    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 2.5)
+    assert default_workers(2400**2) == 1
+    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 0.1)
+    assert default_workers(100) == 1

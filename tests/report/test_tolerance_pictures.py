@@ -1,0 +1,150 @@
+"""Pictures of tolerance studies are whole, repeatable, and show what they are given."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from doedesign.report.pictures import draw_budget, draw_changes, draw_histograms, draw_shares, draw_yield
+from doedesign.report.tolerance import error_label
+from doedesign.tolerance import Budget, Change, Index, Share, Table, limit_from_text
+from doedesign.tolerance.analysis import yield_of
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+
+RGB = (Colour("656nm", (656e-9,), (1.0,)), Colour("589nm", (589e-9,), (1.0,)), Colour("486nm", (486e-9,), (1.0,)))
+CAMERA = Camera(Grid((64, 64), 1.85e-6), 116e-6, "fused_silica", RGB, 1e-3, 1.85e-6, 32)
+PLACES = tuple((colour.name, depth) for colour in RGB for depth in (0.05, np.inf))
+NEAR_ROWS = np.array([depth < 1 for _, depth in PLACES])
+LIMITS = [
+    limit_from_text(text) for text in ("zeroth_order <= 5 %", "ring_to_disc >= 2", "ring_to_disc >= 2.5 for 656nm")
+]
+# The lines that stand for limits.
+MARK = np.array([0xD1, 0x49, 0x5B]) / 255
+
+
+def random_table(rng: np.random.Generator, plates: int = 60) -> Table:
+    shape = (plates, len(PLACES))
+    values = {
+        "zeroth_order": rng.gamma(3, 0.01, shape),
+        "strehl": 1 - rng.gamma(2, 0.03, shape),
+        "throughput": np.full(shape, 0.9),  # a number that does not vary
+        "outside_window": rng.gamma(3, 0.02, shape),
+        "ring_to_disc": np.where(NEAR_ROWS, rng.normal(3, 0.5, shape), np.nan),
+        "far_spot": np.where(NEAR_ROWS, np.nan, rng.normal(0.4, 0.02, shape)),
+    }
+    values["ring_to_disc"][0, 0] = np.inf  # a plate without any light in the disc
+    return Table(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
+
+
+def changes(rng: np.random.Generator) -> list[Change]:
+    names = [f"{key}[{k}]" for key in ("overlay_x_m", "overlay_y_m", "depth_scale", "cd_bias_m") for k in range(4)]
+
+    def change(name: str, quantity: str, colour: str | None) -> Change:
+        low, high = 0.4 + 0.01 * rng.normal(size=2)
+        return Change(name, "overlay", quantity, colour, float(low), 0.4, float(high), 1e-6)
+
+    out = [
+        change(name, quantity, colour)
+        for quantity in ("zeroth_order", "far_spot")
+        for colour in (None, "656nm")
+        for name in names
+    ]
+    return [*out, Change("corner_radius_m", "corners", "far_spot", None, None, 0.4, 0.38, 1e-6)]
+
+
+def shares(rng: np.random.Generator) -> list[Share]:
+    def index() -> Index:
+        value = float(rng.uniform(0, 0.6))
+        return Index(value, value - 0.1, value + 0.1)
+
+    return [
+        Share(source, quantity, colour, index(), index())
+        for quantity in ("zeroth_order", "strehl", "far_spot", "ring_to_disc")
+        for colour in (None, *(colour.name for colour in RGB))
+        for source in ("depth", "overlay", "cd", "roughness", "defects")
+    ]
+
+
+def budget(verdict: str = "found") -> Budget:
+    yields = [yield_of(np.arange(64) < good) for good in (64, 62, 50, 30)]
+    return Budget("overlay", 0.9, (0.0, 0.5, 1.0, 2.0), tuple(yields), verdict, 0.7, 0.5, 0.9, {"overlay_x_m[0]": 4e-7})  # pyright: ignore[reportArgumentType]
+
+
+def draw_all(folder: Path) -> dict[str, Path]:
+    rng = np.random.default_rng(5)
+    names = ("histograms", "yield", "one_at_a_time", "sobol", "budget", "bare", "beyond")
+    files = {name: folder / f"{name}.png" for name in names}
+    table = random_table(rng)
+    draw_histograms(files["histograms"], CAMERA, table, table.of(["normal/3"]), LIMITS)
+    draw_yield(files["yield"], table, LIMITS)
+    draw_changes(files["one_at_a_time"], changes(rng))
+    draw_shares(files["sobol"], CAMERA, shares(rng))
+    draw_budget(files["budget"], budget())
+    draw_yield(files["bare"], table)
+    draw_budget(files["beyond"], budget("beyond"))
+    return files
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return draw_all(tmp_path_factory.mktemp("pictures"))
+
+
+def test_every_picture_is_whole_and_nothing_is_cut_off(pictures: dict[str, Path]):
+    for name, path in pictures.items():
+        image = imread(path)[..., :3]
+        assert np.ptp(image) > 0.9, name
+        rim = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+        assert np.all(rim == 1.0), name
+
+
+def test_the_same_input_gives_the_same_bytes(pictures: dict[str, Path], tmp_path: Path):
+    with mpl.rc_context({"font.size": 20, "axes.grid": True, "axes.formatter.useoffset": True}):
+        again = draw_all(tmp_path)
+    for name, path in again.items():
+        assert path.read_bytes() == pictures[name].read_bytes(), name
+        assert not any(chunk in path.read_bytes() for chunk in (b"tEXt", b"iTXt", b"tIME")), name
+
+
+def coloured(path: Path, hue: np.ndarray) -> int:
+    """Number of dots of a colour."""
+    return int(np.all(np.abs(imread(path)[..., :3] - hue) < 0.02, axis=-1).sum())
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda path, table, limits: draw_histograms(path, CAMERA, table, table, limits),
+        draw_yield,
+    ],
+    ids=["histograms", "yield"],
+)
+def test_a_limit_is_marked_wherever_it_lies(
+    draw: Callable[[Path, Table, list], None], rng: np.random.Generator, tmp_path: Path
+):
+    table = random_table(rng)
+    draw(tmp_path / "without.png", table, [])
+    assert coloured(tmp_path / "without.png", MARK) == 0
+    # Far from all plates: the view is widened.
+    draw(tmp_path / "with.png", table, [limit_from_text("ring_to_disc >= 9")])
+    # One line over the height of a panel, 1.7 inches of 160 dots, about 2 wide; not all of them are of the pure colour.
+    assert coloured(tmp_path / "with.png", MARK) > 200
+
+
+def test_a_longer_bar_is_a_larger_change(tmp_path: Path):
+    for size in (0.01, 0.04):
+        change = Change("overlay_x_m[0]", "overlay", "far_spot", None, 0.4 - size, 0.4, 0.4 + size / 4, 1e-4)
+        other = Change("depth_scale[0]", "depth", "far_spot", None, 0.36, 0.4, 0.44, 1e-4)
+        draw_changes(tmp_path / f"{size}.png", [change, other])
+    lower = np.array([0x56, 0xB4, 0xE9]) / 255
+    assert coloured(tmp_path / "0.04.png", lower) > 1.3 * coloured(tmp_path / "0.01.png", lower)
+
+
+def test_an_error_is_named_in_words():
+    assert error_label("overlay_x_m[2]") == "overlay x, mask 2"
+    assert error_label("sidewall_rad") == "sidewall"
+    assert error_label("radial_nonuniformity") == "radial nonuniformity"
