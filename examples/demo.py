@@ -16,10 +16,10 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.drawing import level_map_from
 from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
+from doedesign.drawing import level_map_from
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, label
 
 from fab.errors import InputError
 from sim.frames import Frame
@@ -173,22 +173,18 @@ def without_background(psf: MeasuredPsf) -> tuple[MeasuredPsf, float]:
 def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
     """Where the point about which the light is most symmetric lies: row and column, pixel centres at whole numbers.
 
-    The peak of the image's convolution with itself, of the root of the intensity so that disc and ring count
-    beside a bright spot. Good to a few pixels of a large frame; a comparison with the model does the rest.
+    The peak of the image's convolution with itself. Good to a few pixels; a comparison with the model does the rest.
 
     Raises:
         InputError: no light above the noise.
     """
     factor = max(1, -(-max(psf.rate.shape) // _SEARCH))
-    share = _sums(psf.valid.astype(np.float64), factor)
-    light, floor = (_sums(np.where(psf.valid, values, 0.0), factor) for values in (psf.rate, psf.floor))
-    # Pixels of another colour lie among their neighbours; where whole regions are full, the light is brightest.
-    seen = gaussian_filter(share, 1.5)
-    dense = seen > 0.02 * factor**2
-    smooth = np.where(dense, gaussian_filter(light, 1.5) / np.maximum(seen, 1e-3), psf.rate[psf.valid].max())
+    there = (np.where(psf.valid, values, 0.0) for values in (psf.rate, psf.floor, psf.valid))
+    sums, floor, share = (_sums(values, factor) for values in there)
+    light = _without_holes(sums, share, factor)
     # That filter leaves a fifth of white noise.
     quiet = np.sqrt(np.median(floor[share > 0] / share[share > 0] ** 2)) / 5
-    clear = np.sqrt(np.where(smooth > 6 * quiet, np.maximum(smooth, 0.0), 0.0))
+    clear = np.where(light > 6 * quiet, np.maximum(light, 0.0), 0.0)
     if not clear.any():
         raise InputError("image", "there must be light above the noise", "none", "Expose longer, or check the files.")
     size = tuple(cast(int, next_fast_len(2 * count, real=True)) for count in clear.shape)
@@ -198,6 +194,30 @@ def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
     # A bin's middle lies (factor - 1) / 2 pixels beyond its first one.
     row, column = (factor * place / 2 + (factor - 1) / 2 for place in peak)
     return row, column
+
+
+def smoothed(psf: MeasuredPsf) -> Float[np.ndarray, "y x"]:
+    """The image a little blurred and without holes, for comparisons that need every pixel."""
+    light, share = (np.where(psf.valid, values, 0.0).astype(np.float64) for values in (psf.rate, psf.valid))
+    return _without_holes(light, share, 1)
+
+
+def _without_holes(
+    light: Float[np.ndarray, "y x"], share: Float[np.ndarray, "y x"], factor: int
+) -> Float[np.ndarray, "y x"]:
+    """Sums over bins as a blurred image; `share` counts the pixels that are there, of `factor` squared.
+
+    Pixels of another colour lie among their neighbours. Where a whole region is missing it is the brightest of all, or,
+    if it reaches the border, beyond the frame.
+    """
+    seen = gaussian_filter(share, 1.5)
+    there = seen > 0.02 * factor**2
+    mean = gaussian_filter(light, 1.5) / np.maximum(seen, 1e-3)
+    labelled: Any = label(~there)
+    regions = labelled[0]
+    edge = np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]])
+    full = ~there & ~np.isin(regions, edge)
+    return np.where(there, mean, np.where(full, mean[there].max() if there.any() else 0.0, 0.0))
 
 
 def _sums(values: Float[np.ndarray, "y x"], factor: int) -> Float[np.ndarray, "v u"]:

@@ -21,7 +21,7 @@ from doedesign.spec import variation_to_toml
 from doedesign.tolerance.analysis import QUANTITIES, limit_text, obeys, yield_of
 from doedesign.tolerance.budget import Budget
 from doedesign.tolerance.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
-from doedesign.tolerance.pool import Work, evaluate_here, predicted_bank
+from doedesign.tolerance.pool import Beyond, Work, evaluate_here, predicted_bank
 from doedesign.tolerance.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerance.studies import FORMAT, Plates, Study, study
 from fab.errors import InputError
@@ -144,7 +144,8 @@ def one_draw(run_folder: Path, key: str, as_json: bool, **settings: Any) -> str:
     asked = study(open_run(run_folder), quiet=True, **{**settings, "workers": 1})
     variation = asked.variation(key)
     asked.plates([key])
-    rows = asked.journal.finished[key]
+    kept = asked.journal.finished[key]
+    rows = [] if isinstance(kept, Beyond) else kept
     if as_json:
         return json.dumps({"key": key, "variation": vars(variation), "rows": rows}, sort_keys=True)
     lines = [f"draw {key} of {asked.drawn.name}, seed {asked.seed}"]
@@ -175,6 +176,7 @@ def _results(asked: Study, plan: Plan, found: Found) -> dict[str, Any]:
         "units": "SI; a depth of null is infinity; a colour of null is the worst colour and depth of each plate",
         "nominal": found.nominal.rows,
         "expected": found.expected.rows,
+        "beyond": asked.beyond(plan.keys(asked)),
         "plates": _told(asked, found.plates),
     }
     if found.changes is not None:
@@ -257,12 +259,14 @@ def _draw(folder: Path, asked: Study, found: Found) -> list[str]:
 def _draw_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]:
     """One line per plate, colour and depth, with every number that was found; empty where a row has no such number."""
     plates = asked.journal.finished
-    numbers = list(dict.fromkeys(name for row in plates[keys[0]] for name in row if name not in ("colour", "depth_m")))
-    yield ("key", "colour", "depth_m", *sorted(numbers))
+    rows = (row for key in keys if not isinstance(found := plates[key], Beyond) for row in found)
+    numbers = sorted({name for row in rows for name in row} - {"colour", "depth_m"})
+    yield ("key", "colour", "depth_m", *numbers)
     for key in keys:
-        for row in plates[key]:
+        found = plates[key]
+        for row in [] if isinstance(found, Beyond) else found:
             depth = "inf" if row["depth_m"] is None else row["depth_m"]
-            values = ("inf" if row.get(name, "") is None else row.get(name, "") for name in sorted(numbers))
+            values = ("inf" if row.get(name, "") is None else row.get(name, "") for name in numbers)
             yield (key, row["colour"], depth, *values)
 
 
@@ -298,6 +302,9 @@ def summary(asked: Study, plan: Plan, found: Found, results: Mapping[str, Any]) 
         words.append(f"most important: {source}, {100 * shares[source]:.0f} % of the variance of the {label}")
     if found.budget is not None:
         words.append(f"{found.budget}{_sigmas(found.budget)}")
+    if results["beyond"]:
+        key, reason = next(iter(results["beyond"].items()))
+        words.append(f"{len(results['beyond'])} plates beyond the model count as bad, such as {key} ({reason})")
     return "; ".join(words)
 
 

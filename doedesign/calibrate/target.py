@@ -1,0 +1,213 @@
+"""One measured image beside its model: the window, its place, its weights, and the two numbers that are solved for.
+
+Of every image the brightness and the level of its background are unknown. Given the model's image they follow from
+linear least squares, so the search never sees them (variable projection): with r = y - gain m - background at the
+best gain and background, the gradient of the weighted squares with respect to the model is -2 gain W r.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.fft import irfft2, rfft2
+from scipy.ndimage import gaussian_filter
+
+from fab.errors import InputError
+from sim.measured import MeasuredPsf, cut_window, smoothed
+
+
+class Shot(NamedTuple):
+    """A measured image as it came.
+
+    Attributes:
+        name: what it is called.
+        depth_m: depth of the point source.
+        psf: the whole merged frame.
+        centre: row and column about which its light lies.
+        brightness: rate that all light on the clear aperture would give, and its relative standard deviation; None
+            where only the shape is known.
+        defocus_sigma: standard deviation of the source's curvature, 1/m; 0 if its depth is exact.
+    """
+
+    name: str
+    depth_m: float
+    psf: MeasuredPsf
+    centre: tuple[float, float]
+    brightness: tuple[float, float] | None = None
+    defocus_sigma: float = 0.0
+
+
+class Target(NamedTuple):
+    """A measured image in the window, in units in which its light adds up to about 1.
+
+    Attributes:
+        name: what it is called.
+        depth_m: depth of the point source.
+        psf: the window.
+        scale: rate of one unit.
+        shift_px: where the chief ray lies, pixels from the window's middle (y, x), as found before the fit.
+        gain: what the gain should be and its standard deviation, or None.
+        defocus_sigma: standard deviation of the source's curvature, 1/m.
+    """
+
+    name: str
+    depth_m: float
+    psf: MeasuredPsf
+    scale: float
+    shift_px: tuple[float, float]
+    gain: tuple[float, float] | None
+    defocus_sigma: float
+
+
+class Match(NamedTuple):
+    """A model beside a measured image.
+
+    Attributes:
+        gain: what one unit of the model's energy is in the image.
+        background: level of the image.
+        residual: `[y, x]` image - gain * model - background.
+        squares: weighted sum of squares, with the gain's own term.
+    """
+
+    gain: float
+    background: float
+    residual: Float[np.ndarray, "y x"]
+    squares: float
+
+
+def target_of(shot: Shot, window: int, model: Float[np.ndarray, "y x"]) -> Target:
+    """Cut a shot to the window and find its centre by comparison with a model.
+
+    Args:
+        shot: the image.
+        window: pixels per side.
+        model: `[y, x]` what the image should look like, centred.
+
+    Raises:
+        InputError: the image is smaller than the window, or its middle is no light at all.
+    """
+    psf, rest = _window(shot, shot.centre, window)
+    shift = _shift_px(smoothed(psf), model)
+    for _ in range(2):
+        if max(map(abs, shift)) <= 1:
+            break
+        # From here on the place in the window is the model's word.
+        low_y, low_x = (c - r for c, r in zip(shot.centre, rest, strict=True))
+        shot = shot._replace(centre=(low_y + shift[0], low_x + shift[1]))
+        psf, rest = _window(shot, shot.centre, window)
+        shift = _shift_px(smoothed(psf), model)
+    scale = shot.brightness[0] if shot.brightness else float(psf.rate[psf.valid].sum())
+    if not scale > 0:
+        raise InputError(shot.name, "the light above the background must add up", f"{scale:.4g}", "Expose longer.")
+    unit = MeasuredPsf(psf.rate / scale, psf.floor / scale**2, psf.slope / scale, psf.valid)
+    gain = (1.0, shot.brightness[1]) if shot.brightness else None
+    return Target(shot.name, shot.depth_m, unit, scale, shift, gain, shot.defocus_sigma)
+
+
+def _window(shot: Shot, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
+    try:
+        psf, rest = cut_window(shot.psf, centre, window)
+    except InputError as error:
+        raise InputError(shot.name, error.rule, error.got, error.cure) from error
+    if not psf.valid.any():
+        got = f"a centre at row {centre[0]:.0f}, column {centre[1]:.0f}"
+        raise InputError(shot.name, "its light must lie within the frame", got, "Check `centre`.")
+    return psf, rest
+
+
+def _correlation(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "v u"]:
+    """Correlation of the roots of two intensities for every shift of the first, normalised, in FFT order.
+
+    The model is blurred like the image (`sim.measured.smoothed`).
+    """
+    one, other = (np.sqrt(np.maximum(values, 0.0)) for values in (image, gaussian_filter(model, 1.5)))
+    one, other = one - one.mean(), other - other.mean()
+    size = (2 * image.shape[0], 2 * image.shape[1])
+    ahead, behind = (np.asarray(rfft2(v, size)) for v in (one, other))
+    norm = np.sqrt((one**2).sum() * (other**2).sum())
+    return np.asarray(irfft2(ahead * behind.conj(), size)) / max(norm, np.finfo(float).tiny)
+
+
+def _shift_px(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> tuple[float, float]:
+    """By how many pixels (y, x) an image lies off a model: the peak of their correlation."""
+    likeness = _correlation(image, model)
+    row, column = (int(i) for i in np.unravel_index(np.argmax(likeness), likeness.shape))
+
+    def place(line: Float[np.ndarray, " n"], at: int) -> float:
+        low, peak, high = line[at - 1], line[at], line[(at + 1) % len(line)]
+        bend = low - 2 * peak + high
+        whole = at if at < len(line) // 2 else at - len(line)
+        return whole + (float((low - high) / (2 * bend)) if bend < 0 else 0.0)
+
+    return place(likeness[:, column], row), place(likeness[row], column)
+
+
+def likeness(target: Target, model: Float[np.ndarray, "y x"], quarter_turns: int, mirrored: bool) -> float:
+    """How much an image, turned to the left after it was mirrored left to right, looks like a model: 1 if equal."""
+    picture = smoothed(target.psf)
+    # Rows count upwards, so numpy's turn to the left is one to the right.
+    turned = np.rot90(picture[:, ::-1] if mirrored else picture, -quarter_turns)
+    return float(_correlation(turned, model).max())
+
+
+def measured_weights(target: Target, model_error: float) -> Float[np.ndarray, "y x"]:
+    """Inverse variances with the signal taken from the measurement itself, smoothed a little against its noise."""
+    return weights_at(target, gaussian_filter(np.maximum(target.psf.rate, 0.0), 0.7), model_error)
+
+
+def weights_at(
+    target: Target, signal: Float[np.ndarray, "y x"], model_error: float, background: float = 0.0
+) -> Float[np.ndarray, "y x"]:
+    """Inverse variances where the light is `signal`; zero where a pixel says nothing.
+
+    Args:
+        target: the image.
+        signal: light of the plate, in the target's units.
+        model_error: relative error that the model expects of itself.
+        background: further light, which the model does not make.
+    """
+    # What the transform gets wrong at a bright pixel it gets wrong beside it, too.
+    nearby = gaussian_filter(signal**2, 1.0)
+    variance = target.psf.variance(signal + background) + model_error**2 * nearby
+    return np.where(target.psf.valid, 1 / np.maximum(variance, np.finfo(float).tiny), 0.0)
+
+
+def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Match:
+    """Best gain and background, and what is left."""
+    rate, total = target.psf.rate, weights.sum()
+    mean_model, mean_rate = (float((weights * v).sum() / total) for v in (model, rate))
+    centred = weights * (model - mean_model)
+    wanted, trust = (target.gain[0], target.gain[1] ** -2) if target.gain else (0.0, 0.0)
+    against = float((centred * (rate - mean_rate)).sum()) + trust * wanted
+    gain = max(against / (float((centred * (model - mean_model)).sum()) + trust), np.finfo(float).tiny)
+    background = mean_rate - gain * mean_model
+    residual = np.where(weights > 0, rate - gain * model - background, 0.0)
+    squares = float((weights * residual**2).sum()) + trust * (gain - wanted) ** 2
+    return Match(gain, background, residual, squares)
+
+
+def projected(
+    target: Target,
+    weights: Float[np.ndarray, "y x"],
+    model: Float[np.ndarray, "y x"],
+    found: Match,
+    columns: Float[np.ndarray, "p y x"],
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    """Half the Hessian (Gauss-Newton) and half the negative gradient of the squares, gain and background solved for.
+
+    Args:
+        target: the image.
+        weights: its weights.
+        model: the model's image.
+        found: their match.
+        columns: derivatives of the model's image.
+    """
+    flat = found.gain * columns.reshape(len(columns), -1)
+    weight = weights.ravel()
+    solved = np.stack([model.ravel(), np.ones(weight.size)])
+    known = (solved * weight) @ solved.T
+    if target.gain:
+        known[0, 0] += target.gain[1] ** -2
+    cross = (solved * weight) @ flat.T
+    hessian = (flat * weight) @ flat.T - cross.T @ np.linalg.solve(known, cross)
+    return hessian, (flat * weight) @ found.residual.ravel()
