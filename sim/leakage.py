@@ -21,7 +21,7 @@ from sim.surface import Surface
 def mean_transmission(surface: Surface) -> Complex[np.ndarray, " w"]:
     """Mean transmission c0 over the open aperture, weighted by every cell's open share, per wavelength."""
     coverage = np.asarray(surface.coverage, np.float64)
-    return _over(np.asarray(surface.transmission), coverage) / coverage.sum()
+    return _over(np.asarray(surface.means), coverage) / coverage.sum()
 
 
 def _over(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
@@ -41,9 +41,9 @@ def strehl(surface: Surface, nominal: Surface) -> Float[np.ndarray, " w"]:
         nominal: the plate exactly as drawn, on the DOE's own grid; where the plate is finer, its cells are repeated.
     """
     parts = surface.grid.shape[0] // nominal.grid.shape[0]
-    meant = np.repeat(np.repeat(np.conj(np.asarray(nominal.transmission)), parts, axis=1), parts, axis=2)
+    meant = np.repeat(np.repeat(np.conj(np.asarray(nominal.means)), parts, axis=1), parts, axis=2)
     coverage = np.asarray(surface.coverage, np.float64)
-    return np.abs(_over(np.asarray(surface.transmission) * meant, coverage) / coverage.sum()) ** 2
+    return np.abs(_over(np.asarray(surface.means) * meant, coverage) / coverage.sum()) ** 2
 
 
 class SplitPsf(NamedTuple):

@@ -26,6 +26,7 @@ class Surface(eqx.Module):
     Attributes:
         transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
             that of the plate within `sim.cell`'s accuracy, and its mean is the plate's.
+        means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other plates.
         coverage: `[y, x]` open share of every cell.
         grid: the cells: those of the DOE, or a whole number of parts of them where the sensor sees waves too
             oblique for moments.
@@ -34,6 +35,7 @@ class Surface(eqx.Module):
     """
 
     transmission: Complex[Array, "w y x"]
+    means: Complex[Array, "w y x"]
     coverage: Float[Array, "y x"]
     grid: Grid = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
@@ -75,7 +77,7 @@ def as_fabricated(
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return Surface(flat, coverage, camera.grid, lines, height)
+        return Surface(flat, flat, coverage, camera.grid, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan = plan_of(camera, process, variation, min(lines), traced)
@@ -84,12 +86,12 @@ def as_fabricated(
         _keep_off(etched, particle, camera.grid)
     widths = _opening_widths(etched) if traced or variation.etch_lag else None
     relief = relief_of(camera.grid, process, variation, traced)
-    transmission = transmission_of(_packed(etched), widths, relief, rates, plan)
+    transmission, means = transmission_of(_packed(etched), widths, relief, rates, plan)
     loss = _subcell_loss(variation, camera.grid.pitch_m, rates, traced)
     if loss is not None:
-        transmission = transmission * loss[:, None, None]
+        transmission, means = transmission * loss[:, None, None], means * loss[:, None, None]
     grid = _refined(camera.grid, plan.parts)
-    return Surface(transmission, _coverage(grid, camera, variation, traced), grid, lines)
+    return Surface(transmission, means, _coverage(grid, camera, variation, traced), grid, lines)
 
 
 def _flat(height_m: Array, rate: Array) -> Array:

@@ -113,7 +113,7 @@ def _widest_band(camera: Camera, wavelength_m: float) -> float:
     return half * camera.grid.pitch_m / (wavelength_m * camera.sensor_distance_m)
 
 
-def _per_mask(value: tuple[float, ...], masks: int) -> Array:
+def _per_mask(value: tuple[float | Array, ...], masks: int) -> Array:
     return jnp.asarray(jnp.stack([jnp.asarray(v, jnp.float32) for v in value]) if value else jnp.zeros(masks))
 
 

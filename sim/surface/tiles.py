@@ -28,8 +28,8 @@ def transmission_of(
     relief: Relief,
     rates: Float[Array, " w"],
     plan: Plan,
-) -> Complex[Array, "w v u"]:
-    """Transmission of every cell, tile by tile, with the far field of the whole plate within the band."""
+) -> tuple[Complex[Array, "w v u"], Complex[Array, "w v u"]]:
+    """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean."""
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
     halo = ((plan.reach, plan.reach + count_y * TILE - ny), (plan.reach, plan.reach + count_x * TILE - nx))
@@ -49,13 +49,15 @@ def transmission_of(
         bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
         return _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
 
-    def strip(start_y: Array) -> Array:
+    def strip(start_y: Array) -> tuple[Array, Array]:
         starts = jnp.arange(count_x) * TILE
         moments = jax.lax.map(jax.checkpoint(lambda start_x: tile(start_y, start_x)), starts)
         return _strip_values(moments, plan)
 
-    strips = jax.lax.map(strip, jnp.arange(count_y) * TILE)
-    return _joined(strips)[:, : ny * plan.parts, : nx * plan.parts]
+    strips, means = jax.lax.map(strip, jnp.arange(count_y) * TILE)
+    means = jnp.moveaxis(means, 0, 1).reshape(rates.shape[0], -1, means.shape[3])
+    inside = (slice(None), slice(ny * plan.parts), slice(nx * plan.parts))
+    return _joined(strips)[inside], means[inside]
 
 
 def _tile_moments(
@@ -108,8 +110,10 @@ def _tile_moments(
     return moments.reshape(*moments.shape[:3], tile, tile)
 
 
-def _strip_values(moments: Float[Array, "tile moment 2 w t t"], plan: Plan) -> Complex[Array, "w v u"]:
-    """One row of tiles as values of its cells, with what spills to the cells `FILTER_REACH` above and below."""
+def _strip_values(
+    moments: Float[Array, "tile moment 2 w t t"], plan: Plan
+) -> tuple[Complex[Array, "w v u"], Complex[Array, "w y u"]]:
+    """One row of tiles as values of its cells, with what spills to `FILTER_REACH` cells above and below; and means."""
     count, _, _, lines = moments.shape[:4]
     parts, reach = plan.parts, FILTER_REACH
     moments = moments.reshape(count, parts, parts, len(DEGREES), 2, lines, TILE, TILE)
@@ -127,7 +131,8 @@ def _strip_values(moments: Float[Array, "tile moment 2 w t t"], plan: Plan) -> C
         odd = of[1, 0] + _filtered(of[1, 1], first, 2)
         wide = _filtered(jnp.pad(odd, spill), first, 1) + _filtered(jnp.pad(of[2, 0], spill), second, 1)
         total = jnp.pad(even, spill) + wide
-    return jax.lax.complex(*total.reshape(2, lines, *total.shape[1:]))
+    filtered, means = (part.reshape(2, lines, *part.shape[1:]) for part in (total, values[0]))
+    return jax.lax.complex(*filtered), jax.lax.complex(*means)
 
 
 def _filtered(values: Float[Array, "n v u"], weights: Float[np.ndarray, " tap"], axis: int) -> Float[Array, "n v u"]:
