@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.masks import planes
+from fab.masks import levels_of, planes
 from fab.process import ERRORS, Process, Variation, error_names, variation_of
 from sim.camera import Camera, Colour
 from sim.leakage import split_psf, strehl, zeroth_order
@@ -132,9 +132,8 @@ def test_overlay_by_whole_pixels_shifts_one_plane(shift):
     level[8:-8, 8:-8] = noise_map()[8:-8, 8:-8]
     split = planes(level, LEVELS)
     split[2] = np.roll(split[2], shift, axis=(0, 1))
-    moved = (15 - sum(split[k].astype(int) << k for k in range(4))).astype(np.uint8)
-    lines = {"overlay_y_m": shift[0] * PITCH, "overlay_x_m": shift[1] * PITCH}
-    off = Variation(**{name: (0.0, 0.0, value, 0.0) for name, value in lines.items()})
+    moved = levels_of(split, LEVELS)
+    off = variation_of(4, {"overlay_y_m[2]": shift[0] * PITCH, "overlay_x_m[2]": shift[1] * PITCH})
     one = as_fabricated(level, cam, PROCESS, off)
     other = as_fabricated(moved, cam, PROCESS, Variation())
     # 1.85 um is no float32; 1e-7 of a cell is left, and the sine is good to 4e-6.
