@@ -58,7 +58,8 @@ def displaced_circle_coverage(
     y = (jnp.asarray(grid.axis_m("y"), jnp.float32) - centre_m[0])[:, None] / grid.pitch_m
     x = (jnp.asarray(grid.axis_m("x"), jnp.float32) - centre_m[1])[None, :] / grid.pitch_m
     distance = jnp.sqrt(jnp.maximum(y * y + x * x, 1e-6))
-    steep = jnp.maximum(jnp.abs(y), jnp.abs(x)) / distance
+    # At least 0.7, but in the very middle of the circle, where nothing is to be divided by zero.
+    steep = jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(x)) / distance, 0.5)
     flat = jnp.maximum(jnp.minimum(jnp.abs(y), jnp.abs(x)) / distance, 1e-4)
     inward = radius - distance
     far, near = (steep + flat) / 2, (steep - flat) / 2

@@ -152,7 +152,10 @@ def likeness(target: Target, model: Float[np.ndarray, "y x"], quarter_turns: int
 
 def measured_weights(target: Target, model_error: float) -> Float[np.ndarray, "y x"]:
     """Inverse variances with the signal taken from the measurement itself, smoothed a little against its noise."""
-    return weights_at(target, gaussian_filter(np.maximum(target.psf.rate, 0.0), 0.7), model_error)
+    valid = target.psf.valid.astype(np.float64)
+    light = gaussian_filter(np.maximum(target.psf.rate, 0.0) * valid, 0.7)
+    # Over the pixels that are there: a mosaic has others between them.
+    return weights_at(target, light / np.maximum(gaussian_filter(valid, 0.7), 1e-3), model_error)
 
 
 def weights_at(

@@ -72,12 +72,11 @@ def calibrate(
     for name, pixels in measured.full.items():
         if pixels and measured.spec.channel is None:
             say(f"{name}: {pixels} pixels are full in every exposure and left out")
-    # Usually seven rounds of slopes to either side.
-    with _models("calibration", 7 * (2 * len(unknowns.names) + 1)) as on_model:
-        result = fitted(
-            drawn, believed, measured, errors, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model
-        )
     with _written(run, folder) as fresh:
+        # Usually seven rounds of slopes and a step.
+        with _models("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
+            settings = {"evaluations": evaluations, "polish": polish, "seed": seed, "on_model": on_model}
+            result = fitted(drawn, believed, measured, errors, **settings)
         _write(fresh, run, spec, measured, result)
     say(summary(result))
     return folder, result
@@ -119,11 +118,11 @@ def explain(
     require_own(folder)
     drawn = drawn_of(run, masks)
     believed = process_for(drawn.levels, run.spec.process, process)
-    # About as many plates as kinds of errors, twice their reach, and half as many again for pairs.
-    with _models("explanations", 200) as on_model:
-        family = explanations(drawn, believed, targets, errors, pairs=pairs, reach=reach, on_model=on_model)
-    text = family_text(family)
     with _written(run, folder) as fresh:
+        # About ten plates for every error and six for a pair.
+        with _models("explanations", 200) as on_model:
+            family = explanations(drawn, believed, targets, errors, pairs=pairs, reach=reach, on_model=on_model)
+        text = family_text(family)
         (fresh / "explanations.json").write_bytes(canonical_json({"run": run.spec.name, **_family_record(family)}))
         (fresh / "explanations.txt").write_text(text + "\n", encoding="utf-8")
         draw_family(fresh / "explanations.png", family)

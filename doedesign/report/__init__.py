@@ -8,7 +8,8 @@ Reading order, from what they share to the single picture:
     psfs        point spread functions of every colour and depth
     curves      MTF and encircled energy over colours and depths, and the history of an optimisation
     pattern     a target pattern beside what the plate draws
-    calibration measured images beside the model's, errors with their uncertainty, what explains a single ratio
+    calibration measured images beside the model's, errors with their uncertainty
+    family      what would explain a measured ring:disc ratio
     tolerance   what a process makes of a design: histograms, yield, which errors matter and how large they may be
 
 Conventions: SI units in every argument, human units on the axes; up in a picture is +y. The same input gives the

@@ -6,8 +6,9 @@ draw_mtf("mtf.png", camera, bank, near_m, far_m, lens_bank)
 draw_histograms("histograms.png", camera, plates.table, nominal.table, limits)
 """
 
-from doedesign.report.calibration import draw_check, draw_estimates, draw_family, draw_fitted_psfs
+from doedesign.report.calibration import draw_check, draw_estimates, draw_fitted_psfs
 from doedesign.report.curves import draw_encircled, draw_history, draw_mtf
+from doedesign.report.family import draw_family
 from doedesign.report.height import draw_height
 from doedesign.report.pattern import draw_pattern
 from doedesign.report.plate import draw_split

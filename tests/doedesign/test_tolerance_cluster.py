@@ -141,7 +141,9 @@ def test_workers_are_set_up_and_mistakes_are_told(
     set_up = ask(evaluate=fakes.settings)
     with pytest.raises(KeyError):  # these rows are no numbers of a plate
         set_up.monte_carlo(1).table.worst("strehl")
-    (row,) = set_up.journal.finished["normal/0"]
+    found = set_up.journal.finished["normal/0"]
+    assert isinstance(found, list)
+    (row,) = found
     assert (row["JAX_PLATFORMS"], row["OMP_NUM_THREADS"]) == ("cpu", "1")
     refusing = ask(evaluate=fakes.refused)
     refusing.monte_carlo(20)

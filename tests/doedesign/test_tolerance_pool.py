@@ -4,6 +4,7 @@ who computed them.
 Plates here are a few sums, so that what is tested is the machinery around them.
 """
 
+import contextlib
 import json
 import math
 import os
@@ -11,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -66,7 +67,9 @@ def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Stud
     set_up = ask(evaluate=fakes.settings, workers=2)
     with pytest.raises(KeyError):  # these rows are no numbers of a plate
         set_up.monte_carlo(8).table.worst("strehl")
-    for (row,) in set_up.journal.finished.values():
+    for found in set_up.journal.finished.values():
+        assert isinstance(found, list)
+        (row,) = found
         assert row["OMP_NUM_THREADS"] == "1"
         assert row["JAX_PLATFORMS"] == "cpu"
         assert "multi_thread_eigen=false" in row["XLA_FLAGS"]
@@ -181,8 +184,9 @@ asked.monte_carlo(400)
 """
 
 
-def started(folder: Path) -> subprocess.Popen[str]:
-    """A script of a user's, without `if __name__ == "__main__"`, that has finished a few plates."""
+@contextlib.contextmanager
+def started(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A script of a user's, without `if __name__ == "__main__"`, that has finished a few plates with two workers."""
     script = folder / "script.py"
     script.write_text(SCRIPT.format(here=str(HERE), name=str(folder), out=str(folder / "out")))
     process = subprocess.Popen(
@@ -192,12 +196,20 @@ def started(folder: Path) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 60
-    while len(lines_so_far(folder / "out" / "draws.jsonl")) < 8:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return process
+    try:
+        deadline = time.monotonic() + 60
+        while len(lines_so_far(folder / "out" / "draws.jsonl")) < 8 or len(workers_of(folder)) < 2:
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def workers_of(folder: Path) -> set[int]:
+    return {json.loads(line)["pid"] for line in lines_so_far(folder / "plates") if line.endswith(b"}")}
 
 
 def lines_so_far(path: Path) -> list[bytes]:
@@ -212,17 +224,17 @@ def alive(pid: int) -> bool:
     return status.rpartition(")")[2].split()[0] not in ("Z", "X")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc to see which processes live")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
 def test_a_run_that_is_stopped_keeps_its_plates_and_its_workers_end(
     how: signal.Signals, ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path
 ):
-    process = started(tmp_path)
-    workers = {line["pid"] for line in lines(tmp_path / "plates")}
-    assert len(workers) == 2
-    process.send_signal(how)
-    _, said = process.communicate(timeout=20)
-    assert process.returncode != 0
+    with started(tmp_path) as process:
+        workers = workers_of(tmp_path)
+        process.send_signal(how)
+        _, said = process.communicate(timeout=30)
+        assert process.returncode != 0
     assert ("KeyboardInterrupt" in said) == (how == signal.SIGINT)
     assert "SpawnProcess" not in said  # no worker cries out
     deadline = time.monotonic() + 10

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.polygons import MAX_VERTICES, annulus_sectors, doubled_area, paint, rectangles, smallest_runs
+from fab.polygons import MAX_VERTICES, annulus_sectors, doubled_area, paint, rectangles, run_lengths, smallest_runs
 
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 1))
 
@@ -96,6 +96,32 @@ def test_smallest_runs_agree_with_a_plain_search(bitmap):
         widths += [len(run) for run in text.split("0") if run]
         spaces += [len(run) for run in text.strip("0").split("1") if run]
     assert smallest_runs(bitmap) == (min(widths, default=None), min(spaces, default=None))
+
+
+@given(BITMAPS)
+def test_run_lengths_agree_with_a_plain_search(bitmap):
+    wanted = np.zeros(bitmap.shape, dtype=int)
+    for y, line in enumerate(bitmap):
+        text = "".join(map(str, line))
+        x = 0
+        for run in text.replace("10", "1 0").replace("01", "0 1").split():
+            if run[0] == "1":
+                wanted[y, x : x + len(run)] = len(run)
+            x += len(run)
+    found = run_lengths(bitmap)
+    assert found.dtype == np.uint8
+    assert np.array_equal(found, wanted)
+
+
+def test_run_lengths_end_at_255_and_take_any_bit_for_set():
+    bitmap = np.ones((2, 300), dtype=np.uint8)
+    bitmap[1, 255] = 0
+    assert np.all(run_lengths(bitmap)[0] == 255)
+    assert run_lengths(bitmap)[1].tolist() == [255] * 255 + [0] + [44] * 44
+    assert np.array_equal(run_lengths(bitmap * np.uint8(8)), run_lengths(bitmap))
+    # A turned view, as openings are measured along y.
+    assert np.array_equal(run_lengths(bitmap.T), bitmap.T * run_lengths(bitmap.T))
+    assert run_lengths(bitmap.T).max() == 2
 
 
 @pytest.mark.parametrize(("inner", "outer"), [(2_215_000, 3_700_000), (1000, 2000), (9_025_000, 13_300_000)])

@@ -1,0 +1,150 @@
+"""Numbers of a plate, against the metrics of its PSFs and against what a known error must do to them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from doedesign.predict import Drawn, Prediction, plate_rows, predict
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels, height_of
+from fab.masks import unetched_outside
+from fab.process import Process, Variation
+from sim.camera import Camera, Colour
+from sim.metrics import energy_budget, energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m, zeroth_order
+from sim.psf import psf_bank, surface_bank
+from sim.surface import as_fabricated
+
+PITCH_M = 1.85e-6
+CELLS = 64
+LEVELS = Levels(16, 75e-9)
+PROCESS = Process(LEVELS)
+COLOURS = (Colour("red", (640e-9,), (1.0,)), Colour("green", (530e-9, 550e-9), (0.3, 0.7)))
+CAMERA = Camera(Grid((CELLS, CELLS), PITCH_M), CELLS * PITCH_M, "fused_silica", COLOURS, 1e-3, 3.7e-6, 48)
+NEAR_M, FAR_M = (6e-3,), (5.0, np.inf)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> Drawn:
+    """A ring that keeps some light on the axis."""
+    y, x = np.indices((CELLS, CELLS)) - (CELLS - 1) / 2
+    level = (np.mod(np.hypot(y, x) / 8, 1) * 13).astype(np.uint8)
+    level = unetched_outside(level, LEVELS, CAMERA.grid, CAMERA.aperture_m)
+    return Drawn("ring", level, LEVELS, CAMERA, NEAR_M, FAR_M)
+
+
+@pytest.fixture(scope="module")
+def nominal(drawn: Drawn) -> Prediction:
+    return predict(drawn, PROCESS, Variation())
+
+
+def test_there_is_a_row_for_every_depth_and_colour_near_depths_first(nominal: Prediction):
+    assert [(row["depth_m"], row["colour"]) for row in nominal.rows] == [
+        (depth, colour) for depth in (6e-3, 5.0, None) for colour in ("red", "green")
+    ]
+    for row in nominal.rows:
+        # A near source is judged by its ring, a far one by its spot.
+        assert ("ring_to_disc" in row) == (row["depth_m"] in NEAR_M)
+        assert ("far_spot" in row) == (row["depth_m"] not in NEAR_M)
+        assert all(isinstance(v, float) for k, v in row.items() if k not in ("colour", "depth_m"))
+
+
+def test_the_bank_of_a_plate_without_errors_is_that_of_its_height_map(drawn: Drawn, nominal: Prediction):
+    bank = psf_bank(CAMERA, height_of(drawn.level, LEVELS), drawn.depths_m)
+    np.testing.assert_allclose(nominal.bank.energy, bank.energy, rtol=0, atol=1e-6 * bank.energy.max())
+    assert (nominal.bank.depths_m, nominal.bank.colours) == (bank.depths_m, bank.colours)
+    surface = as_fabricated(drawn.level, CAMERA, PROCESS, Variation())
+    np.testing.assert_array_equal(np.asarray(nominal.surface.transmission), np.asarray(surface.transmission))
+
+
+def test_rows_are_the_metrics_of_the_plates_psfs(drawn: Drawn, nominal: Prediction):
+    height = height_of(drawn.level, LEVELS)
+    for row in nominal.rows:
+        c = [colour.name for colour in COLOURS].index(row["colour"])
+        colour = COLOURS[c]
+        depth = np.inf if row["depth_m"] is None else row["depth_m"]
+        psf = nominal.bank.energy[c, drawn.depths_m.index(depth)]
+        budget = energy_budget(CAMERA, height, psf, depth, colour)
+        weighted = list(zip(colour.wavelengths_m, colour.weights, strict=True))
+        # The opening's area is once pi r², once a sum of the cells' shares: 1e-5 apart.
+        wanted = sum(weight * zeroth_order(CAMERA, height, line) for line, weight in weighted)
+        assert row["zeroth_order"] == pytest.approx(wanted, rel=1e-4)
+        assert row["strehl"] == pytest.approx(1.0, abs=1e-5)  # the sine of the fields is good to 4e-6
+        assert row["throughput"] == pytest.approx(budget.spot + budget.window, abs=1e-6)
+        assert row["outside_window"] == pytest.approx(budget.uncollected + budget.higher_orders, abs=1e-4)
+        assert row["chrome"] == pytest.approx(0.0, abs=1e-4)
+        assert row["throughput"] + row["outside_window"] + budget.reflected == pytest.approx(1.0, abs=1e-4)
+        if depth in NEAR_M:
+            assert row["ring_to_disc"] == ring_to_disc(psf, CAMERA, depth).ratio
+        else:
+            radius = spot_radius_m(CAMERA, mean_wavelength_m(colour))
+            assert row["far_spot"] == energy_within(psf, CAMERA.pixel_m, radius)
+
+
+def test_a_deeper_etch_shows_in_every_number_it_should(drawn: Drawn, nominal: Prediction):
+    """All etches 8 % too deep: the overlap with the design falls as the square of the rms phase."""
+    deep = predict(drawn, PROCESS, Variation(common_depth_scale=0.08))
+    open_ = np.asarray(nominal.surface.coverage, float)
+    lost = (15 - drawn.level) * 75e-9 * 0.08
+    for row in deep.rows[:2]:
+        colour = next(colour for colour in COLOURS if colour.name == row["colour"])
+        wanted = 0.0
+        for line, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+            wrong = np.exp(-2j * np.pi * CAMERA.waves_per_metre(line) * lost)
+            wanted += weight * abs((wrong * open_).sum() / open_.sum()) ** 2
+        assert wanted < 0.99
+        assert row["strehl"] == pytest.approx(wanted, abs=2e-5)  # twice the sine's 4e-6 and float32
+    for row, other in zip(deep.rows, nominal.rows, strict=True):
+        passed = other["throughput"] + other["outside_window"]
+        # Light goes elsewhere and is not lost.
+        assert row["throughput"] + row["outside_window"] == pytest.approx(passed, abs=1e-6)
+
+
+def test_chrome_out_of_place_is_booked_as_such(drawn: Drawn, nominal: Prediction):
+    wide = 0.02 * CAMERA.aperture_m
+    narrow = predict(drawn, PROCESS, Variation(chrome_diameter_m=-wide))
+    for row, other in zip(narrow.rows, nominal.rows, strict=True):
+        passed = other["throughput"] + other["outside_window"]
+        # Circles of 64 cells with straight rims: 1e-4 of their area.
+        assert row["chrome"] == pytest.approx(passed * (0.98**2 - 1), abs=2e-4)
+        assert row["throughput"] + row["outside_window"] == pytest.approx(passed + row["chrome"], abs=2e-4)
+        assert row["throughput"] < other["throughput"]
+
+
+def test_strehl_does_not_fall_with_a_plate_that_only_leaks_less_light_through_its_chrome(drawn: Drawn):
+    """The overlap is one over the open cells, so a displaced opening before a perfect plate leaves it at 1."""
+    moved = as_fabricated(drawn.level, CAMERA, PROCESS, Variation(chrome_x_m=2e-6))
+    bank = surface_bank(CAMERA, moved, (np.inf,))
+    rows = plate_rows(drawn, moved, bank)
+    assert [row["strehl"] for row in rows] == pytest.approx([1.0, 1.0], abs=2e-5)
+
+
+def test_predictions_repeat_to_the_last_bit(drawn: Drawn):
+    short = dataclasses.replace(drawn, near_m=(), far_m=(np.inf,))
+    rough = Variation(roughness_m=4e-9, correlation_m=2e-6, seed=9, depth_scale=(0.01, 0.0, -0.02, 0.01))
+    one, two = (predict(short, PROCESS, rough) for _ in range(2))
+    np.testing.assert_array_equal(one.bank.energy, two.bank.energy)
+    assert one.rows == two.rows
+
+
+def test_another_design_is_not_compared_with_the_one_before(drawn: Drawn, nominal: Prediction):
+    """The plate as drawn is kept between predictions; a new level map or camera must not meet the old one."""
+    short = dataclasses.replace(drawn, near_m=(), far_m=(np.inf,))
+    other = dataclasses.replace(short, level=np.roll(drawn.level, 3, axis=0))
+    assert predict(other, PROCESS, Variation()).rows[0]["strehl"] == pytest.approx(1.0, abs=1e-5)
+    blue = dataclasses.replace(CAMERA, colours=(Colour("blue", (450e-9,), (1.0,)),))
+    rows = predict(dataclasses.replace(other, camera=blue), PROCESS, Variation()).rows
+    assert rows[0]["strehl"] == pytest.approx(1.0, abs=1e-5)
+    assert predict(short, PROCESS, Variation()).rows == nominal.rows[-2:]
+
+
+def test_digests_tell_designs_apart(drawn: Drawn):
+    assert drawn.digest() == dataclasses.replace(drawn, name="copy", level=drawn.level.copy()).digest()
+    assert drawn.digest() != dataclasses.replace(drawn, level=np.roll(drawn.level, 1, axis=0)).digest()
+    assert drawn.depths_m == (*NEAR_M, *FAR_M)
+
+
+def test_errors_beyond_the_model_are_refused(drawn: Drawn):
+    with pytest.raises(InputError, match="half a cell"):
+        predict(drawn, PROCESS, Variation(common_cd_bias_m=PITCH_M))
