@@ -44,12 +44,12 @@ def draw(path: Path, answer: Answer) -> None:
         _draw_lifts(place(figure, 6.4, 5.0, 3.6, 3.1), answer)
         _draw_both(place(figure, 0.75, 0.65, 4.75, 3.55), answer)
         for k, (seen, prediction) in enumerate(answer.shown):
-            _draw_near(place(figure, 5.95 + 1.68 * k, 1.85, 1.58, 1.58), answer.bench, seen, prediction, k)
+            _draw_near(place(figure, 5.95 + 1.68 * k, 2.05, 1.58, 1.58), answer.bench, seen, prediction, k)
         figure.text(5.95 / 11.0, 4.24 / 8.7, f"Near PSFs at the {PROBE} probe")
         note(
             figure,
             5.95,
-            0.65,
+            0.85,
             "Logarithmic, one scale for all three. Circle: edge of the disc.\n"
             "Lift: the design raised by that many of its 16 steps, modulo one wave. The\n"
             f"light without errors is the same at {FULL_WAVE}, the masks are not.",

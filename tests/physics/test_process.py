@@ -168,9 +168,8 @@ def test_overlay_costs_as_much_strehl_as_the_strips_it_displaces(drawn, mask: in
     cells, shift = 128, 0.3 * PITCH_M
     optics = camera(cells, open_share=1.5)
     level = drawn(cells, np.random.default_rng(4))
-    overlay = [0.0] * 4
-    overlay[mask] = shift
-    moved = made(level, STAIRS, Variation(**{("overlay_y_m", "overlay_x_m")[axis]: tuple(overlay)}), optics)  # pyright: ignore[reportArgumentType]
+    name = ("overlay_y_m", "overlay_x_m")[axis]
+    moved = made(level, STAIRS, variation_of(4, {f"{name}[{mask}]": shift}), optics)
     found = strehl(moved, made(level, STAIRS, Variation(), optics))[0]
     # Before the first row or column there is blank glass; what is pushed over the far end is not seen.
     edges = np.count_nonzero(np.diff(planes(level, STAIRS)[mask], axis=axis, prepend=0))
