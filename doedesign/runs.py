@@ -39,7 +39,9 @@ FORMAT = "doedesign run 1"
 CHECKPOINT = "checkpoint.npz"
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
-_UNFINISHED = re.compile(r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|calibration|explanations)\.new)\.[a-z0-9_]{8}")
+_UNFINISHED = re.compile(
+    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|calibration|explanations)\.new)\.[a-z0-9_]{8}"
+)
 
 
 @dataclass(frozen=True)
