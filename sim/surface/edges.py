@@ -73,6 +73,10 @@ def corners(
     The odd piece loses (1 - pi/4) r^2 to the state of its neighbours in that mask, in the middle of that area, with the
     other masks as they are there; where several masks have the same corner they change it together. Every crossing is
     looked at from its four sides; seen from a side that lies in the next cell, it is a crossing of that cell.
+
+    Against a raster, the change is right to 3-6 % for corners that are alone or the same in all masks, to 16-23 % where
+    other masks' edges run through the area, and no better than to its own size where the corners of different masks lie
+    within a third of the radius of each other. All of it is 0.03-0.3 % of a PSF.
     """
     radius = relief.corner_m / plan.grid.pitch_m
     bias = effective_bias(relief) / plan.grid.pitch_m
@@ -174,10 +178,11 @@ def _shared_corners(along_y: Cuts, along_x: Cuts, bias: Array, radius: Array) ->
     """How much of the area at a corner two masks change together, 1 where their edges coincide."""
 
     def apart(along: Cuts) -> Array:
-        middle = along.edges[1 + along.line].mean(axis=1)
+        # From the lower line: modulo one cell, the upper one may lie below it.
+        middle = along.edges[1 + along.line[:, 0]] + jnp.abs(bias)
         gap = middle[:, None] - middle[None, :]
         return gap - jnp.round(gap)
 
     squared = apart(along_y) ** 2 + apart(along_x) ** 2 + (bias[:, None] - bias[None, :]) ** 2
-    # Halved at a tenth of the radius: the area is a narrow hook.
-    return jnp.exp(-squared / jnp.maximum((0.12 * radius) ** 2, 1e-12))
+    # Fitted to rasters: the area is a hook 0.4 radii deep, and apart by less than that each mask still cuts the other's.
+    return jnp.exp(-squared / jnp.maximum((0.3 * radius) ** 2, 1e-12))

@@ -61,6 +61,8 @@ def lines(path: Path) -> list[dict[str, Any]]:
 
 
 def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Study], fakes: ModuleType, right: dict):
+    main = sys.modules["__main__"]
+    before = {name: vars(main).get(name) for name in ("__file__", "__spec__")}
     asked = ask(workers=2)
     asked.monte_carlo(40)
     assert asked.journal.finished == right
@@ -75,7 +77,7 @@ def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Stud
         assert "multi_thread_eigen=false" in row["XLA_FLAGS"]
         assert row["pid"] != os.getpid()
     assert os.environ.get("OMP_NUM_THREADS") is None  # this process is as it was
-    assert sys.modules["__main__"].__spec__ is not None or hasattr(sys.modules["__main__"], "__file__")
+    assert {name: vars(main).get(name) for name in ("__file__", "__spec__")} == before
 
 
 def test_a_worker_that_dies_loses_no_plate(ask: Callable[..., Study], fakes: ModuleType, right: dict, tmp_path: Path):
