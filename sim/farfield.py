@@ -30,6 +30,7 @@ the pupil: a quarter of the work, enough to estimate energies when the image mov
 to call (`displaced`).
 """
 
+from functools import lru_cache
 from typing import Any, cast
 
 import equinox as eqx
@@ -96,6 +97,7 @@ class FarField(eqx.Module):
         return _pixel_energy((rows, shared), pupil, self)
 
 
+@lru_cache(maxsize=32)
 def plan_far_field(
     camera: Camera,
     wavelength_m: float,
@@ -120,6 +122,8 @@ def plan_far_field(
 
     Raises:
         ValueError: a DOE grid that is not square, or `sampling` below 1.
+
+    Kept, because every plate of a tolerance study is looked at with the same few.
     """
     ny, nx = camera.grid.shape
     if ny != nx:

@@ -16,6 +16,7 @@ With fewer samples than lambda f / (2D) asks for, the rule degrades gracefully: 
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -128,7 +129,8 @@ class Banded(eqx.Module):
             block = matrix[:, column : column + tile]
             used = np.flatnonzero(np.any(block != 0, axis=1))
             low, high = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
-            tiles.append(jnp.asarray(block[low:high], dtype=jnp.float32))
+            with jax.ensure_compile_time_eval():  # plans are kept, also those made while something is traced
+                tiles.append(jnp.asarray(block[low:high], dtype=jnp.float32))
             starts.append(low)
         return Banded(tuple(tiles), tuple(starts))
 

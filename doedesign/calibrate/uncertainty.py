@@ -8,7 +8,7 @@ that of what was believed. Nothing more is claimed than the images bear out:
 * What differs from one part of an image to another without the noise explaining it (a model that is a little wrong)
   shows in the slopes of the parts: their scatter over blocks of pixels gives a second covariance, and of the two the
   larger variance of every error counts (the "sandwich" of P. Huber, with blocks as clusters).
-* What the model gets wrong alike everywhere (`sim.cell`: some thousandths of the light) is in neither. On plates
+* What the model gets wrong alike everywhere (`sim.surface`: some thousandths of the light) is in neither. On plates
   computed with finer cells than those of the fit it moved overlay by up to 30 nm, line width by 7 nm, depth by 0.1 %.
 * An error counts as determined where its standard deviation is less than half of what was believed.
 

@@ -141,11 +141,12 @@ def _found(path: str) -> Any:
 
 def single_thread_settings() -> dict[str, str]:
     """Environment of a process that computes with one thread on the CPU, the same numbers on every machine like it."""
-    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    flags = "--xla_cpu_multi_thread_eigen=false"
     libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
     return {
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(),
         "JAX_PLATFORMS": "cpu",
+        "NPROC": "1",  # threads of XLA's own pool, beside those of Eigen
         **{f"{library}_NUM_THREADS": "1" for library in libraries},
     }
 

@@ -2,11 +2,11 @@
 
 `as_fabricated` takes what is drawn (a level map, split into masks here), a process and the errors of one plate
 (`fab.process.Variation`) and returns the transmission of every DOE cell. Nothing is oversampled: displaced and widened
-masks cut each cell into a few pieces of constant depth whose light is added exactly (`sim.cell`), rounded corners
-and tilted walls add what they change at the vertices and along the lines between the pieces, and slow errors
-(uniformity, rotation, magnification) are constants of tiles of 32 x 32 cells. Everything is differentiable in every
-floating-point error, except where edges of two masks coincide (there the light itself has a kink) and, for rounded
-corners, where the edge of another mask passes the corner (a jump of a small part of a small term).
+masks cut each cell into a few pieces of constant depth whose light is added exactly, rounded corners and tilted walls
+add what they change at the vertices and along the lines between the pieces, and slow errors (uniformity, rotation,
+magnification) are constants of tiles of 32 x 32 cells. Everything is differentiable in every floating-point error,
+except where edges of two masks coincide (there the light itself has a kink) and, for rounded corners, where the edge of
+another mask passes the corner (a jump of a small part of a small term).
 
 How each error enters:
 
@@ -22,8 +22,9 @@ How each error enters:
   light lost to angles beyond the sensor, exp(-variance / 2) of the amplitude.
 * particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, and pinholes.
 
-Reading order: `relief` (the errors as numbers), `pieces` (what is open where, and its light), `edges` (walls and
-corners), `tiles` (the whole plate), `plate` (the way in).
+Reading order: `cell` (where lines cut a cell, and what a lens sees of its pieces), `roughness`, `relief` (the errors as
+numbers), `pieces` (what is open where, and its light), `edges` (walls and corners), `tiles` (the whole plate), `plate`
+(the way in).
 """
 
 from sim.surface.plate import Surface, as_fabricated

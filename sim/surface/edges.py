@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim.cell import Cuts, axis_moments, axis_values, plane_moments, point_moments
+from sim.surface.cell import Cuts, axis_moments, axis_values, plane_moments, point_moments
 from sim.surface.pieces import STATES, Pair, summed, turned, weighted
 from sim.surface.relief import Plan, Relief, effective_bias
 
@@ -184,5 +184,5 @@ def _shared_corners(along_y: Cuts, along_x: Cuts, bias: Array, radius: Array) ->
         return gap - jnp.round(gap)
 
     squared = apart(along_y) ** 2 + apart(along_x) ** 2 + (bias[:, None] - bias[None, :]) ** 2
-    # Fitted to rasters: the area is a hook 0.4 radii deep, and apart by less than that each mask still cuts the other's.
+    # Fitted to rasters. The area is a hook 0.4 radii deep; apart by less than that, each mask still cuts the other's.
     return jnp.exp(-squared / jnp.maximum((0.3 * radius) ** 2, 1e-12))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim.cell import Cuts
+from sim.surface.cell import Cuts
 from sim.surface.relief import Plan
 
 TILE = 32  # cells

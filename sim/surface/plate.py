@@ -15,8 +15,8 @@ from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera
 from sim.pupil import cis
-from sim.roughness import cell_share
 from sim.surface.relief import plan_of, relief_of, require_possible
+from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 
 
@@ -25,7 +25,7 @@ class Surface(eqx.Module):
 
     Attributes:
         transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
-            that of the plate within `sim.cell`'s accuracy, and its mean is the plate's.
+            that of the plate within `sim.surface.cell`'s accuracy, and its mean is the plate's.
         means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other plates.
         coverage: `[y, x]` open share of every cell.
         grid: the cells: those of the DOE, or a whole number of parts of them where the sensor sees waves too
@@ -85,7 +85,10 @@ def as_fabricated(
     for particle in variation.particles:
         _keep_off(etched, particle, camera.grid)
     widths = _opening_widths(etched) if traced or variation.etch_lag else None
-    relief = relief_of(camera.grid, process, variation, traced)
+    rough = None
+    if traced or variation.roughness_m:
+        rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
+    relief = relief_of(process, variation, rough)
     transmission, means = transmission_of(_packed(etched), widths, relief, rates, plan)
     loss = _subcell_loss(variation, camera.grid.pitch_m, rates, traced)
     if loss is not None:

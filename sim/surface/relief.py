@@ -14,7 +14,6 @@ from fab.grid import Grid
 from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
-from sim.roughness import cell_roughness
 
 SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
 jax.tree_util.register_dataclass(
@@ -131,7 +130,7 @@ def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.n
     )
 
 
-def relief_of(grid: Grid, process: Process, variation: Variation, traced: bool) -> Relief:
+def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x"] | None = None) -> Relief:
     """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
     masks = process.masks
     per_mask = partial(_per_mask, masks=masks)
@@ -149,9 +148,6 @@ def relief_of(grid: Grid, process: Process, variation: Variation, traced: bool) 
     )
     radius = process.wafer_radius_m
     tilt = jnp.stack([jnp.asarray(variation.linear_nonuniformity_y), jnp.asarray(variation.linear_nonuniformity_x)])
-    rough = None
-    if traced or variation.roughness_m:
-        rough = cell_roughness(grid, variation.roughness_m, variation.correlation_m, variation.seed)
     return Relief(
         depth_m=jnp.asarray((nominal * (1 + repeats)).astype(np.float32)) * scale,
         shift_m=shift,
@@ -163,7 +159,7 @@ def relief_of(grid: Grid, process: Process, variation: Variation, traced: bool) 
         lag=jnp.asarray(variation.etch_lag, jnp.float32),
         bowl=jnp.asarray(variation.radial_nonuniformity, jnp.float32) / radius**2,
         tilt=tilt / radius,
-        rough_m=rough,
+        rough_m=rough_m,
         height_m=jnp.float32(process.levels.count - 1) * jnp.float32(process.levels.step_m),
     )
 
@@ -180,7 +176,7 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
         if isinstance(value, tuple) and value and len(value) != masks:
             rule = f"must have one value per mask, {masks}"
             raise InputError(f"variation.{name}", rule, len(value), "Add or remove values.")
-    relief = relief_of(grid, process, variation, traced=False)
+    relief = relief_of(process, variation)
     limits = {
         "cd_bias": float(jnp.abs(effective_bias(relief)).max()),
         "corner_radius": variation.corner_radius_m,

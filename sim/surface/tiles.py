@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, UInt8
 
-from sim.cell import (
+from sim.surface.cell import (
     DEGREES,
     FILTER_REACH,
     axis_moments,
@@ -68,7 +68,7 @@ def _tile_moments(
     rates: Float[Array, " w"],
     plan: Plan,
 ) -> Float[Array, "moment 2 w t t"]:
-    """Moments of the transmission of one tile's cells (`sim.cell.plane_moments` says which)."""
+    """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which)."""
     pitch, tile = plan.grid.pitch_m, TILE
     ny, nx = plan.grid.shape
     middle_y = (start[0] + (tile - ny) / 2) * pitch

@@ -1,6 +1,6 @@
 """A plate on a raster of many samples per cell: what the process model is judged by.
 
-Nothing here shares code with `sim.cell` or `sim.surface`. Every error is done to the samples themselves: openings are
+Nothing here shares code with `sim.surface`. Every error is done to the samples themselves: openings are
 widened by morphology, corners are cut out circle by circle, walls are ramps, masks are shifted sample by sample, and
 the far field is summed at the sample positions. Lengths should be whole samples where they are meant to be exact.
 """

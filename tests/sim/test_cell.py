@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss, legval
 from scipy.integrate import quad_vec
 
-from sim.cell import (
+from sim.surface.cell import (
     DEGREES,
     FILTER_REACH,
     Cuts,

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 
 from fab.grid import Grid
-from sim.roughness import cell_roughness, cell_share
+from sim.surface.roughness import cell_roughness, cell_share
 
 PITCH_M = 1e-6
 RMS_M = 4e-9

@@ -45,8 +45,12 @@ def cell_roughness(grid: Grid, rms_m: Array | float, length_m: Array | float, se
         length_m: correlation length.
         seed: seed of the noise; the same seed gives the same hills for every rms and length.
     """
-    field = jnp.asarray(np.random.default_rng(seed).standard_normal(grid.shape, np.float32))
-    length = _positive(jnp.asarray(length_m, jnp.float32) / grid.pitch_m)
+    noise = np.random.default_rng(seed).standard_normal(grid.shape, np.float32)
+    return _hills(noise, _positive(jnp.asarray(length_m, jnp.float32) / grid.pitch_m)) * rms_m
+
+
+@jax.jit
+def _hills(field: Float[Array, "y x"], length: Array) -> Float[Array, "y x"]:
     for _ in range(2):  # along x, then along what was y
         size = field.shape[1]
         lags = np.arange(size // 2 + 1, dtype=np.float32)
@@ -55,7 +59,7 @@ def cell_roughness(grid: Grid, rms_m: Array | float, length_m: Array | float, se
         # Rounding can push the spectrum's tail below zero.
         gain = jnp.sqrt(jnp.maximum(jnp.fft.rfft(around).real, 1e-12))
         field = _filtered_rows(field, gain).T
-    return field * rms_m
+    return field
 
 
 def _filtered_rows(field: Float[Array, "y x"], gain: Float[Array, " f"]) -> Float[Array, "y x"]:
