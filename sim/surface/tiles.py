@@ -91,15 +91,16 @@ def _tile_moments(
     taken = relief.depth_m[:, None, None, None, None] * jnp.einsum("kia,kjb->kijab", chosen_y, chosen_x)
     segments = along_y.state.shape[1], along_x.state.shape[1]
     taken = jnp.transpose(taken, (3, 4, 0, 1, 2)).reshape(segments[0] * segments[1], -1)
-    depth = jnp.dot(taken, pieces.reshape(-1, tile * tile), precision=PRECISION)
     axis = (jnp.arange(tile) - (tile - 1) / 2) * pitch
     y, x = middle_y + plan.die_m[0] + axis[:, None], middle_x + plan.die_m[1] + axis[None, :]
     uniform = 1.0 + relief.bowl * (y * y + x * x) + relief.tilt[0] * y + relief.tilt[1] * x
-    depth = depth * uniform.reshape(-1)
-    height = relief.height_m - depth
+    # What differs from cell to cell goes into the product; after it, it would be computed again for every piece.
+    pieces = (pieces * uniform).reshape(-1, tile * tile)
     if bump is not None:
-        height = height + bump.reshape(-1)
-    light = light_of(height, rates)
+        pieces = jnp.concatenate([pieces, -bump.reshape(1, -1)])
+        taken = jnp.concatenate([taken, jnp.ones((taken.shape[0], 1))], axis=1)
+    depth = jnp.dot(taken, pieces, precision=PRECISION)
+    light = light_of(relief.height_m - depth, rates)
     weights = plane_moments(axis_moments(along_y.edges, plan.parts), axis_moments(along_x.edges, plan.parts))
     moments = summed(weights, light)
     if plan.walls:
