@@ -66,12 +66,21 @@ def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> 
     Raises:
         InputError: the file cannot be read, or is for another staircase.
     """
-    made = process_of(spec if file is None else load_process(file))
-    if (made.levels.count, made.levels.step_m) != (levels.count, levels.step_m):
+    return matching(levels, process_of(spec if file is None else load_process(file)), str(file or "process"))
+
+
+def matching(levels: Levels, process: Process, where: str) -> Process:
+    """A process as it is, if it makes the staircase of a design.
+
+    Raises:
+        InputError: it makes another one.
+    """
+    made = process.levels
+    if (made.count, made.step_m) != (levels.count, levels.step_m):
         rule = f"must be for {levels.count} levels of {format_length(levels.step_m)}"
-        got = f"{made.levels.count} of {format_length(made.levels.step_m)}"
-        raise InputError(str(file or "process"), rule, got, "Give a process for this design.")
-    return made
+        got = f"{made.count} of {format_length(made.step_m)}"
+        raise InputError(where, rule, got, "Give a process for this design.")
+    return process
 
 
 def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Spread]]:

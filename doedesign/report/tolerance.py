@@ -329,7 +329,7 @@ def draw_budget(path: str | Path, budget: Budget) -> None:
         100 * side(one) for one in budget.yields
     ]
     shares, low, high = yields(lambda y: y.share), yields(lambda y: y.low), yields(lambda y: y.high)
-    words = wrapped(f"{budget.yields[0].plates} plates per point, 95 % confidence. {budget}", 4.6)
+    words = wrapped(f"{budget.yields[0].plates} plates per point, 95 % confidence; {budget}", 4.6)
     foot = 0.6 + 0.15 * (words.count("\n") + 1)
     with picture(path, (5.0, foot + 2.9)) as figure:
         axes = place(figure, 0.65, foot, 4.2, 2.55)

@@ -324,21 +324,16 @@ def _drawn_and_spec(design: "str | Path | Run | Drawn", masks: Path | None) -> "
 
 
 def _process(given: "str | Path | Process | None", spec: Any, drawn: "Drawn") -> Process:
-    from doedesign.build import process_of
+    from doedesign.build import matching, process_for, process_of
     from doedesign.spec import load_process
 
     if isinstance(given, Process):
-        made = given
-    elif given is not None:
-        made = process_of(load_process(Path(given)))
-    elif spec is not None:
-        made = process_of(spec.process)
-    else:
-        made = Process(drawn.levels)
-    if (made.levels.count, made.levels.step_m) != (drawn.levels.count, drawn.levels.step_m):
-        cure = "Give a process for this design."
-        raise InputError("process.levels", f"must be those of the design, {drawn.levels}", made.levels, cure)
-    return made
+        return matching(drawn.levels, given, "process")
+    if spec is not None:
+        return process_for(drawn.levels, spec.process, None if given is None else Path(given))
+    if given is None:
+        return Process(drawn.levels)
+    return matching(drawn.levels, process_of(load_process(Path(given))), str(given))
 
 
 def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:

@@ -129,7 +129,6 @@ def compiled() -> Compiled:
     return Compiled(slopes, float(value), along)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_are_those_of_finite_differences(name: str, compiled: Compiled):
     step = STEPS[name.partition("[")[0]]
