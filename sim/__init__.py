@@ -10,12 +10,11 @@ Reading order, from the substance to the picture:
     farfield    pupil -> pixel energies, the default path (eqs. 7-9 of the paper)
     hankel      the same for rotationally symmetric pupils
     fresnel     the direct path (eq. 5): reference for the other two
-    cell        one DOE cell with displaced masks, and what it does to light from afar
-    roughness   random heights of a rough surface
     surface     the plate as a process with errors makes it (`as_fabricated`)
     psf         PSF banks: every colour and depth of one height map
     transfer    MTF of lens, DOE and pixel
     leakage     0th order, Strehl ratio, leaked and diffracted light of a plate
+    frames      a camera's image files, whatever their format
     measured    measured PSFs from camera files
     metrics     numbers read off a PSF: far-spot energy, ring:disc, 0th order, energy budget
     store       PSF banks and height maps as OpenEXR files

@@ -37,7 +37,7 @@ from doedesign.calibrate.target import measured_weights, weights_at
 _ROUNDS = 15
 _GIVE_UP = 1e5  # damping at which no step helps any more
 _SETTLED = 0.1  # standard deviations of the result that a last step may still move
-# Relative error of the plate's light that the model expects of itself (`sim.surface.cell`), beside the transform's.
+# Relative error of the plate's light that the model expects of itself (`sim.surface`), beside the transform's.
 _PLATE_ERROR = 4e-3
 _EXPLAINED = 3.0  # squares per pixel below which the model knows the noise better than the pixels do
 
