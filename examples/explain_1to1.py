@@ -1,7 +1,7 @@
 """The paper's plate shows ring:disc 1:1 where its simulation says 3:1, and passes 86 % of light. Which errors do that?
 
-    python examples/explain_1to1.py            a quarter of the paper's aperture: two minutes, or three
-    python examples/explain_1to1.py --full     the paper's own size, at every fourth lift: a quarter of an hour
+    python examples/explain_1to1.py            a quarter of the paper's aperture: a minute or two
+    python examples/explain_1to1.py --full     the paper's own size, at every fourth lift: ten minutes
     python examples/explain_1to1.py --even     a design that spreads near light evenly instead of in a ring
 
 A plate with a ratio of 3:1 is designed in the paper's geometry (examples/automotive.toml), made with every error that a
