@@ -306,7 +306,7 @@ def test_a_process_without_errors_is_refused_with_a_cure(ask: Callable[..., Stud
 
 
 def test_a_process_of_other_levels_is_refused(ask: Callable[..., Study]):
-    with pytest.raises(InputError, match="must be those of the design"):
+    with pytest.raises(InputError, match="must be for"):
         ask(process=Process(dataclasses.replace(ask().process.levels, step_m=80e-9)))
 
 

@@ -223,7 +223,7 @@ def test_a_process_comes_from_a_file(run: Path, tmp_path: Path):
     other.write_text('[process]\nlevels = 16\nlevel_step = "75 nm"\nstock = "contact_aligner"\n')
     code, _, said = call("tolerance", run, "--process", other)
     assert code == 2
-    assert "must be those of the design" in said
+    assert "must be for" in said
     perfect.write_text(perfect.read_text() + 'stock = "contact_aligner"\n')
     stock = study(run, process=perfect, quiet=True)
     assert {"depth", "overlay", "cd"} < set(stock.sources)
