@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from fab.grid import Grid
-from fab.layout import Layer, Layout, Shapes, mask_layout, pixel_edges
+from fab.layout import Cell, Layer, Layout, Shapes, mask_layout, pixel_edges
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
 from fab.order import write_order
@@ -95,7 +95,7 @@ def generate(level_map: NDArray[np.uint8], grid: Grid, path: Path) -> Layout:
 
 def read_back(path: Path, grid: Grid, expected: NDArray[np.uint8]) -> None:
     """Read the file with the own reader and compare every pixel."""
-    if not np.array_equal(read_level_map(path, LEVELS, pixel_edges(grid)), expected):
+    if not np.array_equal(read_level_map(path, LEVELS, pixel_edges(grid), "BENCH"), expected):
         raise AssertionError("the file does not hold the map")
 
 
@@ -110,9 +110,9 @@ def full_size(kind: str, count: int, folder: Path) -> dict[str, float]:
         lambda: generate(level_map, grid, gds), lambda: write_floor(other, size), pairs=5
     )
     read_s, _, read_ratio = ratio(lambda: read_back(gds, grid, expected), lambda: write_floor(other, size), pairs=5)
-    oasis_s = timed(lambda: write_oasis(oasis, gds, layout.shapes))
+    oasis_s = timed(lambda: write_oasis(oasis, gds, layout.layers))
     return {
-        "rectangles": sum(map(len, layout.shapes.values())),
+        "rectangles": sum(map(len, layout.cells[0].shapes.values())),
         "gds_mb": size / 1e6,
         "floor_s": floor_s,
         "write_s": write_s,
@@ -139,7 +139,7 @@ def klayout_pixels(plane: NDArray[np.uint8], path: Path) -> None:
 def own_plane(plane: NDArray[np.uint8], path: Path) -> None:
     """Draw the same plane with this package."""
     y_edges, x_edges = (np.arange(n + 1, dtype=np.int32) * 1000 for n in plane.shape)
-    write_gds(path, Layout("TOP", NM, {Layer(1): Shapes(rectangles(plane, x_edges, y_edges))}))
+    write_gds(path, Layout(NM, (Cell("TOP", {Layer(1): Shapes(rectangles(plane, x_edges, y_edges))}),)))
 
 
 def against_klayout(kind: str, count: int, folder: Path) -> float:

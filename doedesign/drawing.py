@@ -146,7 +146,7 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
             _told(grid, levels),
             "Give the masks of this run (--masks).",
         )
-    return read_level_map(folder / manifest.combined_gds, levels, pixel_edges(grid))
+    return read_level_map(folder / manifest.combined_gds, levels, pixel_edges(grid), manifest.doe_cell)
 
 
 def _told(grid: Grid, levels: Levels) -> str:

@@ -4,18 +4,20 @@ Pure comparisons, no files. The sentences name the layer, how many pixels or sha
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.layout import Layer, Layout, PixelEdges, Shapes
-from fab.manifest import ChromeEntry, FileEntry, Manifest, MaskEntry
+from fab.inventory import cell_entry
+from fab.layout import Cell, Layer, Layout, PixelEdges, Shapes
+from fab.manifest import CellEntry, ChromeEntry, FileEntry, Manifest, MaskEntry
 from fab.polygons import doubled_area, paint
 from fab.readback import Reading
 from fab.units import MM, NM, UM
 
-__all__ = ["Expected", "layout_problems", "reading_problems"]
+__all__ = ["Expected", "cell_problems", "layout_problems", "reading_problems"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,23 +112,66 @@ def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> lis
         One sentence per difference.
     """
     problems = []
-    if layout.cell != entry.cell:
-        problems.append(f"the cell is named {layout.cell!r} instead of {entry.cell!r}")
+    if layout.top.name != entry.cell:
+        problems.append(f"the top cell is named {layout.top.name!r} instead of {entry.cell!r}")
     if abs(layout.dbu_m / expected.edges.dbu_m - 1) > 1e-9:
         right = expected.edges.dbu_m
         problems.append(f"the database unit is {layout.dbu_m / NM:.9g} nm instead of {right / NM:.9g} nm")
+    doe = layout.cell(expected.manifest.doe_cell)
+    others = (cell for cell in layout.cells if cell is not doe)
+    problems += cell_problems(others, entry, expected.edges.dbu_m)
+    if doe is None:
+        return [*problems, f"cell {expected.manifest.doe_cell} is missing"]
+    if doe.references:
+        problems.append(f"cell {doe.name} places others")
     etch = expected.etch_layers(entry)
     chrome = expected.chrome_layer(entry)
     none = Shapes(np.empty((0, 4), dtype=np.int32))
-    for layer, shapes in layout.shapes.items():
+    for layer, shapes in doe.shapes.items():
         if layer not in etch and layer != chrome:
             problems += _count_problem(layer, len(shapes), "shapes on a layer that should be empty")
     for layer, mask in etch.items():
-        problems += _etch_problems(layer, layout.shapes.get(layer, none), mask, expected)
+        problems += _etch_problems(layer, doe.shapes.get(layer, none), mask, expected)
     if chrome is not None:
-        shapes = layout.shapes.get(chrome, none)
+        shapes = doe.shapes.get(chrome, none)
         problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
         problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, layout.dbu_m)
+    return problems
+
+
+def cell_problems(cells: Iterable[Cell], entry: FileEntry, dbu_m: float) -> list[str]:
+    """Compare the cells around the DOE (marks, labels, dies, plate) with the manifest.
+
+    Args:
+        cells: every cell of the file but that of the DOE.
+        entry: the manifest's entry of the file.
+        dbu_m: database unit of the order, metres.
+
+    Returns:
+        One sentence per difference.
+    """
+    found = {cell.name: cell_entry(cell, dbu_m) for cell in cells}
+    stated = {cell.cell: cell for cell in entry.cells}
+    problems = [f"cell {name} should not be there" for name in sorted(set(found) - set(stated))]
+    problems += [f"cell {name} is missing" for name in sorted(set(stated) - set(found))]
+    for name in stated.keys() & found.keys():
+        problems += _entry_problems(found[name], stated[name])
+    return problems
+
+
+def _entry_problems(found: CellEntry, stated: CellEntry) -> list[str]:
+    where = f"cell {stated.cell}"
+    problems = [] if found.places == stated.places else [f"{where}: it places other cells, or elsewhere"]
+    here, wanted = ({layer.layer: layer for layer in one.layers} for one in (found, stated))
+    for name in sorted(here.keys() | wanted.keys()):
+        have, want = here.get(name), wanted.get(name)
+        if have is None or want is None:
+            problems.append(f"{where}: layer {name} {'is missing' if have is None else 'should be empty'}")
+        elif have != want:
+            count = f"{have.polygons} shapes of {have.area_um2:.6g} um^2"
+            problems.append(
+                f"{where}: layer {name}: {count} instead of {want.polygons} of {want.area_um2:.6g} um^2, or elsewhere"
+            )
     return problems
 
 

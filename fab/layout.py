@@ -1,4 +1,4 @@
-"""The geometry of a mask set: layers of rectangles and polygons in integer database units.
+"""The geometry of a mask set: cells with layers of rectangles and polygons in integer database units.
 
 Rules of the drawing. The centre of the clear aperture is (0, 0). Mask bit k is layer k + 1, datatype 0
 (the number is the bit, not the order of etching); chrome is layer 5 for up to four masks and the next
@@ -11,6 +11,7 @@ it does; where none does, each edge is rounded once, so that neighbours still sh
 """
 
 import re
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -25,14 +26,18 @@ from fab.polygons import annulus_sectors, doubled_area, rectangles
 from fab.units import MM, NM, format_length
 
 __all__ = [
+    "Cell",
     "Chrome",
     "Layer",
     "Layout",
     "PixelEdges",
+    "Reference",
     "Shapes",
     "chrome_layer",
     "chrome_shapes",
     "etch_layer",
+    "in_order",
+    "layer_from",
     "mask_layout",
     "pixel_edges",
     "require_name",
@@ -62,6 +67,12 @@ class Layer:
     def __str__(self) -> str:
         """Return the usual short form, such as ``3/0``."""
         return f"{self.number}/{self.datatype}"
+
+
+def layer_from(text: str) -> Layer:
+    """The layer of a short form, such as ``3/0``."""
+    number, datatype = text.split("/")
+    return Layer(int(number), int(datatype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,19 +114,97 @@ class Shapes:
         return x0, y0, x1, y1
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """One cell with everything drawn in it.
+@dataclass(frozen=True)
+class Reference:
+    """A cell placed in another one, once or on a raster; never turned, never mirrored.
 
     Attributes:
-        cell: name of the top cell.
-        dbu_m: database unit, metres.
-        shapes: the layers in the order they are written.
+        cell: name of the placed cell.
+        x: where its origin comes to lie, in database units.
+        y: the same along y.
+        columns: copies along x.
+        rows: copies along y.
+        step_x: distance of the columns.
+        step_y: distance of the rows.
     """
 
     cell: str
+    x: int = 0
+    y: int = 0
+    columns: int = 1
+    rows: int = 1
+    step_x: int = 0
+    step_y: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A named drawing that others may place.
+
+    Attributes:
+        name: its name.
+        shapes: the layers in the order they are written.
+        references: the cells it places.
+    """
+
+    name: str
+    shapes: Mapping[Layer, Shapes]
+    references: tuple[Reference, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Everything in one file.
+
+    Attributes:
+        dbu_m: database unit, metres.
+        cells: every cell after those that it places; the last one is the top.
+    """
+
     dbu_m: float
-    shapes: dict[Layer, Shapes]
+    cells: tuple[Cell, ...]
+
+    @property
+    def top(self) -> Cell:
+        """The cell that no other places."""
+        return self.cells[-1]
+
+    def cell(self, name: str) -> Cell | None:
+        """The cell of a name, or None."""
+        return next((cell for cell in self.cells if cell.name == name), None)
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """All layers, in the order in which the cells first use them, the top first."""
+        return tuple(dict.fromkeys(layer for cell in reversed(self.cells) for layer in cell.shapes))
+
+
+def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+    """Cells put so that each comes after those that it places.
+
+    Raises:
+        ValueError: a name is there twice, a placed cell is missing, cells place each other, or there is not
+            exactly one that no other places.
+    """
+    waiting = {}
+    for cell in cells:
+        if cell.name in waiting:
+            raise ValueError(f"two cells are named {cell.name!r}")
+        waiting[cell.name] = cell
+    placed = {reference.cell for cell in waiting.values() for reference in cell.references}
+    tops = [name for name in waiting if name not in placed]
+    if missing := sorted(placed - set(waiting)):
+        raise ValueError(f"the placed cell {missing[0]!r} is missing")
+    if len(tops) != 1:
+        raise ValueError(f"{len(tops)} cells instead of one are placed by no other")
+    done: dict[str, Cell] = {}
+    while waiting:
+        ready = [c for c in waiting.values() if all(r.cell in done for r in c.references)]
+        if not ready:
+            raise ValueError(f"cell {min(waiting)!r} places itself")
+        for cell in ready:
+            done[cell.name] = waiting.pop(cell.name)
+    return tuple(done.values())
 
 
 @dataclass(frozen=True)
@@ -274,14 +363,14 @@ def mask_layout(
     cell: str,
     chrome: Chrome | None = None,
 ) -> Layout:
-    """Draw a whole mask set, centred on the clear aperture.
+    """Draw the planes and the chrome of one DOE as one cell, centred on the clear aperture.
 
     Args:
         level_map: level numbers ``[y, x]``; outside the clear aperture the glass is left blank.
         levels: the staircase.
         grid: the raster of the map.
         aperture_m: diameter of the clear aperture, metres.
-        cell: name of the top cell.
+        cell: name of the cell.
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
 
     Returns:
@@ -301,4 +390,4 @@ def mask_layout(
         found = pool.map(lambda plane: Shapes(rectangles(plane, edges.x, edges.y)), planes(inside, levels))
         shapes = {etch_layer(bit, levels): drawn for bit, drawn in enumerate(found)}
     shapes[chrome_layer(levels)] = chrome_shapes(grid, aperture_m, edges.dbu_m, chrome or Chrome())
-    return Layout(require_name(cell), edges.dbu_m, shapes)
+    return Layout(edges.dbu_m, (Cell(require_name(cell), shapes),))

@@ -22,8 +22,10 @@ from fab.units import MM, NM, UM
 __all__ = [
     "CONVENTIONS",
     "FORMAT",
+    "CellEntry",
     "ChromeEntry",
     "FileEntry",
+    "LayerEntry",
     "Manifest",
     "MaskEntry",
     "map_digest",
@@ -45,8 +47,31 @@ CONVENTIONS = {
 
 
 @dataclass(frozen=True)
+class LayerEntry:
+    """What is drawn on one layer of a cell; the digest is that of `fab.inventory.shapes_digest`."""
+
+    layer: str
+    polygons: int
+    area_um2: float
+    box_um: list[float]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class CellEntry:
+    """One cell of a mask file: its layers, and the cells it places as [name, x_um, y_um]."""
+
+    cell: str
+    layers: list[LayerEntry]
+    places: list[list[Any]]
+
+
+@dataclass(frozen=True)
 class FileEntry:
-    """One file of the folder: its name, kind, size and SHA-256; cell and layers of a mask file."""
+    """One file of the folder: its name, kind, size and SHA-256.
+
+    Of a mask file also its top cell, the layers of the DOE in it, and every cell but that of the DOE.
+    """
 
     file: str
     format: str
@@ -54,6 +79,7 @@ class FileEntry:
     sha256: str
     cell: str | None
     layers: list[str]
+    cells: list[CellEntry]
 
 
 @dataclass(frozen=True)
@@ -114,6 +140,7 @@ class Manifest:
     combined_gds: str
     combined_oasis: str
     preview: str
+    doe_cell: str
     masks: list[MaskEntry]
     chrome: ChromeEntry
     files: list[FileEntry]
@@ -154,6 +181,8 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         if value is None and NoneType in get_args(kind):
             return None
         kind = next(option for option in get_args(kind) if option is not NoneType)
+    if kind is Any:
+        return value
     if get_origin(kind) is list:
         if isinstance(value, list):
             return [_value(get_args(kind)[0], item, f"{where}[{i}]") for i, item in enumerate(value)]

@@ -25,11 +25,25 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.grid import Grid
-from fab.layout import Chrome, Layer, Layout, PixelEdges, chrome_layer, etch_layer, mask_layout, pixel_edges
+from fab.inventory import cell_entry, geometry
+from fab.layout import (
+    Cell,
+    Chrome,
+    Layer,
+    Layout,
+    PixelEdges,
+    Reference,
+    Shapes,
+    chrome_layer,
+    etch_layer,
+    mask_layout,
+    pixel_edges,
+)
 from fab.levels import Levels
 from fab.manifest import (
     CONVENTIONS,
     FORMAT,
+    CellEntry,
     ChromeEntry,
     FileEntry,
     Manifest,
@@ -109,20 +123,27 @@ def order_id(name: str, digest: str) -> str:
     return plain if len(plain) <= _LONGEST_ID else f"{plain[:8].rstrip('_')}_{digest[:4].upper()}"
 
 
-def _only(layout: Layout, layer: Layer, cell: str) -> Layout:
-    return Layout(cell, layout.dbu_m, {layer: layout.shapes[layer]})
+def _merged(parts: list[Shapes]) -> Shapes:
+    if len(parts) == 1:
+        return parts[0]
+    polygons = tuple(polygon for part in parts for polygon in part.polygons)
+    return Shapes(np.concatenate([part.rectangles for part in parts]), polygons)
 
 
-def _geometry(layout: Layout, layer: Layer) -> dict[str, Any]:
-    """Return count, area and box of a layer in the units of the manifest."""
-    shapes = layout.shapes[layer]
-    box = shapes.box
-    unit_um = layout.dbu_m / UM
-    return {
-        "polygons": len(shapes),
-        "area_um2": round(shapes.doubled_area / 2 * unit_um**2, 6),
-        "box_um": None if box is None else [round(edge * unit_um, 6) for edge in box],
-    }
+def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
+    """The drawing of one plate: one layer number, every datatype of it merged onto datatype 0.
+
+    Args:
+        layout: the whole drawing.
+        layer: the layer of the plate, datatype 0.
+        top: name of the top cell.
+    """
+    cells = []
+    for cell in layout.cells:
+        parts = [shapes for other, shapes in cell.shapes.items() if other.number == layer.number and len(shapes)]
+        name = top if cell is layout.top else cell.name
+        cells.append(Cell(name, {layer: _merged(parts)} if parts else {}, cell.references))
+    return Layout(layout.dbu_m, tuple(cells))
 
 
 def _mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
@@ -142,7 +163,7 @@ def _mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]
         smallest_width_um=width_um,
         smallest_space_um=space_um,
         plane_sha256=plane_digest(plane),
-        **_geometry(layout, layer),
+        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
     )
 
 
@@ -159,7 +180,7 @@ def _chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
         outer_diameter_mm=round(2 * outer * layout.dbu_m / MM, 9),
         overlap_um=round(order.chrome.overlap_m / UM, 9),
         chord_error_nm=round(order.chrome.chord_error_m / NM, 9),
-        **_geometry(layout, layer),
+        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
     )
 
 
@@ -179,10 +200,19 @@ def _edges_told(edges: PixelEdges) -> str:
     )
 
 
+def _around(layout: Layout) -> list[CellEntry]:
+    """What the manifest says of every cell but that of the DOE, which comes first."""
+    return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[1:]]
+
+
 def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Manifest:
     """Write everything but the manifest, and return it."""
     say("drawing the masks")
-    layout = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, order.stem, order.chrome)
+    doe_cell = f"{order.stem}_DOE"
+    drawn = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, doe_cell, order.chrome)
+    layout = Layout(drawn.dbu_m, (*drawn.cells, Cell(order.stem, {}, (Reference(doe_cell),))))
+    doe_layers = list(drawn.top.shapes)
+    del drawn
     bit_planes = planes(order.level_map, order.levels)
     masks = [_mask_entry(order, layout, bit, plane) for bit, plane in enumerate(bit_planes)]
     chrome = _chrome_entry(order, layout)
@@ -191,16 +221,18 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
     )
     say("writing GDSII")
     write_gds(folder / gds, layout)
-    files = [(gds, "GDSII", order.stem, list(layout.shapes)), (oasis, "OASIS", order.stem, list(layout.shapes))]
+    files = [(gds, "GDSII", layout, doe_layers)]
     for entry in (*masks, chrome):
         layer = Layer(entry.layer, entry.datatype)
-        write_gds(folder / entry.file, _only(layout, layer, entry.cell))
-        files.append((entry.file, "GDSII", entry.cell, [layer]))
-    dbu_m = layout.dbu_m
-    names = list(layout.shapes)
-    del layout
+        plate = mask_file(layout, layer, entry.cell)
+        write_gds(folder / entry.file, plate)
+        files.append((entry.file, "GDSII", plate, [layer]))
     say("writing OASIS")
-    write_oasis(folder / oasis, folder / gds, names)
+    write_oasis(folder / oasis, folder / gds, layout.layers)
+    files.append((oasis, "OASIS", layout, doe_layers))
+    dbu_m = layout.dbu_m
+    contents = [(name, kind, one.top.name, on, _around(one)) for name, kind, one, on in files]
+    del layout, files
     say("drawing the preview")
     _write_map(folder / levels_file, order.level_map)
     digest = map_digest(order.level_map)
@@ -210,7 +242,7 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
     radii_m = order.chrome.radii_m(order.grid, order.aperture_m)
     picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
     (folder / preview).write_bytes(picture)
-    files += [(levels_file, "NPY", None, []), (preview, "PNG", None, [])]
+    contents += [(levels_file, "NPY", None, [], []), (preview, "PNG", None, [], [])]
     return Manifest(
         format=FORMAT,
         name=order.name,
@@ -228,13 +260,20 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
         combined_gds=gds,
         combined_oasis=oasis,
         preview=preview,
+        doe_cell=doe_cell,
         masks=masks,
         chrome=chrome,
         files=[
             FileEntry(
-                name, kind, (folder / name).stat().st_size, sha256_file(folder / name), cell, [str(v) for v in on]
+                file=name,
+                format=kind,
+                bytes=(folder / name).stat().st_size,
+                sha256=sha256_file(folder / name),
+                cell=top,
+                layers=[str(layer) for layer in on],
+                cells=around,
             )
-            for name, kind, cell, on in files
+            for name, kind, top, on, around in contents
         ],
         tools={"python": platform.python_version(), **{tool: version(tool) for tool in _TOOLS}},
     )

@@ -8,7 +8,8 @@ OASIS keeps repeated shapes folded. They are unfolded here by the library's own 
 the polygons alone would silently miss most of a mask.
 """
 
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
@@ -19,10 +20,10 @@ import gdstk
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.layout import Layer, PixelEdges
+from fab.layout import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.units import UM
 
-__all__ = ["Reading", "read_gds_again", "read_oasis_again"]
+__all__ = ["Again", "Reading"]
 
 # The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
 _MOST_AT_ONCE = 2_200_000
@@ -112,6 +113,9 @@ def _joined(polygons: list[Any], size: int) -> NDArray[np.float64]:
 
 def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
     """Yield the points of polygons with one copy per repetition, in batches."""
+    if not any(polygon.repetition.size for polygon in polygons):
+        yield _joined(polygons, size)
+        return
     origin = np.zeros((1, 2))
     offsets = [polygon.repetition.get_offsets() if polygon.repetition.size else origin for polygon in polygons]
     owners = np.repeat(np.arange(len(polygons)), [len(copies) for copies in offsets])
@@ -122,57 +126,128 @@ def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
         yield points_um[owners[part]] + shifts[part, None, :]
 
 
-def read_gds_again(path: str | Path, layers: Mapping[Layer, int], edges: PixelEdges) -> Iterator[Reading]:
-    """Read layers of a GDSII file of one cell with gdstk, few enough at a time to bound the memory.
+class _Around:
+    """Collects the cells around the DOE, layer by layer."""
 
-    The file must be sound as a stream of records: the library is not safe against broken ones, so this
-    package's own reader goes first.
+    def __init__(self, dbu_m: float) -> None:
+        self.dbu_m = dbu_m
+        self.shapes: dict[str, dict[Layer, list[NDArray[np.int64]]]] = defaultdict(lambda: defaultdict(list))
+        self.references: dict[str, tuple[Reference, ...]] = {}
 
-    Args:
-        path: the file.
-        layers: the layers to read, with the number of shapes expected on each.
+    def add(self, cell: Any) -> None:
+        """Take what was read of a cell; its references come with every part of it."""
+        self.references[cell.name] = tuple(self._references(cell))
+        for polygon in cell.polygons:
+            layer = Layer(polygon.layer, polygon.datatype)
+            offsets = polygon.repetition.get_offsets() if polygon.repetition.size else np.zeros((1, 2))
+            for offset in offsets:
+                self.shapes[cell.name][layer].append(self._units(polygon.points + offset))
+
+    def _units(self, points_um: NDArray[np.float64]) -> NDArray[np.int64]:
+        return np.rint(points_um * (UM / self.dbu_m)).astype(np.int64)
+
+    def _references(self, cell: Any) -> Iterator[Reference]:
+        for reference in cell.references:
+            offsets = reference.repetition.get_offsets() if reference.repetition.size else np.zeros((1, 2))
+            name = reference.cell_name
+            if reference.rotation or reference.x_reflection or reference.magnification != 1:
+                name += " (turned, mirrored or scaled)"
+            for x, y in self._units(np.asarray(reference.origin) + offsets).tolist():
+                yield Reference(name, x, y)
+
+    def cells(self) -> list[Cell]:
+        """Hand everything over."""
+        return [
+            Cell(name, {layer: _sorted_out(found) for layer, found in self.shapes[name].items()}, references)
+            for name, references in self.references.items()
+        ]
+
+
+def _sorted_out(polygons: list[NDArray[np.int64]]) -> Shapes:
+    """Rectangles apart from all other polygons."""
+    rects, others = [], []
+    for points in polygons:
+        low, high = points.min(axis=0), points.max(axis=0)
+        sides = np.count_nonzero(points != np.roll(points, -1, axis=0), axis=1)
+        if len(points) == 4 and (sides == 1).all() and (low < high).all():
+            rects.append([*low, *high])
+        else:
+            others.append(points.astype(np.int32))
+    return Shapes(np.array(rects, dtype=np.int32).reshape(-1, 4), tuple(others))
+
+
+class Again:
+    """A mask file of some cells, read by gdstk.
+
+    The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
+
+    Attributes:
+        doe: name of the cell with the planes.
         edges: the pixel raster.
-
-    Yields:
-        One reading per layer, in the order given.
+        around: the other cells; complete once every reading was taken.
+        problems: one sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
     """
-    waiting = list(layers)
-    while waiting:
-        group = [waiting.pop(0)]
-        while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
-            group.append(waiting.pop(0))
-        counters = {layer: _Counter(layer, edges) for layer in group}
-        wanted = {(layer.number, layer.datatype) for layer in group}
-        cells: list[Any] = gdstk.read_gds(str(path), unit=UM, filter=wanted).cells
+
+    def __init__(self, doe: str, edges: PixelEdges) -> None:
+        self.doe, self.edges = doe, edges
+        self.problems: list[str] = []
+        self._around = _Around(edges.dbu_m)
+
+    @property
+    def around(self) -> list[Cell]:
+        """The cells around the DOE."""
+        return self._around.cells()
+
+    def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[Reading]:
+        """Read a GDSII file, few enough shapes at a time to bound the memory.
+
+        Args:
+            path: the file.
+            layers: the layers of the DOE, with the number of shapes expected on each.
+            others: all other layers.
+
+        Yields:
+            One reading per layer of the DOE, in the order given.
+        """
+        waiting = list(layers)
+        rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
+        while waiting or rest:
+            group = [waiting.pop(0)] if waiting else []
+            while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
+                group.append(waiting.pop(0))
+            wanted = {(layer.number, layer.datatype) for layer in group}
+            wanted.update(rest)
+            rest = []
+            cells: list[Any] = gdstk.read_gds(str(path), unit=UM, filter=wanted).cells
+            yield from self._taken(cells, group)
+
+    def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[Reading]:
+        """Read an OASIS file, known to be whole, and unfold its repetitions.
+
+        Args:
+            path: the file.
+            layers: the layers of the DOE.
+
+        Yields:
+            One reading per layer of the DOE, in the order given.
+        """
+        yield from self._taken(gdstk.read_oas(str(path), unit=UM).cells, list(layers))
+
+    def _taken(self, cells: list[Any], group: list[Layer]) -> Iterator[Reading]:
+        counters = {layer: _Counter(layer, self.edges) for layer in group}
         for cell in cells:
+            if cell.labels or cell.paths:
+                self.problems.append(f"cell {cell.name} holds labels or paths")
+            if cell.name != self.doe:
+                self._around.add(cell)
+                continue
+            if cell.references:
+                self.problems.append(f"cell {cell.name} places others")
             for layer, size, polygons in _runs(cell.polygons):
-                counters[layer].add(_joined(polygons, size))
+                if layer not in counters:
+                    self.problems.append(f"layer {layer} of the DOE holds shapes that should not be there")
+                    continue
+                for points_um in _unfolded(polygons, size):
+                    counters[layer].add(points_um)
         for layer in group:
             yield counters.pop(layer).reading()
-
-
-def read_oasis_again(path: str | Path, layers: list[Layer], edges: PixelEdges) -> tuple[list[Reading], list[str]]:
-    """Read an OASIS file with gdstk and unfold its repetitions.
-
-    Args:
-        path: the file, known to be whole.
-        layers: the layers that it should hold.
-        edges: the pixel raster.
-
-    Returns:
-        One reading per layer, in the order given; and one sentence per thing that should not be in the
-        file (a second cell, references, labels, paths, other layers).
-    """
-    cells: list[Any] = gdstk.read_oas(str(path), unit=UM).cells
-    counters = {layer: _Counter(layer, edges) for layer in layers}
-    problems = [] if len(cells) == 1 else [f"it holds {len(cells)} cells instead of one"]
-    for cell in cells:
-        if cell.references or cell.labels or cell.paths:
-            problems.append(f"cell {cell.name} holds references, labels or paths")
-        for layer, size, polygons in _runs(cell.polygons):
-            if layer not in counters:
-                problems.append(f"layer {layer} holds shapes that should not be there")
-                continue
-            for points_um in _unfolded(polygons, size):
-                counters[layer].add(points_um)
-    return [counters[layer].reading() for layer in layers], problems

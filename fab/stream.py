@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import explain_os_error
-from fab.layout import Layer, Layout, require_name
+from fab.layout import Layer, Layout, Reference, require_name
 from fab.units import UM
 
 __all__ = ["oasis_to_gds", "write_gds", "write_oasis"]
@@ -28,6 +28,7 @@ __all__ = ["oasis_to_gds", "write_gds", "write_oasis"]
 HEADER, BGNLIB, LIBNAME, UNITS, ENDLIB = 0x0002, 0x0102, 0x0206, 0x0305, 0x0400
 BGNSTR, STRNAME, ENDSTR, BOUNDARY, ENDEL = 0x0502, 0x0606, 0x0700, 0x0800, 0x1100
 LAYER, DATATYPE, XY = 0x0D02, 0x0E02, 0x1003
+SREF, AREF, SNAME, COLROW = 0x0A00, 0x0B00, 0x1206, 0x1302
 
 # The version that introduced long polygons; every reader knows it.
 _VERSION = 600
@@ -56,10 +57,20 @@ def _real(value: float) -> bytes:
     return bytes([exponent]) + round(value * 2**56).to_bytes(7, "big")
 
 
-def _opening(cell: str, dbu_m: float) -> bytes:
+def _opening(dbu_m: float) -> bytes:
     library = _record(HEADER, struct.pack(">H", _VERSION)) + _record(BGNLIB, _TIME) + _text(LIBNAME, _LIBRARY)
-    units = _record(UNITS, _real(dbu_m / UM) + _real(dbu_m))
-    return library + units + _record(BGNSTR, _TIME) + _text(STRNAME, cell)
+    return library + _record(UNITS, _real(dbu_m / UM) + _real(dbu_m))
+
+
+def _reference(reference: Reference) -> bytes:
+    x, y, columns, rows = reference.x, reference.y, reference.columns, reference.rows
+    name = _text(SNAME, require_name(reference.cell))
+    if columns == rows == 1:
+        return _record(SREF) + name + _record(XY, struct.pack(">2i", x, y)) + _record(ENDEL)
+    # The second and third point lie one step beyond the last column and the last row.
+    points = (x, y, x + columns * reference.step_x, y, x, y + rows * reference.step_y)
+    raster = _record(COLROW, struct.pack(">2h", columns, rows)) + _record(XY, struct.pack(">6i", *points))
+    return _record(AREF) + name + raster + _record(ENDEL)
 
 
 def _element_start(layer: Layer) -> bytes:
@@ -83,26 +94,27 @@ def _write_polygon(stream: BinaryIO, layer: Layer, polygon: NDArray[np.int32]) -
     stream.write(_element_start(layer) + _record(XY, closed.tobytes()) + _record(ENDEL))
 
 
-def write_gds(path: str | Path, layout: Layout, layers: Iterable[Layer] | None = None) -> None:
-    """Write a layout, or some of its layers, as GDSII; the memory needed does not grow with the file.
+def write_gds(path: str | Path, layout: Layout) -> None:
+    """Write a layout as GDSII; the memory needed does not grow with the file.
 
     Args:
         path: the file; write it inside an `atomic_folder` where a half-written one would do harm.
         layout: the geometry.
-        layers: which of its layers, in this order; all if left out.
 
     Raises:
         InputError: the system refuses the path or the disk is full.
     """
     try:
         with open(path, "wb", buffering=0) as stream:
-            stream.write(_opening(require_name(layout.cell), layout.dbu_m))
-            for layer in layout.shapes if layers is None else layers:
-                shapes = layout.shapes[layer]
-                _write_rectangles(stream, layer, shapes.rectangles)
-                for polygon in shapes.polygons:
-                    _write_polygon(stream, layer, polygon)
-            stream.write(_record(ENDSTR) + _record(ENDLIB))
+            stream.write(_opening(layout.dbu_m))
+            for cell in layout.cells:
+                stream.write(_record(BGNSTR, _TIME) + _text(STRNAME, require_name(cell.name)))
+                for layer, shapes in cell.shapes.items():
+                    _write_rectangles(stream, layer, shapes.rectangles)
+                    for polygon in shapes.polygons:
+                        _write_polygon(stream, layer, polygon)
+                stream.write(b"".join(_reference(reference) for reference in cell.references) + _record(ENDSTR))
+            stream.write(_record(ENDLIB))
     except OSError as error:
         raise explain_os_error(error, path) from error
 

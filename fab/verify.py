@@ -20,15 +20,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.compare import Expected, layout_problems, reading_problems
+from fab.compare import Expected, cell_problems, layout_problems, reading_problems
 from fab.errors import CheckFailed, InputError
 from fab.files import explain_os_error, read_npy, sha256_file
-from fab.layout import Layer, PixelEdges, pixel_edges
+from fab.layout import Layer, PixelEdges, layer_from, pixel_edges
 from fab.levels import Levels
 from fab.manifest import FileEntry, Manifest, map_digest, plane_digest, read_manifest
 from fab.masks import planes
 from fab.polygons import paint
-from fab.readback import read_gds_again, read_oasis_again
+from fab.readback import Again
 from fab.stream import oasis_to_gds
 from fab.walker import read_gds
 
@@ -116,13 +116,14 @@ def _stored_map(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
     return stored if fits and stored.max() < manifest.levels else None
 
 
-def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges) -> NDArray[np.uint8]:
+def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges, cell: str) -> NDArray[np.uint8]:
     """Rebuild the level map that a combined GDSII file draws, with this package's own reader.
 
     Args:
         path: the combined file, bit k on layer k + 1.
         levels: the staircase.
         edges: where the pixel edges fall in the drawing.
+        cell: name of the cell with the planes.
 
     Returns:
         Level numbers ``[y, x]``.
@@ -131,9 +132,11 @@ def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges) -> NDArr
         InputError: the file is missing or corrupt, or draws something else than a plane of pixels.
     """
     etched = np.zeros((edges.y.size - 1, edges.x.size - 1), dtype=np.uint8)
-    layout = read_gds(path)
+    drawn = read_gds(path).cell(cell)
+    if drawn is None:
+        raise InputError(str(path), f"must hold the cell {cell}", "none of that name", "Write the order again.")
     for bit in range(levels.bits):
-        shapes = layout.shapes.get(Layer(bit + 1))
+        shapes = drawn.shapes.get(Layer(bit + 1))
         if shapes is None:
             continue
         painted = paint(shapes.rectangles, edges.x, edges.y, bit, etched)
@@ -156,7 +159,7 @@ def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdg
         return stored, Check(manifest.level_map_file, question, ())
     failed = Check(manifest.level_map_file, question, ("the level map is unreadable or its digest differs",))
     try:
-        drawn = read_level_map(folder / manifest.combined_gds, levels, edges)
+        drawn = read_level_map(folder / manifest.combined_gds, levels, edges, manifest.doe_cell)
     except InputError:
         drawn = None
     if drawn is not None and map_digest(drawn) == manifest.level_map_sha256:
@@ -187,7 +190,8 @@ def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check,
 
 
 def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
-    most = 2 * (sum(mask.polygons for mask in expected.manifest.masks) + expected.manifest.chrome.polygons)
+    around = sum(one.polygons for cell in entry.cells for one in cell.layers)
+    most = 2 * (sum(mask.polygons for mask in expected.manifest.masks) + expected.manifest.chrome.polygons + around)
     with tempfile.TemporaryDirectory() as folder:
         gds = Path(folder) / "altered.gds"
         try:
@@ -202,12 +206,11 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     chrome = expected.chrome_layer(entry)
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
-    if entry.format == _OASIS:
-        readings, problems = read_oasis_again(path, list(layers), expected.edges)
-    else:
-        readings, problems = read_gds_again(path, layers, expected.edges), []
-    for reading in readings:
-        problems += reading_problems(reading, entry, expected)
+    again = Again(expected.manifest.doe_cell, expected.edges)
+    others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
+    readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
+    problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
+    problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
     return Check(entry.file, "gdstk, every pixel", tuple(problems))
 
 

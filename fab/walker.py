@@ -1,11 +1,13 @@
 """This package's own GDSII reader: a walk along the chain of records, without any library.
 
-It accepts what `fab.stream` writes and no more: one cell, plain boundaries, every record in its place.
+It accepts what `fab.stream` writes and no more: cells of plain boundaries and upright references, every record
+in its place.
 Whatever it does not expect is refused with the file and the offset, so a damaged file cannot pass for a
 different drawing. The file is read a few megabytes at a time; a compiled kernel takes whole elements
 from the front of each block and what is left moves to the front of the next.
 """
 
+import struct
 from collections import defaultdict
 from pathlib import Path
 from typing import BinaryIO, NoReturn
@@ -16,11 +18,13 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import explain_os_error
-from fab.layout import Layer, Layout, Shapes
+from fab.layout import Cell, Layer, Layout, Reference, Shapes, in_order
 from fab.stream import (
+    AREF,
     BGNLIB,
     BGNSTR,
     BOUNDARY,
+    COLROW,
     DATATYPE,
     ENDEL,
     ENDLIB,
@@ -28,6 +32,8 @@ from fab.stream import (
     HEADER,
     LAYER,
     LIBNAME,
+    SNAME,
+    SREF,
     STRNAME,
     UNITS,
     XY,
@@ -42,11 +48,11 @@ _LONGEST = 1 << 17
 # The shortest element: a closed triangle.
 _SHORTEST = 4 + 6 + 6 + 4 + 4 * 8 + 4
 _SPOILED = "Write the order again, or fetch the file again."
-_END_OF_FILE = (4).to_bytes(2, "big") + ENDLIB.to_bytes(2, "big")
 # The words that mark an element: length of the record, then its type.
 _BOUNDARY, _LAYER = 4 << 16 | BOUNDARY, 6 << 16 | LAYER
 _ENDEL, _ENDSTR = 4 << 16 | ENDEL, 4 << 16 | ENDSTR
-_MORE, _DONE, _UNEXPECTED, _OPEN = 0, 1, 2, 3
+_SREF, _AREF = 4 << 16 | SREF, 4 << 16 | AREF
+_MORE, _DONE, _UNEXPECTED, _OPEN, _REFERENCE = 0, 1, 2, 3, 4
 
 
 def _from_real(data: bytes) -> float:
@@ -67,6 +73,8 @@ def _walk(words, rects, rect_keys, points, ends, keys):  # pragma: no cover - co
     while p < stop:
         if words[p] == _ENDSTR:
             return p + 1, count, polygons, _DONE
+        if words[p] == _SREF or words[p] == _AREF:
+            return p, count, polygons, _REFERENCE
         if words[p] != _BOUNDARY:
             return p, count, polygons, _UNEXPECTED
         if p + 5 > stop:
@@ -152,68 +160,136 @@ def _refuse(path: str | Path, rule: str, offset: int) -> NoReturn:
     raise InputError(str(path), rule, f"something else at byte {offset}", _SPOILED)
 
 
-def _read_opening(path: str | Path, stream: BinaryIO) -> tuple[str, float]:
-    """Read up to the cell's name; return it and the database unit in metres."""
-    data: dict[int, bytes] = {}
-    for kind in (HEADER, BGNLIB, LIBNAME, UNITS, BGNSTR, STRNAME):
-        offset = stream.tell()
-        head = stream.read(4)
-        length = int.from_bytes(head[:2], "big")
-        data[kind] = stream.read(max(0, length - 4))
-        if head[2:] != kind.to_bytes(2, "big") or len(data[kind]) != length - 4:
-            _refuse(path, "the file must be a whole GDSII stream with one cell", offset)
-    units = data[UNITS]
+class _Stream:
+    """A file read block by block, of which the front is looked at and then dropped."""
+
+    def __init__(self, path: str | Path, file: BinaryIO) -> None:
+        self.path, self._file = path, file
+        self.buffer = np.empty(_BLOCK + _LONGEST, dtype=np.uint8)
+        self.offset = self.kept = 0
+
+    def fill(self) -> bool:
+        """Read on, as far as there is room; return whether anything came."""
+        room = min(_BLOCK, self.buffer.size - self.kept)
+        got = self._file.readinto(self.buffer.data[self.kept : self.kept + room])  # type: ignore[attr-defined]
+        self.kept += got
+        return bool(got)
+
+    def drop(self, count: int) -> None:
+        """Forget the front."""
+        self.buffer[: self.kept - count] = self.buffer[count : self.kept].copy()
+        self.kept -= count
+        self.offset += count
+
+    def record(self, rule: str, *kinds: int) -> tuple[int, bytes]:
+        """Take the next record, which must be of one of these kinds; return its kind and data."""
+        length = self._ahead(4, rule)
+        kind = int.from_bytes(self.buffer[2:4].tobytes(), "big")
+        if kind not in kinds or length < 4:
+            _refuse(self.path, rule, self.offset)
+        self._ahead(length, rule)
+        data = self.buffer[4:length].tobytes()
+        self.drop(length)
+        return kind, data
+
+    def _ahead(self, count: int, rule: str) -> int:
+        """Have some bytes ready; return the length of the record at the front."""
+        while self.kept < count:
+            if not self.fill():
+                _refuse(self.path, rule, self.offset)
+        return int.from_bytes(self.buffer[:2].tobytes(), "big")
+
+
+_WHOLE = "the file must be a whole GDSII stream"
+
+
+def _name(data: bytes) -> str:
+    return data.rstrip(b"\0").decode("ascii", "backslashreplace")
+
+
+def _read_unit(stream: _Stream) -> float:
+    """Read the opening of the file; return the database unit in metres."""
+    for kind in (HEADER, BGNLIB, LIBNAME):
+        stream.record(_WHOLE, kind)
+    units = stream.record(_WHOLE, UNITS)[1]
     dbu_m = _from_real(units[8:16])
     if len(units) != 16 or not 1e-12 <= dbu_m <= 1e-3 or abs(_from_real(units[:8]) * UM / dbu_m - 1) > 1e-9:
         rule = "the user unit must be 1 um and the database unit must lie from 1 pm to 1 mm"
-        raise InputError(str(path), rule, f"UNITS {units.hex()}", _SPOILED)
-    return data[STRNAME].rstrip(b"\0").decode("ascii", "backslashreplace"), dbu_m
+        raise InputError(str(stream.path), rule, f"UNITS {units.hex()}", _SPOILED)
+    return dbu_m
 
 
-def _read_body(path: str | Path, stream: BinaryIO) -> dict[Layer, Shapes]:
-    buffer = np.empty(_BLOCK + _LONGEST, dtype=np.uint8)
-    view = buffer.data
-    found = _Found()
-    offset, kept = stream.tell(), 0
+def _read_reference(stream: _Stream) -> Reference:
+    rule = "a reference must be upright and whole"
+    kind, _ = stream.record(rule, SREF, AREF)
+    name = _name(stream.record(rule, SNAME)[1])
+    at = stream.offset
+    counts = stream.record(rule, COLROW)[1] if kind == AREF else struct.pack(">2h", 1, 1)
+    points = stream.record(rule, XY)[1]
+    if len(counts) != 4 or len(points) != (24 if kind == AREF else 8):
+        _refuse(stream.path, rule, at)
+    stream.record(rule, ENDEL)
+    columns, rows = struct.unpack(">2h", counts)
+    if columns < 1 or rows < 1:
+        _refuse(stream.path, rule, at)
+    x, y, *ends = struct.unpack(f">{len(points) // 4}i", points)
+    if not ends:
+        return Reference(name, x, y)
+    width, height = ends[0] - x, ends[3] - y
+    if ends[1] != y or ends[2] != x or width % columns or height % rows:
+        _refuse(stream.path, rule, at)
+    return Reference(name, x, y, columns, rows, width // columns, height // rows)
+
+
+def _read_cell(stream: _Stream, found: _Found) -> Cell:
+    """Read a cell from its name to its end."""
+    name = _name(stream.record(_WHOLE, STRNAME)[1])
+    references = []
     while True:
-        got = stream.readinto(view[kept : kept + _BLOCK])  # type: ignore[attr-defined]
-        read, why = found.take(buffer, kept + got)
+        read, why = found.take(stream.buffer, stream.kept)
+        stream.drop(read)
         if why == _OPEN:
-            _refuse(path, "every boundary must end at its first point", offset + read)
+            _refuse(stream.path, "every boundary must end at its first point", stream.offset)
         if why == _UNEXPECTED:
-            _refuse(path, "the cell must hold plain boundaries (layer, datatype, points) only", offset + read)
-        kept += got - read
-        rest = buffer[read : read + kept].tobytes()
+            rule = "a cell must hold plain boundaries (layer, datatype, points) and references only"
+            _refuse(stream.path, rule, stream.offset)
         if why == _DONE:
-            break
-        if not got:
-            _refuse(path, "the file must be whole, up to its end record", offset + read)
-        view[:kept] = rest
-        offset += read
-    # Zeros may follow, since some programs fill the last block of a tape.
-    tail = rest + stream.read()
-    if tail[:4] != _END_OF_FILE or tail[4:].strip(b"\0"):
-        _refuse(path, "the file must end with its end record after the one cell", offset + read)
-    return found.shapes()
+            return Cell(name, found.shapes(), tuple(references))
+        if why == _REFERENCE:
+            references.append(_read_reference(stream))
+        elif not stream.fill():
+            _refuse(stream.path, "the file must be whole, up to its end record", stream.offset)
 
 
 def read_gds(path: str | Path) -> Layout:
-    """Read a GDSII file of one cell that holds boundaries only, and check every record of it.
+    """Read a GDSII file of boundaries and upright references, and check every record of it.
 
     Args:
         path: the file.
 
     Returns:
-        The cell. Axis-parallel boundaries of four points come back as rectangles, in the order of the
-        file, all others (degenerate ones too) as polygons; layers are sorted and have no names.
+        The layout, every cell after those that it places. Axis-parallel boundaries of four points come back as
+        rectangles, in the order of the file, all others (degenerate ones too) as polygons; layers are sorted and
+        have no names.
 
     Raises:
         InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names
             the file and the offset.
     """
     try:
-        with open(path, "rb", buffering=0) as stream:
-            cell, dbu_m = _read_opening(path, stream)
-            return Layout(cell, dbu_m, _read_body(path, stream))
+        with open(path, "rb", buffering=0) as file:
+            stream, found, cells = _Stream(path, file), _Found(), []
+            dbu_m = _read_unit(stream)
+            while stream.record(_WHOLE, BGNSTR, ENDLIB)[0] == BGNSTR:
+                cells.append(_read_cell(stream, found))
+            # Zeros may follow, since some programs fill the last block of a tape.
+            while stream.kept or stream.fill():
+                if stream.buffer[: stream.kept].any():
+                    _refuse(path, "the file must end with its end record", stream.offset)
+                stream.drop(stream.kept)
     except OSError as error:
         raise explain_os_error(error, path) from error
+    try:
+        return Layout(dbu_m, in_order(cells))
+    except ValueError as error:
+        raise InputError(str(path), "the cells must make one drawing", str(error), _SPOILED) from error

@@ -37,16 +37,16 @@ def test_every_mask_file_holds_its_own_layer_in_a_cell_of_its_own_name(written_o
     for bit, depth in enumerate((75, 150, 300, 600)):
         stem = f"DOE_SMALL_M{bit + 1}_B{bit}_{depth}NM"
         layout = read_gds(written_order / f"{stem}.gds")
-        assert layout.cell == stem
-        assert list(layout.shapes) == [Layer(bit + 1)]
-    assert list(read_gds(written_order / "DOE_SMALL_CHROME.gds").shapes) == [Layer(5)]
-    assert len(read_gds(written_order / "DOE_SMALL_ALL.gds").shapes) == 5
+        assert layout.top.name == stem
+        assert list(layout.cells[0].shapes) == [Layer(bit + 1)]
+    assert list(read_gds(written_order / "DOE_SMALL_CHROME.gds").cells[0].shapes) == [Layer(5)]
+    assert len(read_gds(written_order / "DOE_SMALL_ALL.gds").cells[0].shapes) == 5
 
 
 def test_the_level_map_is_stored_and_drawn(written_order, level_map, levels, grid):
     blank = unetched_outside(level_map, levels, grid, grid.extent_m[1])
     assert np.array_equal(np.load(written_order / "DOE_SMALL_LEVELS.npy"), blank)
-    drawn = read_level_map(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid))
+    drawn = read_level_map(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid), "DOE_SMALL_DOE")
     assert np.array_equal(drawn, blank)
     assert read_manifest(written_order).level_map_sha256 == map_digest(blank)
 

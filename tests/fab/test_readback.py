@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fab.grid import Grid
-from fab.layout import Layer, Layout, Shapes, mask_layout, pixel_edges
+from fab.layout import Cell, Layer, Layout, Shapes, mask_layout, pixel_edges
 from fab.polygons import rectangles
-from fab.readback import read_gds_again, read_oasis_again
+from fab.readback import Again
 from fab.stream import write_gds, write_oasis
 from fab.units import NM, UM
 
@@ -23,7 +23,7 @@ def written(folder, edges, **planes):
         Layer(number): Shapes(rectangles(plane, edges.x, edges.y), (TRIANGLE,))
         for number, plane in enumerate(planes.values(), 1)
     }
-    write_gds(folder / "a.gds", Layout("TOP", edges.dbu_m, shapes))
+    write_gds(folder / "a.gds", Layout(edges.dbu_m, (Cell("TOP", shapes),)))
     write_oasis(folder / "a.oas", folder / "a.gds", shapes)
     return {layer: len(drawn) for layer, drawn in shapes.items()}
 
@@ -37,14 +37,16 @@ def test_the_other_library_counts_every_pixel_once(tmp_path_factory, pitch_m, on
     folder = tmp_path_factory.mktemp("again")
     edges = pixel_edges(Grid((7, 10), pitch_m))
     layers = written(folder, edges, one=one, two=two)
-    from_oasis, problems = read_oasis_again(folder / "a.oas", list(layers), edges)
-    assert problems == []
-    for readings in (list(read_gds_again(folder / "a.gds", layers, edges)), from_oasis):
+    again = Again("TOP", edges)
+    both = again.gds(folder / "a.gds", layers, []), again.oasis(folder / "a.oas", layers)
+    for readings in map(list, both):
         assert [reading.layer for reading in readings] == list(layers)
         for reading, plane in zip(readings, (one, two), strict=True):
             assert np.array_equal(reading.winding, plane)
             assert reading.strays == 0
             assert [sorted(map(tuple, p.tolist())) for p in reading.polygons] == [sorted(map(tuple, TRIANGLE.tolist()))]
+    assert again.problems == []
+    assert again.around == []
 
 
 def test_repetitions_of_oasis_are_unfolded(tmp_path):
@@ -55,7 +57,7 @@ def test_repetitions_of_oasis_are_unfolded(tmp_path):
     layers = written(tmp_path, edges, plane=plane)
     cells: list[Any] = gdstk.read_oas(str(tmp_path / "a.oas")).cells
     assert len(cells[0].polygons) < 10
-    (reading,), _ = read_oasis_again(tmp_path / "a.oas", list(layers), edges)
+    (reading,) = Again("TOP", edges).oasis(tmp_path / "a.oas", layers)
     assert np.array_equal(reading.winding, plane)
 
 
@@ -64,8 +66,8 @@ def test_overlaps_and_strays_are_seen(tmp_path):
     rects = np.array([[-2000, -2000, 0, 0], [-1000, -1000, 1000, 1000], [0, 0, 1001, 1000], [0, 0, 3000, 1000]])
     slanted = np.array([[0, 0], [1000, 0], [1000, 1000], [1, 1000]], dtype=np.int32)
     shapes = {Layer(1): Shapes(rects.astype(np.int32), (slanted,))}
-    write_gds(tmp_path / "a.gds", Layout("TOP", NM, shapes))
-    (reading,) = read_gds_again(tmp_path / "a.gds", {Layer(1): 5}, edges)
+    write_gds(tmp_path / "a.gds", Layout(NM, (Cell("TOP", shapes),)))
+    (reading,) = Again("TOP", edges).gds(tmp_path / "a.gds", {Layer(1): 5}, [])
     assert reading.strays == 3
     assert reading.winding.tolist() == [[1, 1, 0, 0], [1, 2, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
 
@@ -82,10 +84,15 @@ def test_layers_are_read_in_as_many_passes_as_memory_asks_for(tmp_path, monkeypa
 
     monkeypatch.setattr("fab.readback.gdstk.read_gds", counted)
     edges = pixel_edges(grid)
-    together = [r.winding for r in read_gds_again(tmp_path / "a.gds", {Layer(n): 1 for n in (1, 2, 3)}, edges)]
+
+    def windings(count: int, *others: Layer) -> list[np.ndarray]:
+        layers = {Layer(n): count for n in (1, 2, 3)}
+        return [reading.winding for reading in Again("TOP", edges).gds(tmp_path / "a.gds", layers, others)]
+
+    together = windings(1)
     assert len(passes) == 1
-    apart = [r.winding for r in read_gds_again(tmp_path / "a.gds", {Layer(n): 2_000_000 for n in (1, 2, 3)}, edges)]
-    assert passes[1:] == [{(1, 0)}, {(2, 0)}, {(3, 0)}]
+    apart = windings(2_000_000, Layer(7, 1), Layer(1))
+    assert passes[1:] == [{(1, 0), (7, 1)}, {(2, 0)}, {(3, 0)}]
     assert np.array_equal(together, apart)
 
 
@@ -95,6 +102,8 @@ def test_what_does_not_belong_in_an_oasis_file_is_told(tmp_path):
     cell.add(gdstk.rectangle((0, 0), (1, 1), layer=9), gdstk.Label("text", (0, 0)))
     library.new_cell("OTHER")
     library.write_oas(str(tmp_path / "a.oas"))
-    (reading,), problems = read_oasis_again(tmp_path / "a.oas", [Layer(1)], pixel_edges(Grid((2, 2), UM)))
+    again = Again("TOP", pixel_edges(Grid((2, 2), UM)))
+    (reading,) = again.oasis(tmp_path / "a.oas", [Layer(1)])
     assert not reading.winding.any()
-    assert [any(word in problem for problem in problems) for word in ("2 cells", "labels", "9/0")] == [True] * 3
+    assert [any(word in problem for problem in again.problems) for word in ("labels", "9/0")] == [True] * 2
+    assert [cell.name for cell in again.around] == ["OTHER"]

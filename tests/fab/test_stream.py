@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.grid import Grid
-from fab.layout import Chrome, Layer, Layout, Shapes, mask_layout
+from fab.layout import Cell, Chrome, Layer, Layout, Shapes, mask_layout
 from fab.levels import Levels
 from fab.polygons import rectangles
 from fab.stream import oasis_to_gds, write_gds, write_oasis
@@ -25,7 +25,7 @@ TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
 
 
 def one_layer(rects, *polygons, cell="TOP", dbu_m=NM):
-    return Layout(cell, dbu_m, {Layer(1): Shapes(np.array(rects, dtype=np.int32).reshape(-1, 4), polygons)})
+    return Layout(dbu_m, (Cell(cell, {Layer(1): Shapes(np.array(rects, dtype=np.int32).reshape(-1, 4), polygons)}),))
 
 
 def records(path):
@@ -66,7 +66,7 @@ def test_the_area_survives_many_batches(gds):
     cells: list[Any] = gdstk.read_gds(str(gds)).cells
     # Twenty-one square nanometres each, added up in square micrometres.
     assert sum(polygon.area() for polygon in cells[0].polygons) == pytest.approx(70_000 * 21e-6, rel=1e-9)
-    assert np.array_equal(read_gds(gds).shapes[Layer(1)].rectangles, rects)
+    assert np.array_equal(read_gds(gds).cells[0].shapes[Layer(1)].rectangles, rects)
 
 
 def test_names_and_times_are_fixed(gds):
@@ -127,12 +127,12 @@ def test_gdstk_sees_exactly_the_pixels(tmp_path_factory, plane):
 def test_oasis_keeps_names_repeats_and_polygons(tmp_path, level_map, levels, grid):
     layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
     write_gds(tmp_path / "a.gds", layout)
-    write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", layout.shapes)
+    write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", layout.cells[0].shapes)
     again = kdb.Layout()
     again.read(str(tmp_path / "a.oas"))
     names = [(info.layer, info.datatype, info.name) for info in again.layer_infos()]
-    assert names == [(layer.number, layer.datatype, layer.name) for layer in layout.shapes]
-    for layer, shapes in layout.shapes.items():
+    assert names == [(layer.number, layer.datatype, layer.name) for layer in layout.cells[0].shapes]
+    for layer, shapes in layout.cells[0].shapes.items():
         region = kdb.Region(again.top_cell().begin_shapes_rec(again.find_layer(layer.number, layer.datatype)))
         assert 2 * region.area() == shapes.doubled_area
     assert (tmp_path / "a.oas").stat().st_size < (tmp_path / "a.gds").stat().st_size / 2
@@ -144,23 +144,9 @@ def test_the_same_layout_gives_the_same_bytes(tmp_path, level_map, levels, grid)
         gds, oasis = tmp_path / f"{name}.gds", tmp_path / f"{name}.oas"
         layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
         write_gds(gds, layout)
-        write_oasis(oasis, gds, layout.shapes)
+        write_oasis(oasis, gds, layout.cells[0].shapes)
         digests.append((sha256_file(gds), sha256_file(oasis)))
     assert digests[0] == digests[1]
-
-
-def test_layers_can_be_written_one_by_one(tmp_path, level_map, levels, grid):
-    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
-    write_gds(tmp_path / "all.gds", layout)
-    pieces = []
-    for layer in layout.shapes:
-        write_gds(tmp_path / "one.gds", layout, [layer])
-        pieces.append((tmp_path / "one.gds").read_bytes())
-        assert list(read_gds(tmp_path / "one.gds").shapes) == [layer]
-    # The elements of the whole are those of the parts: same opening, same end.
-    opening = next(i for i, (a, b) in enumerate(zip(pieces[0], pieces[1], strict=False)) if a != b) - 9
-    bodies = b"".join(piece[opening:-8] for piece in pieces)
-    assert (tmp_path / "all.gds").read_bytes() == pieces[0][:opening] + bodies + pieces[0][-8:]
 
 
 def test_a_path_that_cannot_be_written_is_named(tmp_path):
@@ -176,7 +162,7 @@ def test_oasis_back_to_gds_refuses_ruins_and_floods(tmp_path):
     write_gds(tmp_path / "a.gds", one_layer([[i * 3, 0, i * 3 + 1, 1] for i in range(50)], TRIANGLE))
     write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", [])
     oasis_to_gds(tmp_path / "a.oas", tmp_path / "b.gds", 51)
-    again = read_gds(tmp_path / "b.gds").shapes[Layer(1)]
+    again = read_gds(tmp_path / "b.gds").cells[0].shapes[Layer(1)]
     assert (len(again.rectangles), len(again.polygons)) == (50, 1)
     with pytest.raises(InputError, match="51 shapes"):
         oasis_to_gds(tmp_path / "a.oas", tmp_path / "b.gds", 50)
@@ -189,7 +175,7 @@ def test_odd_grids_are_drawn_without_gap_or_overlap(tmp_path):
     # A third of a micrometre fits no unit: neighbours must share the rounded edge.
     levels, grid = Levels(2, 75 * NM), Grid((5, 7), UM / 3)
     layout = mask_layout(np.zeros((5, 7), dtype=np.uint8), levels, grid, 5 * UM / 3, "DOE", Chrome(overlap_m=0))
-    rects = layout.shapes[Layer(1)].rectangles
+    rects = layout.cells[0].shapes[Layer(1)].rectangles
     assert len(rects) > 1
     region = kdb.Region()
     for rect in rects.tolist():

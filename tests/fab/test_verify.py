@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import pytest
 from fab.errors import CheckFailed, InputError
 from fab.files import sha256_file
 from fab.grid import Grid
-from fab.layout import Layer, Layout, Shapes, pixel_edges
+from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.manifest import read_manifest
 from fab.stream import write_gds
@@ -38,7 +39,8 @@ def flip(path, place, mask=0x01):
 def redraw(folder, file, change):
     """Write a mask file again with other shapes."""
     layout = read_gds(folder / file)
-    write_gds(folder / file, Layout(layout.cell, layout.dbu_m, change(layout.shapes)))
+    doe, *around = layout.cells
+    write_gds(folder / file, Layout(layout.dbu_m, (replace(doe, shapes=change(doe.shapes)), *around)))
 
 
 def test_a_whole_order_passes_every_question(written_order):
@@ -137,7 +139,7 @@ def test_an_altered_oasis_file_that_still_parses_is_compared_pixel_by_pixel(orde
 
     layout = kdb.Layout()
     layout.read(str(order_folder / MASKS[1]))
-    shapes = layout.top_cell().shapes(layout.find_layer(3, 0))
+    shapes = layout.cell("DOE_SMALL_DOE").shapes(layout.find_layer(3, 0))
     shapes.clear()
     options = kdb.SaveLayoutOptions()
     options.format = "OASIS"
@@ -148,7 +150,7 @@ def test_an_altered_oasis_file_that_still_parses_is_compared_pixel_by_pixel(orde
 
 def test_another_cell_name_or_unit_is_told(order_folder):
     layout = read_gds(order_folder / MASKS[3])
-    write_gds(order_folder / MASKS[3], Layout("OTHER", 2e-9, layout.shapes))
+    write_gds(order_folder / MASKS[3], Layout(2e-9, (*layout.cells[:-1], replace(layout.top, name="OTHER"))))
     problems = " ".join(problems_of(order_folder, MASKS[3]))
     assert "named 'OTHER' instead of 'DOE_SMALL_M1_B0_75NM'" in problems
     assert "database unit is 2 nm instead of 1 nm" in problems
@@ -208,8 +210,10 @@ def test_what_is_no_order_is_refused(tmp_path):
 def test_a_level_map_is_rebuilt_only_from_separate_pixels(tmp_path):
     levels, edges = Levels(4, 75e-9), pixel_edges(Grid((2, 2), 1e-6))
     rects = np.array([[-1000, -1000, 0, 0], [-1000, -1000, 1000, 0]], dtype=np.int32)
-    write_gds(tmp_path / "a.gds", Layout("TOP", 1e-9, {Layer(1): Shapes(rects[:1]), Layer(2): Shapes(rects[1:])}))
-    assert read_level_map(tmp_path / "a.gds", levels, edges).tolist() == [[0, 1], [3, 3]]
-    write_gds(tmp_path / "a.gds", Layout("TOP", 1e-9, {Layer(1): Shapes(rects)}))
+    write_gds(
+        tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects[:1]), Layer(2): Shapes(rects[1:])}),))
+    )
+    assert read_level_map(tmp_path / "a.gds", levels, edges, "TOP").tolist() == [[0, 1], [3, 3]]
+    write_gds(tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects)}),)))
     with pytest.raises(InputError, match=r"a\.gds: layer 1/0 .*1 pixels covered twice"):
-        read_level_map(tmp_path / "a.gds", levels, edges)
+        read_level_map(tmp_path / "a.gds", levels, edges, "TOP")
