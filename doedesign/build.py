@@ -10,6 +10,7 @@ from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import ERRORS, Defects, Process, Spread, error_names
 from fab.units import format_length
+from fab.wafer import Wafer
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -58,6 +59,15 @@ def process_of(spec: ProcessSpec) -> Process:
         name=spec.stock or ("custom" if spreads or any(defects[key] for key in _EVENTS) else "ideal"),
         **{key: getattr(full, key) for key in _SHARED},
     )
+
+
+def wafer_of(spec: Spec) -> Wafer:
+    """What the masks of an order are filled with.
+
+    Raises:
+        InputError: numbers that do not go together.
+    """
+    return Wafer(**spec.wafer.model_dump())
 
 
 def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> Process:

@@ -90,6 +90,7 @@ def masks(
     pitch_um: float | None = None,
     scale: str | None = None,
     aperture: str | None = None,
+    on_violation: Literal["warn", "fail", "fix"] = "warn",
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -102,6 +103,7 @@ def masks(
         pitch_um: Pixel pitch of a bare height map in micrometres.
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
+        on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
     """
     from doedesign.commands.masks import write_masks
     from doedesign.drawing import level_map_from
@@ -114,7 +116,7 @@ def masks(
         scale_m=_length("--scale", scale),
         aperture_m=_length("--aperture", aperture),
     )
-    folder, report = write_masks(source, drawing, out, _say)
+    folder, report = write_masks(source, drawing, out, on_violation, _say)
     _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
     _print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
 

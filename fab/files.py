@@ -180,6 +180,10 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         _swap(temporary, path)
     except OSError as error:
         raise explain_os_error(error, path) from error
+    except InputError as error:
+        # What a writer says of a file in the temporary folder is told of the folder that was asked for.
+        error.where = error.where.replace(str(temporary), str(path))
+        raise
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)

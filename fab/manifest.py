@@ -28,6 +28,9 @@ __all__ = [
     "LayerEntry",
     "Manifest",
     "MaskEntry",
+    "ModelEntry",
+    "PlateEntry",
+    "WaferEntry",
     "map_digest",
     "plane_digest",
     "read_manifest",
@@ -40,7 +43,9 @@ CONVENTIONS = {
     "chrome layer": "polygon = chrome stays here",
     "levels": "level l of L stands l steps high; the blank glass is level L-1",
     "masks": "bit k of (L-1-level) set = mask k opens and etches 2^k steps; bit k is layer k+1, datatype 0",
-    "axes": "seen from the etched side, +x right, +y up, origin at the centre of the clear aperture; not mirrored",
+    "axes": "seen from the etched side, +x right, +y up, origin at the centre of the wafer; not mirrored",
+    "datatypes": "0 the DOE, 1 alignment marks, 2 test structures, 3 lettering; one mask carries them all",
+    "outlines": "layers 100 to 110 show the blank, the wafer, the clear aperture and the die; they are on no mask",
     "level map": "uint8 [y, x], row 0 at the lowest y; its digest is the SHA-256 of these bytes row by row",
     "plane digests": "SHA-256 of the rows packed to bytes, first pixel in the highest bit, 1 = etched",
 }
@@ -103,6 +108,44 @@ class MaskEntry:
 
 
 @dataclass(frozen=True)
+class PlateEntry:
+    """One mask as the shop makes it, in the order of use: what polygons are on the plate, and how it is read."""
+
+    mask: str
+    makes: str
+    layer: int
+    bit: int | None
+    depth_nm: float | None
+    file: str
+    polygons: str
+    field: str
+    reading: str
+
+
+@dataclass(frozen=True)
+class WaferEntry:
+    """Where everything lies: sizes, the middles of the dies, and the places where people measure, x and y."""
+
+    diameter_mm: float
+    thickness_mm: float
+    blank_mm: float
+    die_pitch_mm: float
+    dies_mm: list[list[float]]
+    places_um: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """A solid or a height map: its content, its volumes by part and how exact they are, or its scale."""
+
+    file: str
+    content: str
+    volumes_mm3: dict[str, Any]
+    relative_error: float
+    metres_per_count: float | None
+
+
+@dataclass(frozen=True)
 class ChromeEntry:
     """The chrome aperture, a true circle drawn with the stated chord error."""
 
@@ -141,8 +184,12 @@ class Manifest:
     combined_oasis: str
     preview: str
     doe_cell: str
+    plates: list[PlateEntry]
+    wafer: WaferEntry
+    rules: dict[str, Any]
     masks: list[MaskEntry]
     chrome: ChromeEntry
+    models: list[ModelEntry]
     files: list[FileEntry]
     tools: dict[str, Any]
 
@@ -230,7 +277,7 @@ def read_manifest(folder: str | Path) -> Manifest:
         rule = "its content must have the digest that it states"
         raise InputError(str(path), rule, "another one", "Fetch the manifest again, or write the order again.")
     manifest: Manifest = _entry(Manifest, data, str(path))
-    entries = [*manifest.files, *manifest.masks, manifest.chrome]
+    entries = [*manifest.files, *manifest.masks, manifest.chrome, *manifest.plates, *manifest.models]
     names = [entry.file for entry in entries]
     names += [manifest.level_map_file, manifest.combined_gds, manifest.combined_oasis, manifest.preview]
     for name in names:

@@ -3,17 +3,19 @@
     DOE_<ID>_ALL.gds, .oas          all layers, for review
     DOE_<ID>_M<n>_B<k>_<depth>.gds  one file per etch mask, on its own layer k + 1
     DOE_<ID>_CHROME.gds             the chrome around the clear aperture
+    DOE_<ID>_ZERO.gds               the chrome marks that are made first, if the wafer has any
     DOE_<ID>_LEVELS.npy             the level map (uint8, row 0 at the lowest y)
     DOE_<ID>_PREVIEW.png            a picture for people
     manifest.json                   what each file is, its digest, its geometry
+    ...                             solids and height maps (`fab.models`); what the caller adds
 
 The folder appears at its final path only after everything in it was read back and found equal to the
-level map. Later content (marks, rules, run sheet, solids) joins as further files of the manifest.
+level map.
 """
 
 import platform
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
+from fab.frame import Frame, draw_frame
 from fab.grid import Grid
 from fab.inventory import cell_entry, geometry
 from fab.layout import (
@@ -32,7 +35,6 @@ from fab.layout import (
     Layer,
     Layout,
     PixelEdges,
-    Reference,
     Shapes,
     chrome_layer,
     etch_layer,
@@ -48,18 +50,25 @@ from fab.manifest import (
     FileEntry,
     Manifest,
     MaskEntry,
+    PlateEntry,
+    WaferEntry,
     map_digest,
     plane_digest,
     read_manifest,
 )
 from fab.masks import planes, unetched_outside
+from fab.models import Relief, write_models
+from fab.part import Plate, plates_of
 from fab.polygons import smallest_runs
 from fab.preview import preview_png
+from fab.process import Process
+from fab.rules import Rules, RulesReport, check
 from fab.stream import write_gds, write_oasis
 from fab.units import MM, NM, UM, format_length
 from fab.verify import Report, verify_order
+from fab.wafer import READING, Wafer
 
-__all__ = ["Order", "order_id", "write_order"]
+__all__ = ["Add", "Order", "mask_file", "order_id", "write_order"]
 
 # What is left of 32 characters beside "DOE_" and the longest ending, "_M6_B5_1234P5NM".
 _LONGEST_ID = 13
@@ -68,6 +77,11 @@ _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 
 def _silent(step: str) -> None:
     """Take the name of a step and do nothing with it."""
+
+
+def _nothing(folder: Path, order: "Order", frame: Frame) -> Sequence[str]:
+    """Add no files."""
+    return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +96,8 @@ class Order:
         aperture_m: diameter of the clear aperture, metres.
         chrome: how the chrome is drawn.
         source: where the height map came from.
+        process: in which order the masks are etched, and what their polygons are on the plates.
+        wafer: what the masks are filled with.
     """
 
     name: str
@@ -91,6 +107,24 @@ class Order:
     aperture_m: float
     chrome: Chrome
     source: Mapping[str, Any]
+    process: Process
+    wafer: Wafer
+
+    @property
+    def plates(self) -> tuple[Plate, ...]:
+        """The masks in the order in which they are used."""
+        process, wafer = self.process, self.wafer
+        return plates_of(self.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
+
+    def rules(self) -> RulesReport:
+        """Check every etch mask against what the process prints."""
+        return check(self.level_map, self.levels, self.grid, self.aperture_m, Rules.of(self.process))
+
+    def plate_stem(self, plate: Plate) -> str:
+        """Return the name of a mask's file (without suffix) and top cell."""
+        if plate.bit is not None:
+            return self.mask_stem(plate.bit)
+        return f"{self.stem}_{'ZERO' if plate.makes == 'zero layer' else 'CHROME'}"
 
     @property
     def stem(self) -> str:
@@ -101,6 +135,9 @@ class Order:
         """Return the name of an etch mask's file (without suffix) and cell."""
         depth = f"{self.levels.etch_depth_m(bit) / NM:.1f}".removesuffix(".0").replace(".", "P")
         return f"{self.stem}_M{bit + 1}_B{bit}_{depth}NM"
+
+
+Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
 def order_id(name: str, digest: str) -> str:
@@ -200,17 +237,62 @@ def _edges_told(edges: PixelEdges) -> str:
     )
 
 
+def _frame(order: Order, doe_cell: str, dbu_m: float) -> Frame:
+    return draw_frame(
+        order.wafer,
+        order.plates,
+        order.levels,
+        doe_cell=doe_cell,
+        stem=order.stem,
+        digest=map_digest(order.level_map),
+        pitch_m=order.grid.pitch_m,
+        minimum_line_m=order.process.minimum_line_m,
+        chrome_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[1],
+        aperture_m=order.aperture_m,
+        dbu_m=dbu_m,
+    )
+
+
+def _plate_entry(order: Order, plate: Plate) -> PlateEntry:
+    dark_field = plate.tone == "clear"
+    return PlateEntry(
+        mask=plate.name,
+        makes=plate.makes,
+        layer=plate.layer,
+        bit=plate.bit,
+        depth_nm=None if plate.bit is None else round(plate.depth_m / NM, 9),
+        file=f"{order.plate_stem(plate)}.gds",
+        polygons=f"digitised data {plate.tone}: polygons are {'clear' if dark_field else 'chrome'} on the plate",
+        field="dark field" if dark_field else "clear field",
+        reading=READING,
+    )
+
+
+def _wafer_entry(order: Order, frame: Frame) -> WaferEntry:
+    wafer = order.wafer
+    places = {name: [round(x / UM, 6), round(y / UM, 6)] for name, (x, y) in sorted(frame.places.items())}
+    return WaferEntry(
+        diameter_mm=round(wafer.diameter_m / MM, 9),
+        thickness_mm=round(wafer.thickness_m / MM, 9),
+        blank_mm=round(wafer.blank_m / MM, 9),
+        die_pitch_mm=round(frame.die_m / MM, 9),
+        dies_mm=[[round(x / MM, 9), round(y / MM, 9)] for x, y in frame.dies],
+        places_um=places,
+    )
+
+
 def _around(layout: Layout) -> list[CellEntry]:
     """What the manifest says of every cell but that of the DOE, which comes first."""
     return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[1:]]
 
 
-def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Manifest:
+def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
     """Write everything but the manifest, and return it."""
     say("drawing the masks")
     doe_cell = f"{order.stem}_DOE"
     drawn = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, doe_cell, order.chrome)
-    layout = Layout(drawn.dbu_m, (*drawn.cells, Cell(order.stem, {}, (Reference(doe_cell),))))
+    frame = _frame(order, doe_cell, drawn.dbu_m)
+    layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
     doe_layers = list(drawn.top.shapes)
     del drawn
     bit_planes = planes(order.level_map, order.levels)
@@ -222,11 +304,11 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
     say("writing GDSII")
     write_gds(folder / gds, layout)
     files = [(gds, "GDSII", layout, doe_layers)]
-    for entry in (*masks, chrome):
-        layer = Layer(entry.layer, entry.datatype)
-        plate = mask_file(layout, layer, entry.cell)
-        write_gds(folder / entry.file, plate)
-        files.append((entry.file, "GDSII", plate, [layer]))
+    for plate in order.plates:
+        name, layer = order.plate_stem(plate), Layer(plate.layer)
+        one = mask_file(layout, layer, name)
+        write_gds(folder / f"{name}.gds", one)
+        files.append((f"{name}.gds", "GDSII", one, [layer] if layer in doe_layers else []))
     say("writing OASIS")
     write_oasis(folder / oasis, folder / gds, layout.layers)
     files.append((oasis, "OASIS", layout, doe_layers))
@@ -242,6 +324,13 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
     radii_m = order.chrome.radii_m(order.grid, order.aperture_m)
     picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
     (folder / preview).write_bytes(picture)
+    say("drawing the solids")
+    shown = Relief(
+        order.level_map, order.levels, order.grid, order.aperture_m, order.chrome, frame.die_m, order.wafer.thickness_m
+    )
+    models = write_models(folder, order.stem, shown)
+    contents += [(model.file, Path(model.file).suffix[1:].upper(), None, [], []) for model in models]
+    contents += [(name, Path(name).suffix[1:].upper(), None, [], []) for name in add(folder, order, frame)]
     contents += [(levels_file, "NPY", None, [], []), (preview, "PNG", None, [], [])]
     return Manifest(
         format=FORMAT,
@@ -261,8 +350,12 @@ def _write_files(folder: Path, order: Order, say: Callable[[str], None]) -> Mani
         combined_oasis=oasis,
         preview=preview,
         doe_cell=doe_cell,
+        plates=[_plate_entry(order, plate) for plate in order.plates],
+        wafer=_wafer_entry(order, frame),
+        rules=order.rules().as_record(),
         masks=masks,
         chrome=chrome,
+        models=models,
         files=[
             FileEntry(
                 file=name,
@@ -300,6 +393,9 @@ def write_order(
     source: Mapping[str, Any],
     *,
     chrome: Chrome | None = None,
+    process: Process | None = None,
+    wafer: Wafer | None = None,
+    add: Add = _nothing,
     say: Callable[[str], None] = _silent,
 ) -> Report:
     """Write a mask order and prove it; the folder appears only if the proof holds.
@@ -313,6 +409,9 @@ def write_order(
         name: the owner's name for it; file names are made from it.
         source: where the height map came from, for the manifest; JSON values only.
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
+        process: order of the etches and tone of the masks; an ideal process if left out.
+        wafer: what the masks are filled with; the defaults of `Wafer` if left out.
+        add: writes further files into the folder and returns their names; what needs light to be written.
         say: told the name of each step as it begins.
 
     Returns:
@@ -325,9 +424,10 @@ def write_order(
     """
     _require_own(Path(folder))
     blank = unetched_outside(level_map, levels, grid, aperture_m)
-    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source)
+    made = process or Process(levels)
+    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source, made, wafer or Wafer())
     with atomic_folder(folder) as fresh:
-        manifest = _write_files(fresh, order, say)
+        manifest = _write_files(fresh, order, add, say)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
         say("reading everything back")
         report = verify_order(fresh)

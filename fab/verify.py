@@ -27,6 +27,7 @@ from fab.layout import Layer, PixelEdges, layer_from, pixel_edges
 from fab.levels import Levels
 from fab.manifest import FileEntry, Manifest, map_digest, plane_digest, read_manifest
 from fab.masks import planes
+from fab.models import model_problems
 from fab.polygons import paint
 from fab.readback import Again
 from fab.stream import oasis_to_gds
@@ -250,6 +251,11 @@ def verify_order(folder: str | Path) -> Report:
         for entry in manifest.files:
             if entry.format in (_GDS, _OASIS):
                 checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)
+        for model in manifest.models:
+            # Libraries of solids and pictures are given whole files only.
+            if byte_checks[model.file].passed:
+                problems = model_problems(folder, model, manifest, reference)
+                checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
     except OSError as error:
         raise explain_os_error(error, folder) from error
     return Report(tuple(checks))

@@ -1,54 +1,161 @@
 """`doedesign masks` and `doedesign verify`: a height map becomes a mask order, and an order is proved."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from doedesign.build import camera_of, process_of, wafer_of
 from doedesign.drawing import LevelMap
+from doedesign.report.marks import draw_part
+from doedesign.report.rules import draw_rules
 from doedesign.runs import open_run
+from doedesign.spec import Spec
+from fab.errors import InputError
 from fab.files import sha256_file
-from fab.layout import Chrome
-from fab.order import write_order
+from fab.frame import Frame
+from fab.layout import Chrome, pixel_edges
+from fab.levels import Levels
+from fab.marks import alignment_site
+from fab.masks import unetched_outside
+from fab.order import Order, write_order
+from fab.process import Process, Variation
+from fab.repair import repaired
+from fab.rules import Rules, check
 from fab.verify import Report, verify_order
+from fab.wafer import Wafer
 
 Say = Callable[[str], None]
 
 
-def write_masks(source: Path, drawing: LevelMap, out: Path | None, say: Say = lambda _: None) -> tuple[Path, Report]:
+def write_masks(
+    source: Path,
+    drawing: LevelMap,
+    out: Path | None,
+    on_violation: Literal["warn", "fail", "fix"] = "warn",
+    say: Say = lambda _: None,
+) -> tuple[Path, Report]:
     """Write and prove the mask order of a level map.
 
     Args:
         source: the run folder or height map it came from, for the manifest.
         drawing: what to draw.
         out: order folder; `masks/NAME` by default.
+        on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
         say: told what is going on.
 
     Returns:
         the folder and the report of its proof.
 
     Raises:
-        InputError: the map cannot be drawn, or the folder cannot be written.
+        InputError: the map cannot be drawn, the process cannot print it and `on_violation` is "fail", or the folder
+            cannot be written.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
     folder = out or Path("masks") / drawing.name
-    chrome = Chrome()
-    kind, name = "height map", drawing.file.name
-    if source.is_dir():
-        run = open_run(source)
-        chrome = Chrome(overlap_m=run.spec.process.chrome_overlap_m)
-        kind, name = "run", run.spec.name
-    origin = {"kind": kind, "name": name, "height_sha256": sha256_file(drawing.file)}
-    report = write_order(
+    spec = open_run(source).spec if source.is_dir() else None
+    chrome = Chrome() if spec is None else Chrome(overlap_m=spec.process.chrome_overlap_m)
+    process = _process(spec, drawing.levels)
+    origin: dict[str, Any] = {
+        "kind": "height map" if spec is None else "run",
+        "name": drawing.file.name if spec is None else spec.name,
+        "height_sha256": sha256_file(drawing.file),
+    }
+    level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
+    rules = Rules.of(process)
+    report = check(level, drawing.levels, drawing.grid, drawing.aperture_m, rules)
+    for headline in report.headlines():
+        say(f"warning: {headline}")
+    if on_violation == "fail" and not report.printable:
+        cure = "Design with a coarser pitch or fewer levels, choose another process, or take --on-violation fix."
+        raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
+    if on_violation == "fix" and not report.clean:
+        level, cost = _fixed(spec, drawing, level, rules, say)
+        origin["repair"] = cost
+
+    def add(fresh: Path, order: Order, _: Frame) -> list[str]:
+        marks = f"{order.stem}_MARKS.png"
+        site = alignment_site(order.plates, pixel_edges(order.grid).dbu_m)
+        draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
+        found = order.rules()
+        if found.clean:
+            return [marks]
+        name = f"{order.stem}_RULES.png"
+        title = f"{order.stem}: where the masks break the rules of {process.name}"
+        draw_rules(fresh / name, found, order.level_map, order.levels, order.grid, order.aperture_m, title)
+        return [marks, name]
+
+    proof = write_order(
         folder,
-        drawing.level,
+        level,
         drawing.levels,
         drawing.grid,
         drawing.aperture_m,
         drawing.name,
         origin,
         chrome=chrome,
+        process=process,
+        wafer=Wafer() if spec is None else wafer_of(spec),
+        add=add,
         say=say,
     )
-    return folder, report
+    return folder, proof
+
+
+def _process(spec: Spec | None, levels: Levels) -> Process:
+    """The process of a spec; for other levels than its own (`--levels`) what it says of the lithography."""
+    if spec is None:
+        return Process(levels)
+    made = process_of(spec.process)
+    if made.levels == levels:
+        return made
+    said = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
+    return Process(levels, name=made.name, **said)
+
+
+def _fixed(
+    spec: Spec | None, drawing: LevelMap, level: NDArray[np.uint8], rules: Rules, say: Say
+) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """Change a level map until the process prints it; say what that costs."""
+    levels = drawing.levels
+    rate = 1 / (levels.count * levels.step_m)
+    if spec is not None:
+        rate = camera_of(spec).waves_per_metre(spec.optics.design_wavelength_m)
+    say("repairing the level map")
+    fixed, cost = repaired(level, levels, drawing.grid, drawing.aperture_m, rules, rate)
+    left = f", {cost.broken_after} of {cost.broken_before} broken places are left" if cost.broken_after else ""
+    say(
+        f"repaired: {100 * cost.changed_share:.3g} % of the pixels changed, {100 * (1 - cost.efficiency):.2g} % of the "
+        f"light goes astray{left}"
+    )
+    record: dict[str, Any] = asdict(cost)
+    if spec is not None:
+        record["psf"] = _psf_cost(spec, levels, level, fixed, say)
+    return fixed, record
+
+
+def _psf_cost(
+    spec: Spec, levels: Levels, before: NDArray[np.uint8], after: NDArray[np.uint8], say: Say
+) -> list[dict[str, Any]]:
+    """What light does with the map before and after a repair, colour by colour and depth by depth."""
+    from doedesign.predict import Drawn, predict
+
+    camera, scene = camera_of(spec), spec.scene
+    rows = [
+        predict(Drawn(spec.name, level, levels, camera, scene.near_m, scene.far_m), Process(levels), Variation()).rows
+        for level in (before, after)
+    ]
+    told = []
+    for old, new in zip(*rows, strict=True):
+        numbers = {key: [old[key], new[key]] for key in ("ring_to_disc", "far_spot", "zeroth_order") if key in old}
+        told.append({"colour": old["colour"], "depth_m": old["depth_m"], **numbers})
+    worst = max((t for t in told if "far_spot" in t), key=lambda t: t["far_spot"][0] - t["far_spot"][1], default=None)
+    if worst is not None:
+        say(f"far spot of {worst['colour']}: {worst['far_spot'][0]:.3f} before, {worst['far_spot'][1]:.3f} after")
+    return told
 
 
 def verify(folder: Path) -> Report:

@@ -11,6 +11,7 @@ are told together. `spec_warnings` returns what is allowed but probably not mean
     table       what all tables have in common
     models      the tables, one per section of the TOML
     process     the tables of the process: errors, defects, limits of a good plate
+    wafer       the table of the wafer: dies, mask blanks, chrome
     variation   files of their own: a process, the errors of one plate
     checks      rules that join several tables, and warnings; process_checks those of the process
     errors      what was wrong, in words a user can act on

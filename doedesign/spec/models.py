@@ -32,6 +32,7 @@ from doedesign.spec.values import (
     Wavelength,
     broken,
 )
+from doedesign.spec.wafer import WaferSpec
 from fab.units import NM, parse_length
 
 __all__ = [
@@ -226,6 +227,7 @@ class Spec(Table, frozen=True):
         optimize: how the height map is found.
         objectives: what it is judged by; `[[objective]]` in TOML.
         limits: when a plate is good; `[[limit]]` in TOML.
+        wafer: what the masks are filled with.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -237,3 +239,4 @@ class Spec(Table, frozen=True):
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
     limits: tuple[LimitSpec, ...] = unsaid(())
+    wafer: WaferSpec = unsaid(WaferSpec())

@@ -80,5 +80,5 @@ def test_oasis_draws_the_same_way_up(tmp_path):
     write_order(tmp_path / "o", one_pixel(3, 1, 14), LEVELS, GRID, 8e-6, "up", {}, chrome=Chrome(overlap_m=1e-6))
     layout = kdb.Layout()
     layout.read(str(tmp_path / "o" / "DOE_UP_ALL.oas"))
-    box = layout.top_cell().bbox(layout.find_layer(1, 0))
+    box = layout.cell("DOE_UP_DOE").bbox(layout.find_layer(1, 0))
     assert (box.left, box.bottom, box.right, box.top) == (-2000, 2000, 0, 4000)

@@ -70,7 +70,9 @@ def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
 def test_every_single_byte_of_a_mask_file_counts(order_folder):
     path = order_folder / MASKS[3]
     whole = path.read_bytes()
-    for place in range(0, len(whole), 7):
+    # The opening and the first cell densely, the rest wherever it falls.
+    places = {*range(0, 700, 41), *np.linspace(700, len(whole) - 1, 20).astype(int).tolist()}
+    for place in sorted(places):
         flip(path, place, 0x40)
         assert any(MASKS[3] in difference for difference in verify_order(order_folder).differences)
         path.write_bytes(whole)
@@ -132,6 +134,58 @@ def test_a_chrome_that_is_no_annulus_is_told(order_folder, change, words):
     redraw(order_folder, MASKS[2], lambda s: {Layer(5): Shapes(s[Layer(5)].rectangles, change(s[Layer(5)].polygons))})
     for question in ("own reader", "gdstk"):
         assert any(words in problem for problem in problems_of(order_folder, MASKS[2], question))
+
+
+def around(layout, name, change):
+    """The layout with one of the cells around the DOE changed."""
+    cells = (replace(cell, **change(cell)) if cell.name == f"DOE_SMALL{name}" else cell for cell in layout.cells)
+    return replace(layout, cells=tuple(cells))
+
+
+def mirrored(cell):
+    flipped = {}
+    for layer, shapes in cell.shapes.items():
+        rects = shapes.rectangles[:, [2, 1, 0, 3]] * np.array([-1, 1, -1, 1], dtype=np.int32)
+        flipped[layer] = Shapes(rects, shapes.polygons)
+    return {"shapes": flipped}
+
+
+def one_moved(cell):
+    layer, shapes = next(iter(cell.shapes.items()))
+    rects = shapes.rectangles.copy()
+    rects[0] += 1
+    return {"shapes": {**cell.shapes, layer: Shapes(rects, shapes.polygons)}}
+
+
+def relayered(cell):
+    return {"shapes": {Layer(layer.number, 9): shapes for layer, shapes in cell.shapes.items()}}
+
+
+def shifted(cell):
+    return {"references": tuple(replace(reference, x=reference.x + 1) for reference in cell.references)}
+
+
+@pytest.mark.parametrize(
+    ("cell", "change", "words"),
+    [
+        ("_SITE", mirrored, "cell DOE_SMALL_SITE: layer 1/1"),
+        ("_SITE", one_moved, "or elsewhere"),
+        ("_DIE", relayered, "is missing"),
+        ("_WAFER", shifted, "cell DOE_SMALL_WAFER: it places other cells, or elsewhere"),
+        ("_DIE", shifted, "cell DOE_SMALL_DIE: it places other cells, or elsewhere"),
+        ("_TEST", lambda cell: {"name": "OTHER"}, "OTHER"),
+    ],
+    ids=["mirrored marks", "a nanometre", "another datatype", "dies elsewhere", "DOE off its die", "another name"],
+)
+def test_whatever_changes_around_the_doe_is_told_by_both_readers(order_folder, cell, change, words):
+    layout = around(read_gds(order_folder / MASKS[0]), cell, change)
+    if words == "OTHER":
+        wafer = layout.cell("DOE_SMALL_WAFER")
+        renamed = tuple(replace(r, cell="OTHER") if r.cell == "DOE_SMALL_TEST" else r for r in wafer.references)
+        layout = around(layout, "_WAFER", lambda _: {"references": renamed})
+    write_gds(order_folder / MASKS[0], layout)
+    for question in ("own reader", "gdstk"):
+        assert any(words in problem for problem in problems_of(order_folder, MASKS[0], question))
 
 
 def test_an_altered_oasis_file_that_still_parses_is_compared_pixel_by_pixel(order_folder, tmp_path):

@@ -1,0 +1,40 @@
+"""The wafer in a spec: what the masks of an order are filled with. What is left out is usual for a wafer of 100 mm."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from doedesign.spec.table import Table, unsaid
+from doedesign.spec.values import length
+from fab.units import MM
+from fab.wafer import Wafer
+
+__all__ = ["WaferSpec"]
+
+Size = Annotated[float, length(1 * MM, 0.5)]
+Thickness = Annotated[float, length(0.01 * MM, 50 * MM)]
+Dies = Annotated[int, Field(strict=True, ge=1, le=1000)]
+
+_USUAL = Wafer()
+
+
+class WaferSpec(Table, frozen=True):
+    """The wafer, its mask blanks, and how it is filled; see `fab.wafer.Wafer`.
+
+    Attributes:
+        diameter_m: diameter of the wafer.
+        thickness_m: its thickness.
+        blank_m: edge of the square mask blanks.
+        dies: rows and columns of dies.
+        pitch_m: distance of the dies; the next whole millimetre that a die needs if none is given.
+        zero_layer: whether marks of chrome are made before the first etch.
+        chrome: "liftoff" or "etch".
+    """
+
+    diameter_m: Size = unsaid(_USUAL.diameter_m)
+    thickness_m: Thickness = unsaid(_USUAL.thickness_m)
+    blank_m: Size = unsaid(_USUAL.blank_m)
+    dies: tuple[Dies, Dies] = unsaid(_USUAL.dies)
+    pitch_m: Size | None = unsaid()
+    zero_layer: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.zero_layer)
+    chrome: Literal["liftoff", "etch"] = unsaid(_USUAL.chrome)

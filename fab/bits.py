@@ -1,0 +1,283 @@
+"""Bit planes with 64 pixels in a word: erosion, runs and corners at the speed of the memory.
+
+Word w of a row holds the pixels 64 w to 64 w + 63, the first in its lowest bit; what a row lacks to
+a whole word is clear. `outside` is the word that stands for all pixels beyond the sides of a plane: `NONE` for lines,
+`ALL` for the complement of them. Axis 0 is y, axis 1 is x.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = [
+    "ALL",
+    "NONE",
+    "Words",
+    "corners",
+    "count",
+    "count_starts",
+    "erode",
+    "longest_runs",
+    "pack",
+    "split",
+    "windows",
+]
+
+Words = NDArray[np.uint64]
+
+NONE = np.uint64(0)
+ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
+_EACH = np.uint64(0x0101010101010101)
+# Carries bit 0 of byte i to bit 56 + i.
+_GATHER = np.uint64(0x0102040810204080)
+_THREADS = 4
+_ONE, _SIX, _TOP = np.uint64(1), np.uint64(6), np.uint64(63)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ones(word):  # pragma: no cover - compiled
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((word * _EACH) >> np.uint64(56))
+
+
+@njit(cache=True, nogil=True)
+def _pack(levels, top, spans, out):  # pragma: no cover - compiled
+    # `levels` holds eight pixels per word; no byte borrows from the next, since none exceeds `top`.
+    bits, ny = out.shape[:2]
+    for y in range(ny):
+        out[:, y] = NONE
+        first, last = np.uint64(spans[y, 0]), np.uint64(spans[y, 1])
+        if first >= last:
+            continue
+        for group in range(levels.shape[1]):
+            etched = top * _EACH - levels[y, group]
+            place = np.uint64(8 * (group & 7))
+            for bit in range(bits):
+                byte = (((etched >> np.uint64(bit)) & _EACH) * _GATHER) >> np.uint64(56)
+                out[bit, y, group >> 3] |= byte << place
+        for bit in range(bits):
+            out[bit, y, : first >> _SIX] = NONE
+            out[bit, y, first >> _SIX] &= ALL << (first & _TOP)
+            out[bit, y, (last - _ONE) >> _SIX] &= ALL >> (_TOP - ((last - _ONE) & _TOP))
+            out[bit, y, ((last - _ONE) >> _SIX) + _ONE :] = NONE
+
+
+def pack(level_map: NDArray[np.uint8], bits: int, spans: NDArray[np.int64]) -> Words:
+    """Split a level map into packed etch masks.
+
+    Args:
+        level_map: C-ordered levels ``[y, x]`` below ``2**bits``.
+        bits: number of masks.
+        spans: ``(ny, 2)`` first column and end column of every row that may be etched; nothing is, beyond.
+
+    Returns:
+        ``[bit, y, word]``, a pixel set where the mask etches it.
+    """
+    ny, nx = level_map.shape
+    top = np.uint64(2**bits - 1)
+    if nx % 8:
+        level_map = np.pad(level_map, ((0, 0), (0, -nx % 8)), constant_values=int(top))
+    groups = level_map.view(np.uint64)
+    out = np.empty((bits, ny, -(-nx // 64)), dtype=np.uint64)
+    rows = [slice(ny * i // _THREADS, ny * (i + 1) // _THREADS) for i in range(_THREADS)]
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda part: _pack(groups[part], top, spans[part], out[:, part]), rows))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def count(words: Words) -> Any:  # pragma: no cover - compiled
+    """Return the number of set pixels of a plane."""
+    total = 0
+    for y in range(words.shape[0]):
+        for w in range(words.shape[1]):
+            total += _ones(words[y, w])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def count_starts(words: Words, axis: int, outside: np.uint64) -> Any:  # pragma: no cover - compiled
+    """Return how many runs along an axis begin inside the plane."""
+    ny, nw = words.shape
+    total = 0
+    for y in range(ny):
+        if axis == 1:
+            total += _ones(words[y, 0] & ~((words[y, 0] << _ONE) | (outside & _ONE)))
+            for w in range(1, nw):
+                total += _ones(words[y, w] & ~((words[y, w] << _ONE) | (words[y, w - 1] >> _TOP)))
+        elif y:
+            for w in range(nw):
+                total += _ones(words[y, w] & ~words[y - 1, w])
+        else:
+            for w in range(nw):
+                total += _ones(words[y, w] & ~outside)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _and_shifted(words, axis, by, outside):  # pragma: no cover - compiled
+    ny, nw = words.shape
+    skip, low = by >> 6, np.uint64(by & 63)
+    high = np.uint64(64) - low
+    for y in range(ny):
+        if axis == 0:
+            for w in range(nw):
+                words[y, w] &= words[y + by, w] if y + by < ny else outside
+            continue
+        whole = max(0, nw - skip - 1)
+        if low:
+            for w in range(whole):
+                words[y, w] &= (words[y, w + skip] >> low) | (words[y, w + skip + 1] << high)
+        else:
+            for w in range(whole):
+                words[y, w] &= words[y, w + skip]
+        for w in range(whole, nw):
+            near = words[y, w + skip] if w + skip < nw else outside
+            words[y, w] &= (near >> low) | (outside << high) if low else near
+
+
+@njit(cache=True, nogil=True)
+def erode(words: Words, axis: int, length: int, outside: np.uint64) -> None:  # pragma: no cover - compiled
+    """Keep, in place, the pixels that begin `length` set ones along an axis: shorter runs vanish, others stay one."""
+    reach = 1
+    while reach < length:
+        by = min(reach, length - reach)
+        _and_shifted(words, axis, by, outside)
+        reach += by
+
+
+@njit(cache=True, nogil=True)
+def split(words: Words, axis: int, outside: np.uint64, alone: Words) -> Any:  # pragma: no cover - compiled
+    """Take the runs of one pixel out of a plane and shorten, in place, all others by one at their end.
+
+    Args:
+        words: the plane.
+        axis: along which the runs lie.
+        outside: what lies beyond its sides.
+        alone: filled with the runs of one pixel.
+
+    Returns:
+        How many there were.
+    """
+    ny, nw = words.shape
+    total = 0
+    if axis == 1:
+        for y in range(ny):
+            before = outside
+            for w in range(nw):
+                here = words[y, w]
+                after = words[y, w + 1] if w + 1 < nw else outside
+                follower = (here >> _ONE) | (after << _TOP)
+                alone[y, w] = here & ~follower & ~((here << _ONE) | (before >> _TOP))
+                total += _ones(alone[y, w])
+                words[y, w] = here & follower
+                before = here
+        return total
+    before_row = np.full(nw, outside)
+    for y in range(ny):
+        for w in range(nw):
+            here = words[y, w]
+            follower = words[y + 1, w] if y + 1 < ny else outside
+            alone[y, w] = here & ~follower & ~before_row[w]
+            total += _ones(alone[y, w])
+            before_row[w] = here
+            words[y, w] = here & follower
+    return total
+
+
+@njit(cache=True, nogil=True)
+def corners(words: Words, found: Words) -> Any:  # pragma: no cover - compiled
+    """Find where pixels touch only at a corner.
+
+    Args:
+        words: the plane; the outside is clear.
+        found: filled with a set pixel (y, x) for the corner between it and (y + 1, x + 1).
+
+    Returns:
+        How many corners there are.
+    """
+    ny, nw = words.shape
+    total = 0
+    found[ny - 1] = NONE
+    for y in range(ny - 1):
+        for w in range(nw):
+            low, high = words[y, w], words[y + 1, w]
+            low_next, high_next = low >> _ONE, high >> _ONE
+            if w + 1 < nw:
+                low_next |= words[y, w + 1] << _TOP
+                high_next |= words[y + 1, w + 1] << _TOP
+            found[y, w] = (low ^ high) & (low_next ^ high_next) & (low ^ low_next)
+            total += _ones(found[y, w])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def longest_runs(
+    starting: Words, words: Words, axis: int, most: int, looks: int
+) -> NDArray[np.int64]:  # pragma: no cover - compiled
+    """List the longest of the runs along an axis that are met first, from the middle row up and around.
+
+    Args:
+        starting: a plane whose runs begin where some of the runs of `words` do; the outside is clear.
+        words: the plane whose runs are measured; the outside is clear.
+        axis: along which the runs lie.
+        most: how many are listed at most.
+        looks: how many are measured at most.
+
+    Returns:
+        ``(n, 3)`` row, column and length of each, longest first.
+    """
+    ny, nw = words.shape
+    out = np.empty((most + 1, 3), np.int64)
+    used = seen = 0
+    for i in range(ny):
+        y = (i + ny // 2) % ny
+        for w in range(nw):
+            fresh = starting[y, w]
+            if axis == 0 and y:
+                fresh &= ~starting[y - 1, w]
+            elif axis == 1:
+                fresh &= ~((fresh << _ONE) | (starting[y, w - 1] >> _TOP if w else NONE))
+            while fresh:
+                first = 64 * w + _ones((fresh & (~fresh + _ONE)) - _ONE)
+                fresh &= fresh - _ONE
+                row, column = y, first
+                while row < ny and column < 64 * nw and (words[row, column >> 6] >> np.uint64(column & 63)) & _ONE:
+                    row, column = row + 1 - axis, column + axis
+                length = row - y + column - first
+                place = used
+                while place and out[place - 1, 2] < length:
+                    out[place] = out[place - 1]
+                    place -= 1
+                out[place, 0], out[place, 1], out[place, 2] = y, first, length
+                used = min(used + 1, most)
+                seen += 1
+                if seen == looks:
+                    return out[:used]
+    return out[:used]
+
+
+@njit(cache=True, nogil=True)
+def windows(words: Words, nx: int, size: int) -> NDArray[np.int64]:  # pragma: no cover - compiled
+    """Count the set pixels of all whole square windows that fit side by side into a plane of `nx` columns."""
+    across = nx // size
+    out = np.zeros((words.shape[0] // size, across), np.int64)
+    for y in range(out.shape[0] * size):
+        for i in range(across):
+            first, last = i * size, i * size + size - 1
+            low, high = ALL << np.uint64(first & 63), ALL >> np.uint64(63 - (last & 63))
+            total = 0
+            for w in range(first >> 6, (last >> 6) + 1):
+                word = words[y, w]
+                if w == first >> 6:
+                    word &= low
+                if w == last >> 6:
+                    word &= high
+                total += _ones(word)
+            out[y // size, i] += total
+    return out

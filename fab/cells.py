@@ -1,0 +1,216 @@
+"""Cells: what a solid, a mesh or an optics program gets of a map, because none of them takes all of it.
+
+CAD programs, viewers and slicers choke on tens of millions of faces, so a map is either cut to a window at full
+resolution or reduced: blocks of pixels become one column of their mean height, which keeps the volume.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels, require_levels
+
+__all__ = ["Cells", "Window", "reduced_cells", "require_map", "whole", "window_cells"]
+
+_MOST_CELLS = 4_000_000
+# Heights that differ by less than this part of the relief are one height that was rounded differently.
+_CLOSEST = 1e-9
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of pixels of a grid.
+
+    Attributes:
+        row: first row, 0 at the lowest y.
+        column: first column, 0 at the lowest x.
+        rows: how many rows.
+        columns: how many columns.
+    """
+
+    row: int
+    column: int
+    rows: int
+    columns: int
+
+    def require(self, grid: Grid) -> None:
+        """Check that the window lies on a grid.
+
+        Raises:
+            InputError: it is empty or reaches beyond the grid.
+        """
+        ny, nx = grid.shape
+        inside = 0 <= self.row < self.row + self.rows <= ny and 0 <= self.column < self.column + self.columns <= nx
+        if not inside:
+            got = f"{self.rows} x {self.columns} pixels from row {self.row}, column {self.column}"
+            rule = f"must be filled and lie on the {ny} x {nx} pixels of the map"
+            raise InputError("window", rule, got, "Choose another window.")
+
+    def cut(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the pixels of the window, ``[y, x]``, as a view."""
+        return values[self.row : self.row + self.rows, self.column : self.column + self.columns]
+
+    def edges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where the pixel edges of the window lie.
+
+        Args:
+            grid: the grid; its centre is the origin.
+
+        Returns:
+            Edges along x ``(columns + 1,)`` and along y ``(rows + 1,)``, metres.
+        """
+        ny, nx = grid.shape
+        x = self.column + np.arange(self.columns + 1) - nx / 2
+        y = self.row + np.arange(self.rows + 1) - ny / 2
+        pitch_m = np.float64(grid.pitch_m)
+        return x * pitch_m, y * pitch_m
+
+    def centre_m(self, grid: Grid) -> tuple[float, float]:
+        """Return the coordinates x, y of the window's centre, metres; the grid's centre is the origin."""
+        ny, nx = grid.shape
+        x = (2 * self.column + self.columns - nx) / 2 * grid.pitch_m
+        return x, (2 * self.row + self.rows - ny) / 2 * grid.pitch_m
+
+
+def whole(grid: Grid) -> Window:
+    """Return the window that covers a grid."""
+    return Window(0, 0, *grid.shape)
+
+
+def require_map(level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> NDArray[np.uint8]:
+    """Check that an array is a level map of a staircase on a grid.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster.
+
+    Returns:
+        The same numbers as a C-ordered uint8 array.
+
+    Raises:
+        InputError: it is not.
+    """
+    checked = require_levels(level_map, levels)
+    if checked.shape != grid.shape:
+        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
+    return checked
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A relief of columns on a rectangular raster.
+
+    Attributes:
+        height_m: height of every column above the deepest floor, metres, ``[y, x]`` float64.
+        x_edges_m: edges of the columns along x, metres, increasing, ``(nx + 1,)``.
+        y_edges_m: the same along y.
+        blank_m: height of the blank surface above the deepest floor, metres; z = 0 lies there.
+        block: pixels along the side of a column; 1 is full resolution.
+    """
+
+    height_m: NDArray[np.float64]
+    x_edges_m: NDArray[np.float64]
+    y_edges_m: NDArray[np.float64]
+    blank_m: float
+    block: int = 1
+
+    @property
+    def volume_m3(self) -> float:
+        """Sum of the columns above the deepest floor, cubic metres."""
+        rows = self.height_m @ np.diff(self.x_edges_m)
+        return math.fsum(rows * np.diff(self.y_edges_m))
+
+    @property
+    def area_m2(self) -> float:
+        """Area of the raster, square metres."""
+        return float((self.x_edges_m[-1] - self.x_edges_m[0]) * (self.y_edges_m[-1] - self.y_edges_m[0]))
+
+
+@njit(cache=True)
+def _block_means(level_map, heights, block):  # pragma: no cover - compiled
+    ny, nx = level_map.shape
+    out = np.zeros((-(-ny // block), -(-nx // block)))
+    for j in range(out.shape[0]):
+        y_end = min(ny, (j + 1) * block)
+        for y in range(j * block, y_end):
+            for x in range(nx):
+                out[j, x // block] += heights[level_map[y, x]]
+        for i in range(out.shape[1]):
+            out[j, i] /= (y_end - j * block) * (min(nx, (i + 1) * block) - i * block)
+    return out
+
+
+def _joined(values: NDArray[np.float64], closest: float) -> NDArray[np.float64]:
+    """Make values equal that only the order of a sum sets apart, so that no wall is lower than any number can say."""
+    different, where = np.unique(values, return_inverse=True)
+    apart = np.diff(different, prepend=-np.inf) > closest
+    return different[apart][np.cumsum(apart) - 1][where].reshape(values.shape)
+
+
+def _heights_m(levels: Levels) -> NDArray[np.float64]:
+    """Return the heights of the levels; levels that different etches bring to one height have the same number."""
+    heights = levels.heights_m()
+    return _joined(heights, _CLOSEST * float(heights.max()))
+
+
+def window_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window) -> Cells:
+    """Take a window of a map at full resolution.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        window: the pixels to take.
+
+    Returns:
+        One column per pixel, where the window lies on the plate.
+
+    Raises:
+        InputError: the map does not belong to the levels or the grid, the window leaves the map or holds
+            more than 4 million pixels.
+    """
+    checked = require_map(level_map, levels, grid)
+    window.require(grid)
+    if window.rows * window.columns > _MOST_CELLS:
+        rule = f"a mesh may have at most {_MOST_CELLS} columns"
+        got = f"{window.rows} x {window.columns}"
+        raise InputError("window", rule, got, "Choose a smaller window or a reduced map.")
+    heights = _heights_m(levels)
+    return Cells(heights[window.cut(checked)], *window.edges_m(grid), float(heights.max()))
+
+
+def reduced_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, most: int = 1000) -> Cells:
+    """Reduce a map to columns of the mean height of square blocks of pixels; the volume stays.
+
+    The block is the smallest that leaves at most `most` columns along the longer side. Blocks at the high end
+    of an axis are cut where the map ends. A mean across a jump of one wave stands between its
+    two sides: a reduced map is for looking at and for weighing, not for optics.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        most: columns along the longer side, 1 to 2000.
+
+    Returns:
+        The columns and the block.
+
+    Raises:
+        InputError: the map does not belong to the levels or the grid, or `most` is out of range.
+    """
+    checked = require_map(level_map, levels, grid)
+    if not 1 <= most <= math.isqrt(_MOST_CELLS):
+        rule = f"the columns along a side must be 1 to {math.isqrt(_MOST_CELLS)}"
+        raise InputError("mesh", rule, most, "Choose another number of columns.")
+    block = -(-max(grid.shape) // most)
+    heights = _heights_m(levels)
+    x_m, y_m = whole(grid).edges_m(grid)
+    x, y = (np.append(edges[:-1:block], edges[-1]) for edges in (x_m, y_m))
+    means = _joined(_block_means(checked, heights, block), _CLOSEST * float(heights.max()))
+    return Cells(means, x, y, float(heights.max()), block)

@@ -1,0 +1,205 @@
+"""Where everything lies: the mask plate, the wafer on it, its dies, alignment sites and test structures.
+
+    PLATE    outline of the mask blank (100/0), labels beside the wafer
+    WAFER    outline (101/0), dies on a raster, alignment sites left and right, test structures
+    DIE      the DOE in its middle, marks below it, the die's box (110/0) and the clear aperture (102/0)
+
+All cells are placed upright, about the middle of the plate, which is the middle of the wafer. Layers from 100 on say
+where things are; they are in the review files and on no mask.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fab.errors import InputError
+from fab.layout import Cell, Layer, Reference, Shapes
+from fab.lettering import label_block, mask_label
+from fab.levels import Levels
+from fab.marks import alignment_site, die_marks
+from fab.part import Part, Plate, centred, joined, moved, prefixed, row
+from fab.structures import process_monitor
+from fab.units import MM, UM, format_length
+from fab.wafer import READING, Wafer
+
+__all__ = ["APERTURE", "BLANK", "DIE", "OUTLINES", "WAFER", "Frame", "draw_frame"]
+
+BLANK, WAFER = Layer(100, 0, "BLANK_OUTLINE"), Layer(101, 0, "WAFER_OUTLINE")
+APERTURE, DIE = Layer(102, 0, "CLEAR_APERTURE"), Layer(110, 0, "DIE_BOX")
+OUTLINES = (BLANK, WAFER, APERTURE, DIE)
+
+# The rim that is held, beaded or ground.
+_RIM_M = 4 * MM
+_GAP_M = 200 * UM
+_LETTERS_M = 0.5 * MM
+# A circle of so many corners has no more vertices than every reader knows.
+_CORNERS = 180
+
+
+class Frame(NamedTuple):
+    """The cells around a DOE.
+
+    Attributes:
+        cells: die, sites, test structures, wafer and plate, each after those that it places.
+        places: where on the wafer people measure, ``(x_m, y_m)`` by name.
+        dies: middles of the dies, ``(x_m, y_m)``, row by row from the lowest y.
+        die_m: edge of a die, metres.
+    """
+
+    cells: tuple[Cell, ...]
+    places: Mapping[str, tuple[float, float]]
+    dies: tuple[tuple[float, float], ...]
+    die_m: float
+
+
+def draw_frame(
+    wafer: Wafer,
+    plates: Sequence[Plate],
+    levels: Levels,
+    *,
+    doe_cell: str,
+    stem: str,
+    digest: str,
+    pitch_m: float,
+    minimum_line_m: float,
+    chrome_m: float,
+    aperture_m: float,
+    dbu_m: float,
+) -> Frame:
+    """Draw everything around a DOE.
+
+    Args:
+        wafer: what is filled.
+        plates: the masks in the order in which they are used.
+        levels: the staircase.
+        doe_cell: name of the DOE's cell.
+        stem: name of the job; that of the top cell.
+        digest: digest of the level map, for the labels.
+        pitch_m: edge of a DOE pixel, metres.
+        minimum_line_m: narrowest line that the process prints, metres.
+        chrome_m: diameter of the DOE with its chrome, metres.
+        aperture_m: diameter of the clear aperture, metres.
+        dbu_m: database unit, metres.
+
+    Returns:
+        The cells and the places.
+
+    Raises:
+        InputError: the wafer is too small for what is asked, or the dies lie too close.
+    """
+    marks = die_marks(plates, dbu_m)
+    site = alignment_site(plates, dbu_m)
+    monitor = process_monitor(levels, plates, pitch_m, dbu_m, minimum_line_m)
+    marks, side_m = _below(marks, chrome_m)
+    pitch = wafer.pitch_m or math.ceil(side_m / MM - 1e-6) * MM
+    if pitch < side_m - dbu_m:
+        rule = f"must be {format_length(side_m)} or more, what a die with its marks needs"
+        raise InputError("wafer.pitch", rule, format_length(pitch), "Leave it out, or choose a larger one.")
+    dies = _raster(wafer.dies, pitch)
+    site_m, monitor_m = _beside(wafer, dies, pitch, site, monitor)
+    unit = _Unit(dbu_m)
+    names = {part: f"{stem}_{part}" for part in ("DIE", "SITE", "TEST", "WAFER")}
+    rows, columns = wafer.dies
+    die_cell = Cell(
+        names["DIE"],
+        {DIE: unit.square(pitch), APERTURE: unit.circle(aperture_m), **marks.shapes},
+        (Reference(doe_cell),),
+    )
+    step = unit(pitch)
+    first = (unit(dies[0][0]), unit(dies[0][1]))
+    wafer_cell = Cell(
+        names["WAFER"],
+        {WAFER: unit.circle(wafer.diameter_m)},
+        (
+            Reference(names["DIE"], *first, columns, rows, step * (columns > 1), step * (rows > 1)),
+            Reference(names["SITE"], -unit(site_m), 0),
+            Reference(names["SITE"], unit(site_m), 0),
+            Reference(names["TEST"], 0, unit(monitor_m)),
+        ),
+    )
+    labels = _labels(plates, wafer, stem, digest, dbu_m)
+    top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
+    sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
+    # Every die has its marks; the coordinates are told for the one in the middle.
+    middle = dies[len(dies) // 2]
+    beside = prefixed(moved(marks, *middle), "middle die: ")
+    places = joined([*sites, beside, moved(monitor, 0, monitor_m), labels]).places
+    small = (Cell(names["SITE"], site.shapes), Cell(names["TEST"], monitor.shapes))
+    return Frame((die_cell, *small, wafer_cell, top), places, dies, pitch)
+
+
+class _Unit:
+    """Lengths and outlines in database units."""
+
+    def __init__(self, dbu_m: float) -> None:
+        self.dbu_m = dbu_m
+
+    def __call__(self, length_m: float) -> int:
+        return round(length_m / self.dbu_m)
+
+    def square(self, side_m: float) -> Shapes:
+        half = self(side_m / 2)
+        return Shapes(np.array([[-half, -half, half, half]], dtype=np.int32))
+
+    def circle(self, diameter_m: float) -> Shapes:
+        angle = (np.arange(_CORNERS) + 0.5) * 2 * np.pi / _CORNERS
+        points = diameter_m / 2 / self.dbu_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return Shapes(np.empty((0, 4), dtype=np.int32), (np.rint(points).astype(np.int32),))
+
+
+def _size_m(part: Part) -> tuple[float, float]:
+    x0, y0, x1, y1 = part.box
+    return (x1 - x0) * part.dbu_m, (y1 - y0) * part.dbu_m
+
+
+def _below(marks: Part, chrome_m: float) -> tuple[Part, float]:
+    """Put a die's marks below its chrome; return them and the edge of the die, which has its DOE in the middle."""
+    width, height = _size_m(marks)
+    half = chrome_m / 2 + 2 * _GAP_M + height
+    return moved(marks, 0, -(half - _GAP_M / 2 - height / 2)), max(2 * half, width + _GAP_M)
+
+
+def _raster(dies: tuple[int, int], pitch_m: float) -> tuple[tuple[float, float], ...]:
+    rows, columns = dies
+    return tuple(
+        ((column - (columns - 1) / 2) * pitch_m, (line - (rows - 1) / 2) * pitch_m)
+        for line in range(rows)
+        for column in range(columns)
+    )
+
+
+def _beside(
+    wafer: Wafer, dies: Sequence[tuple[float, float]], pitch_m: float, site: Part, monitor: Part
+) -> tuple[float, float]:
+    """Find room for the sites on the x axis and for the test structures below the dies.
+
+    Returns:
+        x of the right site and y of the test structures, metres.
+    """
+    usable = wafer.diameter_m / 2 - _RIM_M
+    (site_w, site_h), (test_w, test_h) = _size_m(site), _size_m(monitor)
+    farthest = max(math.hypot(abs(x) + pitch_m / 2, abs(y) + pitch_m / 2) for x, y in dies)
+    most_x, most_y = (max(abs(die[axis]) for die in dies) + pitch_m / 2 for axis in (0, 1))
+    # As far apart as they can be, for the best angle, though no farther than the usual stage of a microscope pair.
+    site_m = min(0.7 * wafer.diameter_m / 2, math.sqrt(max(usable**2 - (site_h / 2) ** 2, 0)) - site_w / 2)
+    monitor_m = -(most_y + _GAP_M + test_h / 2)
+    corner = math.hypot(test_w / 2, monitor_m - test_h / 2)
+    if farthest > usable or site_m - site_w / 2 < most_x + _GAP_M or corner > usable:
+        rule = f"must hold the dies of {format_length(pitch_m)}, two alignment sites and the test structures"
+        got = f"{wafer.dies[0]} x {wafer.dies[1]} dies on a wafer of {format_length(wafer.diameter_m)}"
+        raise InputError("wafer", rule, got, "Take fewer dies, or a larger wafer.")
+    return round(site_m / MM, 1) * MM, monitor_m
+
+
+def _labels(plates: Sequence[Plate], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
+    """Labels of all masks side by side, above the wafer on the blank; each mask carries its own."""
+    blocks = [label_block([(p, mask_label(stem, p, READING, digest))], _LETTERS_M, dbu_m) for p in plates]
+    labels = centred(row(blocks, 4 * _LETTERS_M))
+    width, height = _size_m(labels)
+    y = wafer.diameter_m / 2 + _GAP_M + height / 2
+    if max(width / 2, y + height / 2) > wafer.blank_m / 2 - 1 * MM:
+        # No room beside the wafer: the labels go to its lower rim.
+        y = -(wafer.diameter_m / 2 - _RIM_M / 2)
+    return moved(labels, 0, y)

@@ -1,0 +1,193 @@
+"""Moves of a repair: rectangles of pixels that take another depth, and what they do to the rules and to the light.
+
+The energy of a map is the weighted sum of the pixels by which runs are too short and of the corners that touch, over
+all bit planes at once, and of the error of every pixel. A depth is a number of steps, whose bits are the masks. The
+functions look at no more than the surroundings of a rectangle, so moves far apart know nothing of each other.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["Task", "broken", "loss", "offends", "sweep"]
+
+
+class Task(NamedTuple):
+    """A level map in work, on maps that are padded by `pad` pixels of blank glass.
+
+    `etched` and `wanted` hold how many steps deep each pixel is etched now and should be, `free` what may change,
+    `error[a, b]` what depth a costs where b is wanted; `line` and `space` are the narrowest ones in pixels, and
+    `gravity` how many kissing corners one missing pixel of width is as bad as.
+    """
+
+    etched: NDArray[np.uint8]
+    wanted: NDArray[np.uint8]
+    free: NDArray[np.bool_]
+    error: NDArray[np.float64]
+    pad: int
+    line: int
+    space: int
+    gravity: int
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ones(value):  # pragma: no cover - compiled
+    value = value - ((value >> 1) & 0x55)
+    value = (value & 0x33) + ((value >> 2) & 0x33)
+    return (value + (value >> 4)) & 0x0F
+
+
+@njit(cache=True, nogil=True)
+def _deficit(task, y, x, dy, dx, first, last):  # pragma: no cover - compiled
+    # Missing pixels of the short runs, of all planes at once, that begin `first` to `last` pixels from (y, x) along
+    # (dy, dx). A run begins where the depth's bits differ from those of the pixel before, and ends where they do again.
+    total = 0
+    for start in range(first, last + 1):
+        here = np.int64(task.etched[y + start * dy, x + start * dx])
+        begun = here ^ np.int64(task.etched[y + (start - 1) * dy, x + (start - 1) * dx])
+        line, space = begun & here, begun & ~here
+        before = here
+        for length in range(1, max(task.line, task.space)):
+            if not (line | space):
+                break
+            after = np.int64(task.etched[y + (start + length) * dy, x + (start + length) * dx])
+            ended = before ^ after
+            before = after
+            if length < task.line:
+                total += _ones(line & ended) * (task.line - length)
+            if length < task.space:
+                total += _ones(space & ended) * (task.space - length)
+            line &= ~ended
+            space &= ~ended
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _kissing(etched, y0, x0, y1, x1):  # pragma: no cover - compiled
+    total = 0
+    for y in range(y0 - 1, y1):
+        for x in range(x0 - 1, x1):
+            a, b, c, d = etched[y, x], etched[y, x + 1], etched[y + 1, x], etched[y + 1, x + 1]
+            total += _ones(np.int64((a ^ b) & (c ^ d) & (a ^ c)))
+    return total
+
+
+@njit(cache=True, nogil=True)
+def broken(task, y0, x0, y1, x1):  # pragma: no cover - compiled
+    """Return what is broken by and about the pixels of a rectangle: all that a change of them can change."""
+    reach = max(task.line, task.space)
+    missing = 0
+    if reach > 1:
+        for y in range(y0, y1):
+            missing += _deficit(task, y, x0, 0, 1, -reach, x1 - x0)
+        for x in range(x0, x1):
+            missing += _deficit(task, y0, x, 1, 0, -reach, y1 - y0)
+    return _kissing(task.etched, y0, x0, y1, x1) + task.gravity * missing
+
+
+@njit(cache=True, nogil=True)
+def offends(task, y, x):  # pragma: no cover - compiled
+    """Tell whether a pixel itself lies in a short run or at a kissing corner."""
+    if _kissing(task.etched, y, x, y + 1, x + 1):
+        return True
+    own = np.int64(task.etched[y, x])
+    for dy, dx in ((0, 1), (1, 0)):
+        # Bits that have been the same as the pixel's own so far, and how many pixels they have been it.
+        for need, wanted in ((task.line, own), (task.space, ~own)):
+            for behind in range(need - 1):
+                same = 0xFF & wanted
+                for at in range(1, behind + 1):
+                    same &= ~(own ^ np.int64(task.etched[y - at * dy, x - at * dx]))
+                same &= own ^ np.int64(task.etched[y - (behind + 1) * dy, x - (behind + 1) * dx])
+                for at in range(1, need - behind):
+                    differs = own ^ np.int64(task.etched[y + at * dy, x + at * dx])
+                    if same & differs:
+                        return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def loss(task, y0, x0, y1, x1):  # pragma: no cover - compiled
+    """Return the summed error of the pixels of a rectangle."""
+    total = 0.0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            total += task.error[task.etched[y, x], task.wanted[y, x]]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _depths_near(task, y, x, reach, out):  # pragma: no cover - compiled
+    # The depths that a pixel may take, each once: the one that is wanted and those of the pixels around it.
+    out[0] = task.wanted[y, x]
+    used = 1
+    for far in (1, reach):
+        for dy in range(-far, far + 1, far):
+            for dx in range(-far, far + 1, far):
+                depth = task.etched[y + dy, x + dx]
+                known = False
+                for i in range(used):
+                    known |= out[i] == depth
+                if not known:
+                    out[used] = depth
+                    used += 1
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _improve(task, y, x, weight):  # pragma: no cover - compiled
+    # Take the best of the moves that cover a pixel; tell whether there was one.
+    etched = task.etched
+    reach = max(task.line, task.space, 2)
+    depths = np.empty(19, np.int64)
+    many = _depths_near(task, y, x, reach, depths)
+    kept = np.empty((reach, reach), etched.dtype)
+    best, best_depth = -1e-9, -1
+    best_y = best_x = best_high = best_wide = 0
+    # The pixel alone, and lines and a square with the pixel at one of their ends or corners.
+    for kind in range(9):
+        high = reach if kind in (1, 2, 5, 6, 7, 8) else 1
+        wide = reach if kind in (3, 4, 5, 6, 7, 8) else 1
+        y0 = y - (high - 1 if kind in (2, 6, 8) else 0)
+        x0 = x - (wide - 1 if kind in (4, 7, 8) else 0)
+        y1, x1 = y0 + high, x0 + wide
+        allowed = True
+        for v in range(max(y0, 0), min(y1, etched.shape[0])):
+            for u in range(max(x0, 0), min(x1, etched.shape[1])):
+                allowed &= task.free[v, u]
+                kept[v - y0, u - x0] = etched[v, u]
+        if not allowed:
+            continue
+        before = weight * broken(task, y0, x0, y1, x1) + loss(task, y0, x0, y1, x1)
+        for i in range(many):
+            for v in range(y0, y1):
+                for u in range(x0, x1):
+                    etched[v, u] = depths[i]
+            change = loss(task, y0, x0, y1, x1) - before
+            # A move that costs more light than it can mend needs no look at the rules.
+            if change < best:
+                change += weight * broken(task, y0, x0, y1, x1)
+            if change < best:
+                best, best_depth = change, depths[i]
+                best_y, best_x, best_high, best_wide = y0, x0, high, wide
+        for v in range(y0, y1):
+            for u in range(x0, x1):
+                etched[v, u] = kept[v - y0, u - x0]
+    if best_depth < 0:
+        return False
+    etched[best_y : best_y + best_high, best_x : best_x + best_wide] = best_depth
+    return True
+
+
+@njit(cache=True, nogil=True)
+def sweep(task, first, last, weight, changed_too):  # pragma: no cover - compiled
+    """Take the best move of every offending pixel (and every changed one) of some rows; return how many were taken."""
+    moved = 0
+    for y in range(first, last):
+        for x in range(task.pad, task.etched.shape[1] - task.pad):
+            changed = changed_too and task.etched[y, x] != task.wanted[y, x]
+            if task.free[y, x] and (changed or offends(task, y, x)):
+                moved += _improve(task, y, x, weight)
+    return moved

@@ -1,0 +1,50 @@
+"""The wafer that a mask set is for: its glass, its mask blanks, and how it is filled."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from fab.errors import InputError
+from fab.units import MM, format_length
+
+__all__ = ["READING", "Wafer"]
+
+READING = "right-reading chrome down"
+
+
+@dataclass(frozen=True)
+class Wafer:
+    """The glass, the mask blanks, and how the wafer is filled.
+
+    Attributes:
+        diameter_m: diameter of the wafer, metres.
+        thickness_m: its thickness, metres.
+        blank_m: edge of the square mask blanks, metres; 5 inches for a wafer of 100 mm.
+        dies: rows and columns of dies.
+        pitch_m: distance of the dies, metres; the next whole millimetre that a die needs if None.
+        zero_layer: whether marks of chrome are made before the first etch.
+        chrome: how the aperture's chrome is made.
+    """
+
+    diameter_m: float = 100 * MM
+    thickness_m: float = 0.5 * MM
+    blank_m: float = 127 * MM
+    dies: tuple[int, int] = (3, 3)
+    pitch_m: float | None = None
+    zero_layer: bool = False
+    chrome: Literal["liftoff", "etch"] = "liftoff"
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: a wafer that its blanks do not hold, no die, or a length that cannot be.
+        """
+        for name in ("diameter_m", "thickness_m", "blank_m"):
+            if not 0 < getattr(self, name) < 1:
+                got = format_length(getattr(self, name))
+                raise InputError(f"wafer.{name}", "must be positive and below 1 m", got, "Mend it.")
+        if self.blank_m < self.diameter_m:
+            rule = f"must hold the wafer of {format_length(self.diameter_m)}"
+            raise InputError("wafer.blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
+        if min(self.dies) < 1:
+            raise InputError("wafer.dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")

@@ -1,0 +1,58 @@
+"""What the tests of parts share: how another library sees a part, and which corners only touch."""
+
+import numpy as np
+
+from fab.layout import Layer
+from fab.part import Part
+
+
+def region(part: Part, *layers: Layer):
+    """What KLayout makes of some layers of a part, not merged."""
+    from klayout import db
+
+    out = db.Region()
+    out.merged_semantics = False
+    for layer in layers:
+        shapes = part.shapes[layer]
+        for box in shapes.rectangles.tolist():
+            out.insert(db.Box(*box))
+        for polygon in shapes.polygons:
+            out.insert(db.Polygon([db.Point(*vertex) for vertex in polygon.tolist()]))
+    return out
+
+
+def numbers(part: Part) -> list[int]:
+    return sorted({layer.number for layer in part.shapes})
+
+
+def layers_of(part: Part, number: int) -> list[Layer]:
+    return [layer for layer in part.shapes if layer.number == number]
+
+
+def kissing_corners(boxes: np.ndarray) -> int:
+    """How many points are touched by two boxes from opposite sides and by nothing from the others."""
+    x, y = np.unique(boxes[:, ::2]), np.unique(boxes[:, 1::2])
+    plane = np.zeros((y.size + 1, x.size + 1), dtype=bool)
+    columns, rows = np.searchsorted(x, boxes[:, ::2]) + 1, np.searchsorted(y, boxes[:, 1::2]) + 1
+    for (x0, x1), (y0, y1) in zip(columns, rows, strict=True):
+        plane[y0:y1, x0:x1] = True
+    a, b, c, d = plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
+    return int(np.count_nonzero((a & d & ~b & ~c) | (b & c & ~a & ~d)))
+
+
+def assert_sound(part: Part, least_m: float) -> None:
+    """Every mask: rectangles that share no area, no kissing corner, no line and no gap below the least."""
+    least = round(least_m / part.dbu_m)
+    for number in numbers(part):
+        layers = layers_of(part, number)
+        assert all(part.shapes[layer].polygons == () for layer in layers)
+        boxes = np.concatenate([part.shapes[layer].rectangles for layer in layers])
+        assert (boxes[:, :2] < boxes[:, 2:]).all()
+        drawn = region(part, *layers)
+        merged = drawn.merged()
+        # Equal areas: nothing is drawn twice, within a datatype or between them.
+        assert merged.area() == drawn.area(), number
+        assert kissing_corners(boxes) == 0, number
+        assert merged.width_check(least).is_empty(), number
+        assert merged.space_check(least).is_empty(), number
+        assert merged.notch_check(least).is_empty(), number

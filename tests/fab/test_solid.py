@@ -1,0 +1,250 @@
+import math
+
+import cadquery
+import numpy as np
+import pytest
+
+from fab.cells import Window
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels, height_of
+from fab.solid import (
+    ChromeRing,
+    Rings,
+    Substrate,
+    patch_step,
+    patch_volume_m3,
+    substrate_step,
+    substrate_volumes_m3,
+)
+from fab.step import step_volumes_m3
+from fab.units import MM, NM, UM
+
+DIE = Substrate("die", 10 * MM, 0.5 * MM)
+WAFER = Substrate("wafer", 100 * MM, 0.5 * MM)
+FLAT = Substrate("wafer", 100 * MM, 0.5 * MM, 32.5 * MM)
+CHROME = ChromeRing(2.195 * MM, 3.7 * MM)
+APERTURE = 4.4 * MM
+SIXTEEN = Levels(16, 75 * NM)
+# The kernel integrates planes and cylinders in closed form; what is left is float64 of millimetres in text.
+CLOSE = 1e-12
+
+
+def some_rings(count=60, aperture_m=APERTURE):
+    outer = np.arange(1, count + 1) * aperture_m / 2 / count
+    return Rings(outer, np.random.default_rng(5).integers(0, 16, count) * 75 * NM, 1125 * NM)
+
+
+def shapes_of(path):
+    return {name.split("/")[-1]: shape for shape, name, _, _ in cadquery.Assembly.importStep(str(path))}
+
+
+def sizes(shape):
+    box = shape.BoundingBox(1e-9)
+    return [box.xmin, box.xmax, box.ymin, box.ymax, box.zmin, box.zmax]
+
+
+@pytest.mark.parametrize("substrate", [DIE, WAFER, FLAT], ids=["die", "wafer", "wafer with a flat"])
+@pytest.mark.parametrize("rings", [None, some_rings()], ids=["flat", "radial"])
+def test_a_plate_reads_back_with_the_volumes_of_closed_form(tmp_path, substrate, rings):
+    substrate_step(tmp_path / "p.step", substrate, APERTURE, CHROME, rings)
+    want = substrate_volumes_m3(substrate, CHROME, rings)
+    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx(want, rel=CLOSE)
+    assert want["CHROME"] == pytest.approx(math.pi * (3.7**2 - 2.195**2) * 1e-4 * 1e-9, rel=1e-14)
+
+
+def test_volumes_of_closed_form_by_hand():
+    # Two rings of 1 and 2 mm, 1 um and 0.5 um deep.
+    rings = Rings(np.array([1 * MM, 2 * MM]), np.array([0.0, 0.5 * UM]), 1 * UM)
+    assert rings.removed_m3 == pytest.approx(math.pi * (1 * 1e-3 + 3 * 0.5e-3) * 1e-9, rel=1e-14)
+    assert substrate_volumes_m3(DIE, None, rings) == pytest.approx({"SUBSTRATE": 50e-9 - rings.removed_m3}, rel=1e-14)
+    # The cut-off segment by its chord: half of the wafer if the flat is the diameter, almost.
+    half = Substrate("wafer", 2 * MM, MM, 2 * MM * (1 - 1e-15))
+    assert half.area_m2 == pytest.approx(math.pi / 2 * 1e-6, rel=1e-6)
+
+
+def test_the_relief_is_measured_and_not_only_the_bulk(tmp_path):
+    rings, bare = some_rings(), substrate_volumes_m3(DIE)["SUBSTRATE"]
+    substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
+    removed = bare - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
+    # The relief is 2e-4 of the glass, so it comes out with four digits less.
+    assert removed == pytest.approx(rings.removed_m3, rel=1e-8)
+
+
+def test_parts_lie_at_the_datum(tmp_path):
+    substrate_step(tmp_path / "p.step", DIE, APERTURE, CHROME, some_rings())
+    shapes = shapes_of(tmp_path / "p.step")
+    assert set(shapes) == {"SUBSTRATE", "CHROME", "DATUM_CLEAR_APERTURE"}
+    # The kernel's boxes are wider than the shape by its tolerance, 1e-7 mm.
+    assert sizes(shapes["SUBSTRATE"]) == pytest.approx([-5, 5, -5, 5, -0.5, 0], abs=1e-6)
+    assert sizes(shapes["CHROME"]) == pytest.approx([-3.7, 3.7, -3.7, 3.7, 0, 1e-4], abs=1e-6)
+    assert sizes(shapes["DATUM_CLEAR_APERTURE"]) == pytest.approx([-2.2, 2.2, -2.2, 2.2, 0, 0], abs=1e-6)
+    assert shapes["DATUM_CLEAR_APERTURE"].Area() == pytest.approx(math.pi * 2.2**2, rel=CLOSE)
+    substrate_step(tmp_path / "w.step", FLAT, APERTURE)
+    low_y = -math.sqrt(50**2 - 16.25**2)
+    assert sizes(shapes_of(tmp_path / "w.step")["SUBSTRATE"])[2:4] == pytest.approx([low_y, 50], abs=1e-6)
+
+
+def test_a_flat_plate_has_the_clear_aperture_as_a_face(tmp_path):
+    substrate_step(tmp_path / "p.step", DIE, APERTURE)
+    areas = sorted(face.Area() for face in shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces())
+    disc = math.pi * 2.2**2
+    assert areas == pytest.approx([5, 5, 5, 5, disc, 100 - disc, 100], rel=CLOSE)
+
+
+def test_every_ring_is_a_flat_face_at_its_height(tmp_path):
+    heights = np.array([0, 0, 15, 3, 3, 0, 15, 7]) * 75 * NM
+    rings = Rings(np.arange(1, 9) * 0.2 * MM, heights, 1125 * NM)
+    substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
+    faces = shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces()
+    walls = [face for face in faces if face.geomType() == "CYLINDER"]
+    # Rings of equal height are one face; the surface around the relief is the last one.
+    radii = [(0, 2), (2, 3), (3, 5), (5, 6), (6, 7), (7, 8)]
+    depths = [1125, 0, 900, 1125, 0, 600]
+    areas = [math.pi * 0.04 * (b * b - a * a) for a, b in radii]
+    rest = 100 - math.pi * 1.6**2
+    flat = [face for face in faces if face.geomType() == "PLANE" and face.Center().z > -0.01]
+    found = sorted((round(-face.Center().z * 1e6), face.Area()) for face in flat)
+    want = sorted([*zip(depths, areas, strict=True), (0, rest)])
+    assert [depth for depth, _ in found] == [depth for depth, _ in want]
+    assert [area for _, area in found] == pytest.approx([area for _, area in want], rel=CLOSE)
+    assert len(walls) == 6
+
+
+@pytest.mark.parametrize("heights", [[15] * 4, [0] * 4, [15, 0, 15, 15], [0]], ids=str)
+def test_awkward_profiles(tmp_path, heights):
+    count = len(heights)
+    rings = Rings(np.arange(1, count + 1) * 2.2 * MM / count, np.array(heights) * 75 * NM, 1125 * NM)
+    substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
+    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx(substrate_volumes_m3(DIE, None, rings), rel=CLOSE)
+
+
+def test_nanometre_rings_and_steps_survive(tmp_path):
+    # Ten thousand times finer than the die is wide, and steps of 1 nm.
+    rings = Rings(np.arange(1, 200) * 20 * NM, np.arange(1, 200) % 2 * NM, 1 * NM)
+    substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
+    removed = substrate_volumes_m3(DIE)["SUBSTRATE"] - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
+    # 2.5e-20 m3 of 5e-8 m3: less than the last digit of the volume of the glass.
+    assert removed == pytest.approx(rings.removed_m3, abs=5e-8 * 1e-14)
+    planes = [f for f in shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces() if f.geomType() == "PLANE"]
+    assert len(planes) == 6 + 199  # those of the die and one per ring
+
+
+def test_the_same_plate_gives_the_same_bytes_whatever_was_written_before(tmp_path):
+    for name in ("a", "b"):
+        substrate_step(tmp_path / f"{name}.step", DIE, APERTURE, CHROME, some_rings(12))
+        # The kernel counts its products from file to file.
+        substrate_step(tmp_path / "other.step", WAFER, APERTURE, CHROME)
+    content = (tmp_path / "a.step").read_bytes()
+    assert content == (tmp_path / "b.step").read_bytes()
+    header = content[: content.index(b"DATA;")].decode()
+    assert "FILE_NAME('DOE','2000-01-01T00:00:00'" in header
+    assert "Open CASCADE" not in header.replace("Open CASCADE Model", "")
+    assert str(tmp_path) not in header
+    assert b"SI_UNIT(.MILLI.,.METRE.)" in content
+
+
+def test_writing_prints_nothing(tmp_path, capfd):
+    substrate_step(tmp_path / "p.step", DIE, APERTURE)
+    step_volumes_m3(tmp_path / "p.step")
+    assert capfd.readouterr() == ("", "")
+
+
+PATCHES = {
+    "one pixel": [[5]],
+    "a row": [[0, 15, 15, 3]],
+    "kissing corners": [[15, 0], [0, 15]],
+    "empty plane": [[0] * 4] * 3,
+    "full plane": [[15] * 3] * 5,
+}
+
+
+@pytest.mark.parametrize("level_map", PATCHES.values(), ids=PATCHES.keys())
+def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
+    level_map = np.array(level_map, dtype=np.uint8)
+    grid = Grid(level_map.shape, 1.85 * UM)
+    window = Window(0, 0, *level_map.shape)
+    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window, UM)
+    want = (height_of(level_map, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
+    assert patch_volume_m3(level_map, SIXTEEN, grid, window, UM) == pytest.approx(want, rel=1e-14)
+    # Edges of 1e-3 mm are written with 15 digits.
+    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx({"PATCH": want}, rel=1e-11)
+
+
+def test_a_patch_lies_where_its_window_does(tmp_path):
+    level_map = np.random.default_rng(2).integers(0, 16, (20, 30)).astype(np.uint8)
+    level_map[5, 8] = 15
+    grid, window = Grid((20, 30), UM), Window(5, 8, 4, 6)
+    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window)
+    box = sizes(shapes_of(tmp_path / "p.step")["PATCH"])
+    # From the blank surface down to the deepest floor and 10 um more.
+    assert box == pytest.approx([-7e-3, -1e-3, -5e-3, -1e-3, -11.125e-3, 0], abs=1e-6)
+    want = patch_volume_m3(level_map, SIXTEEN, grid, window)
+    assert step_volumes_m3(tmp_path / "p.step")["PATCH"] == pytest.approx(want, rel=1e-11)
+
+
+def test_patches_too_large_for_step_are_refused_with_the_number_of_boxes(tmp_path):
+    level_map = (np.indices((50, 50)).sum(axis=0) % 2).astype(np.uint8)
+    grid = Grid((50, 50), UM)
+    with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2500 in 50 x 50 pixels.*mesh"):
+        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 50, 50))
+    with pytest.raises(InputError, match="1 to 20000 boxes"):
+        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 5, 5), most_boxes=20_001)
+    with pytest.raises(InputError, match="window"):
+        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 46, 5, 5))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Substrate("die", 0.0, MM), "substrate width"),
+        (lambda: Substrate("die", MM, math.nan), "substrate thickness"),
+        (lambda: Substrate("die", 10 * MM, MM, MM), "a die has none"),
+        (lambda: Substrate("wafer", 10 * MM, MM, 10 * MM), "shorter than the diameter"),
+        (lambda: ChromeRing(2 * MM, 2 * MM), "make a ring"),
+        (lambda: ChromeRing(1 * MM, 2 * MM, 0.0), "make a ring"),
+        (lambda: Rings(np.array([2.0, 1.0]) * MM, np.zeros(2), UM), "at least 0.3 nm wide"),
+        (lambda: Rings(np.array([MM]), np.zeros(2), UM), "one length"),
+        (lambda: Rings(np.array([MM]), np.array([2 * UM]), UM), "heights must lie"),
+        (lambda: Rings(np.array([MM]), np.array([UM - 0.1 * NM]), UM), "at least 0.3 nm high"),
+    ],
+)
+def test_impossible_parts_are_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("substrate", "aperture_m", "chrome", "rings", "words"),
+    [
+        (DIE, 10 * MM, None, None, "clear aperture"),
+        (DIE, -MM, None, None, "clear aperture"),
+        (DIE, APERTURE, ChromeRing(2 * MM, 5.1 * MM), None, "chrome"),
+        (Substrate("wafer", 10 * MM, MM, 8 * MM), APERTURE, CHROME, None, "circle of 6 mm"),
+        (DIE, 4.3 * MM, None, some_rings(), "inside the clear aperture"),
+        (Substrate("die", 10 * MM, UM), APERTURE, None, some_rings(), "less deep"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path, substrate, aperture_m, chrome, rings, words):
+    with pytest.raises(InputError, match=words):
+        substrate_step(tmp_path / "p.step", substrate, aperture_m, chrome, rings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_damaged_and_missing_step_files_are_refused(tmp_path, capfd):
+    path = tmp_path / "p.step"
+    with pytest.raises(InputError, match="must exist"):
+        step_volumes_m3(path)
+    path.write_bytes(b"ISO-10303-21;\nnothing of the kind\n")
+    with pytest.raises(InputError, match="must be STEP"):
+        step_volumes_m3(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_wrong_unit_in_the_file_is_found(tmp_path):
+    path = tmp_path / "p.step"
+    substrate_step(path, DIE, APERTURE, CHROME)
+    path.write_bytes(path.read_bytes().replace(b"SI_UNIT(.MILLI.,.METRE.)", b"SI_UNIT(.CENTI.,.METRE.)"))
+    want = {name: 1000 * volume for name, volume in substrate_volumes_m3(DIE, CHROME).items()}
+    assert step_volumes_m3(path) == pytest.approx(want, rel=CLOSE)
