@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-TABLES = ("bench.psf", "bench.step", "bench.masks", "bench.plate")
+TABLES = ("bench.psf", "bench.step", "bench.masks", "bench.rules", "bench.solids", "bench.order", "bench.plate")
 
 
 def main() -> int:

@@ -13,10 +13,31 @@ Map of the package, in the order the work flows:
     sampling  draws of a process: Monte-Carlo, corners, Sobol, one at a time
     stock     numbers of named processes, each with its source
     polygons  bitmap <-> rectangles (numba), circles as annulus sectors
-    layout    Layer, Shapes, Layout: the geometry of a mask set in integer database units
+    layout    Layer, Shapes, Cell, Layout: the geometry of a mask set in integer database units
+
+  what a process can print
+
+    rules     narrow lines and spaces, touching corners, density (bits, widths: how they are found)
+    repair    a level map changed until the process prints it (moves: how)
+    compensation  planes grown or shrunk against a line-width bias
+
+  what stands beside the DOE
+
+    part      Part, Plate: things drawn about their own origin, and the plates they are drawn for
+    lettering, marks, structures  polygon text, alignment marks, test structures
+    wafer     Wafer: the glass, its mask blanks, and how it is filled
+    frame     dies, sites, test structures and labels around a DOE
+
+  files
+
     stream    GDSII and OASIS files
     walker    this package's own GDSII reader
+    solid, step      STEP: glass, chrome, exact rings, patches; and its reader
+    cells, mesh, meshfile  the relief as a closed mesh in 3MF, GLB and STL
+    relief    height maps for other programs
+    models    the solids and height maps of an order, and their proof
     manifest  what every file of a mask order is
+    inventory what the manifest says of a cell
     preview   the picture of a mask set
     order     the folder that goes to the lab, with its manifest
     readback  the same files read by a library that had no part in the writing
