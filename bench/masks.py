@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from fab.doe import mask_layout
 from fab.grid import Grid
-from fab.layout import Cell, Layer, Layout, Shapes, mask_layout, pixel_edges
+from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
 from fab.order import write_order

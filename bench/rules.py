@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from bench.masks import LEVELS, MAPS, ratio, row, timed
 from fab.compensation import grown, read_back
+from fab.doe import mask_layout
 from fab.grid import Grid
-from fab.layout import mask_layout, pixel_edges
+from fab.layout import pixel_edges
 from fab.masks import planes, unetched_outside
 from fab.polygons import rectangles
 from fab.repair import repaired

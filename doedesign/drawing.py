@@ -146,7 +146,8 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
             _told(grid, levels),
             "Give the masks of this run (--masks).",
         )
-    return read_level_map(folder / manifest.combined_gds, levels, pixel_edges(grid), manifest.doe_cell)
+    combined, moves = folder / manifest.combined_gds, manifest.edge_moves()
+    return read_level_map(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)
 
 
 def _told(grid: Grid, levels: Levels) -> str:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.compensation import read_back
+from fab.errors import InputError
 from fab.inventory import cell_entry
 from fab.layout import Cell, Layer, Layout, PixelEdges, Shapes
 from fab.manifest import CellEntry, ChromeEntry, FileEntry, Manifest, MaskEntry
@@ -86,11 +88,14 @@ def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: 
 
 def _etch_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expected) -> list[str]:
     """Compare one etch layer, as the own reader found it, with its plane."""
+    missing = abs(len(shapes) - mask.polygons)
+    counted = _count_problem(layer, missing, f"polygons more or less than the {mask.polygons} of the manifest")
+    if mask.edge_move_nm:
+        return counted + _moved_problems(layer, shapes, mask, expected)
     canvas = np.zeros(expected.planes.shape[1:], dtype=np.uint8)
     painted = paint(shapes.rectangles, expected.edges.x, expected.edges.y, 0, canvas)
-    missing = abs(len(shapes) - mask.polygons)
     return [
-        *_count_problem(layer, missing, f"polygons more or less than the {mask.polygons} of the manifest"),
+        *counted,
         *_count_problem(layer, len(shapes.polygons), "shapes are no rectangles"),
         *_count_problem(
             layer, painted.strays, f"rectangles are off the pixel raster, the first is number {painted.first_stray}"
@@ -98,6 +103,15 @@ def _etch_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expe
         *_count_problem(layer, painted.overlaps, "pixels are covered more than once"),
         *_pixel_problems(layer, canvas != expected.planes[mask.bit]),
     ]
+
+
+def _moved_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expected) -> list[str]:
+    """Compare one etch layer whose edges were moved against the bias of the process: moved back, it is its plane."""
+    try:
+        plane = read_back(shapes, expected.edges, expected.manifest.edge_moves()[mask.bit])
+    except InputError as error:
+        return [f"layer {layer}: {error.rule}, but got {error.got}"]
+    return _pixel_problems(layer, plane != expected.planes[mask.bit])
 
 
 def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
@@ -189,6 +203,8 @@ def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> 
     layer, winding = reading.layer, reading.winding
     problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
     mask = expected.etch_layers(entry).get(layer)
+    if mask is not None and reading.moved is not None:
+        return problems + _moved_problems(layer, reading.moved, mask, expected)
     if mask is None:
         covered = int(np.count_nonzero(winding))
         problems += _count_problem(layer, covered, "pixels are covered by rectangles in the chrome")

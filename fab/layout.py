@@ -12,7 +12,6 @@ it does; where none does, each edge is rounded once, so that neighbours still sh
 
 import re
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,8 +20,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.masks import planes, unetched_outside
-from fab.polygons import annulus_sectors, doubled_area, rectangles
+from fab.polygons import annulus_sectors, doubled_area
 from fab.units import MM, NM, format_length
 
 __all__ = [
@@ -38,7 +36,6 @@ __all__ = [
     "etch_layer",
     "in_order",
     "layer_from",
-    "mask_layout",
     "pixel_edges",
     "require_name",
 ]
@@ -353,41 +350,3 @@ def chrome_shapes(grid: Grid, aperture_m: float, dbu_m: float, chrome: Chrome) -
         raise InputError("chrome chord error", "must be one database unit or more", got, "Choose a larger one.")
     polygons = annulus_sectors(inner, outer, chrome.chord_error_m / dbu_m)
     return Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygons))
-
-
-def mask_layout(
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    aperture_m: float,
-    cell: str,
-    chrome: Chrome | None = None,
-) -> Layout:
-    """Draw the planes and the chrome of one DOE as one cell, centred on the clear aperture.
-
-    Args:
-        level_map: level numbers ``[y, x]``; outside the clear aperture the glass is left blank.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres.
-        cell: name of the cell.
-        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
-
-    Returns:
-        One layer per etch mask, mask 0 first, and the chrome last.
-
-    Raises:
-        InputError: the map does not belong to the levels or the grid, or a number is out of range.
-    """
-    side_m = min(grid.extent_m)
-    if not 0 < aperture_m <= side_m * (1 + 1e-9):
-        rule = f"must lie from 0 to the shorter side of the raster, {format_length(side_m)}"
-        raise InputError("aperture", rule, format_length(aperture_m), "Give the diameter of the clear aperture.")
-    edges = pixel_edges(grid)
-    inside = unetched_outside(level_map, levels, grid, aperture_m)
-    # The kernel lets go of the interpreter lock, so the planes share the cores.
-    with ThreadPoolExecutor() as pool:
-        found = pool.map(lambda plane: Shapes(rectangles(plane, edges.x, edges.y)), planes(inside, levels))
-        shapes = {etch_layer(bit, levels): drawn for bit, drawn in enumerate(found)}
-    shapes[chrome_layer(levels)] = chrome_shapes(grid, aperture_m, edges.dbu_m, chrome or Chrome())
-    return Layout(edges.dbu_m, (Cell(require_name(cell), shapes),))

@@ -89,7 +89,11 @@ class FileEntry:
 
 @dataclass(frozen=True)
 class MaskEntry:
-    """One etch mask. `box_um` is x0, y0, x1, y1; box, width and space are None where there is none."""
+    """One etch mask. `box_um` is x0, y0, x1, y1; box, width and space are None where there is none.
+
+    `edge_move_nm`: how far every edge of an etched area is drawn outward, against the bias of the process; width, space
+    and digest are those of the plane before the move.
+    """
 
     mask: int
     bit: int
@@ -98,6 +102,7 @@ class MaskEntry:
     file: str
     cell: str
     depth_nm: float
+    edge_move_nm: float
     polygon_means: str
     polygons: int
     area_um2: float
@@ -192,6 +197,10 @@ class Manifest:
     models: list[ModelEntry]
     files: list[FileEntry]
     tools: dict[str, Any]
+
+    def edge_moves(self) -> tuple[int, ...]:
+        """Return how far the edges of every mask were moved outward, in database units."""
+        return tuple(round(mask.edge_move_nm / self.dbu_nm) for mask in self.masks)
 
     def staircase(self) -> Levels:
         """Return the levels of the order."""

@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.compensation import edge_moves
+from fab.doe import mask_layout
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.frame import Frame, draw_frame
@@ -38,7 +40,6 @@ from fab.layout import (
     Shapes,
     chrome_layer,
     etch_layer,
-    mask_layout,
     pixel_edges,
 )
 from fab.levels import Levels
@@ -120,6 +121,14 @@ class Order:
         """Check every etch mask against what the process prints."""
         return check(self.level_map, self.levels, self.grid, self.aperture_m, Rules.of(self.process))
 
+    def edge_moves(self) -> tuple[int, ...]:
+        """How far the edges of every mask are moved outward against the bias of the process, database units."""
+        if not self.wafer.compensate:
+            return (0,) * self.levels.bits
+        usual = self.process.expected()
+        own = usual.cd_bias_m or (0.0,) * self.levels.bits
+        return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], pixel_edges(self.grid).dbu_m)
+
     def plate_stem(self, plate: Plate) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
         if plate.bit is not None:
@@ -196,6 +205,7 @@ def _mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]
         file=f"{stem}.gds",
         cell=stem,
         depth_nm=round(order.levels.etch_depth_m(bit) / NM, 9),
+        edge_move_nm=round(order.edge_moves()[bit] * layout.dbu_m / NM, 9),
         polygon_means=CONVENTIONS["etch layers"],
         smallest_width_um=width_um,
         smallest_space_um=space_um,
@@ -290,7 +300,8 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     """Write everything but the manifest, and return it."""
     say("drawing the masks")
     doe_cell = f"{order.stem}_DOE"
-    drawn = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, doe_cell, order.chrome)
+    moves = order.edge_moves()
+    drawn = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, doe_cell, order.chrome, moves)
     frame = _frame(order, doe_cell, drawn.dbu_m)
     layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
     doe_layers = list(drawn.top.shapes)

@@ -9,7 +9,7 @@ the polygons alone would silently miss most of a mask.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
@@ -39,12 +39,14 @@ class Reading:
         winding: ``[y, x]`` int32, how many rectangles cover each pixel.
         strays: four-point shapes that are no rectangle on the pixel raster; they are not counted in.
         polygons: shapes with any other number of points, ``(v, 2)`` int64 in database units.
+        moved: the shapes as they are, instead of `winding`, of a layer whose edges lie off the pixel raster on purpose.
     """
 
     layer: Layer
     winding: NDArray[np.int32]
     strays: int
     polygons: list[NDArray[np.int64]]
+    moved: Shapes | None = None
 
 
 def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -89,6 +91,29 @@ class _Counter:
         np.add.accumulate(winding, axis=0, out=winding)
         np.add.accumulate(winding, axis=1, out=winding)
         return Reading(self.layer, winding[:-1, :-1], self.strays, self.polygons)
+
+
+class _Collector(_Counter):
+    """Collects the shapes of a layer as they are."""
+
+    def __init__(self, layer: Layer, edges: PixelEdges) -> None:
+        super().__init__(layer, edges)
+        self.boxes: list[NDArray[np.int32]] = []
+
+    def add(self, points_um: NDArray[np.float64]) -> None:
+        """Take shapes of equal size, ``(n, v, 2)``."""
+        points = np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
+        low, high = points.min(axis=1), points.max(axis=1)
+        sides = np.count_nonzero(points != np.roll(points, -1, axis=1), axis=2)
+        upright = (points.shape[1] == 4) & (sides == 1).all(axis=1) & (low < high).all(axis=1)
+        self.boxes.append(np.concatenate([low, high], axis=1)[upright].astype(np.int32))
+        self.polygons.extend(points[~upright])
+
+    def reading(self) -> Reading:
+        """Put everything together."""
+        rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
+        nothing = np.zeros((0, 0), dtype=np.int32)
+        return Reading(self.layer, nothing, 0, self.polygons, Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons)))
 
 
 def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
@@ -188,8 +213,8 @@ class Again:
         problems: one sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
     """
 
-    def __init__(self, doe: str, edges: PixelEdges) -> None:
-        self.doe, self.edges = doe, edges
+    def __init__(self, doe: str, edges: PixelEdges, moved: Collection[Layer] = ()) -> None:
+        self.doe, self.edges, self._moved = doe, edges, moved
         self.problems: list[str] = []
         self._around = _Around(edges.dbu_m)
 
@@ -234,7 +259,7 @@ class Again:
         yield from self._taken(gdstk.read_oas(str(path), unit=UM).cells, list(layers))
 
     def _taken(self, cells: list[Any], group: list[Layer]) -> Iterator[Reading]:
-        counters = {layer: _Counter(layer, self.edges) for layer in group}
+        counters = {layer: (_Collector if layer in self._moved else _Counter)(layer, self.edges) for layer in group}
         for cell in cells:
             if cell.labels or cell.paths:
                 self.problems.append(f"cell {cell.name} holds labels or paths")

@@ -14,6 +14,7 @@ which refuses what is broken, and then through the own reader.
 """
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.compare import Expected, cell_problems, layout_problems, reading_problems
+from fab.compensation import read_back
 from fab.errors import CheckFailed, InputError
 from fab.files import explain_os_error, read_npy, sha256_file
 from fab.layout import Layer, PixelEdges, layer_from, pixel_edges
@@ -117,7 +119,9 @@ def _stored_map(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
     return stored if fits and stored.max() < manifest.levels else None
 
 
-def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges, cell: str) -> NDArray[np.uint8]:
+def read_level_map(
+    path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
+) -> NDArray[np.uint8]:
     """Rebuild the level map that a combined GDSII file draws, with this package's own reader.
 
     Args:
@@ -125,6 +129,7 @@ def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges, cell: st
         levels: the staircase.
         edges: where the pixel edges fall in the drawing.
         cell: name of the cell with the planes.
+        moves: how far the edges of every mask were moved outward, database units (`Manifest.edge_moves`).
 
     Returns:
         Level numbers ``[y, x]``.
@@ -136,9 +141,12 @@ def read_level_map(path: str | Path, levels: Levels, edges: PixelEdges, cell: st
     drawn = read_gds(path).cell(cell)
     if drawn is None:
         raise InputError(str(path), f"must hold the cell {cell}", "none of that name", "Write the order again.")
-    for bit in range(levels.bits):
+    for bit, move in zip(range(levels.bits), moves or (0,) * levels.bits, strict=True):
         shapes = drawn.shapes.get(Layer(bit + 1))
         if shapes is None:
+            continue
+        if move:
+            etched |= read_back(shapes, edges, move) << np.uint8(bit)
             continue
         painted = paint(shapes.rectangles, edges.x, edges.y, bit, etched)
         if shapes.polygons or painted.strays or painted.overlaps:
@@ -160,7 +168,8 @@ def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdg
         return stored, Check(manifest.level_map_file, question, ())
     failed = Check(manifest.level_map_file, question, ("the level map is unreadable or its digest differs",))
     try:
-        drawn = read_level_map(folder / manifest.combined_gds, levels, edges, manifest.doe_cell)
+        moves = manifest.edge_moves()
+        drawn = read_level_map(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
     except InputError:
         drawn = None
     if drawn is not None and map_digest(drawn) == manifest.level_map_sha256:
@@ -207,7 +216,8 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     chrome = expected.chrome_layer(entry)
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
-    again = Again(expected.manifest.doe_cell, expected.edges)
+    moved = [layer for layer, mask in expected.etch_layers(entry).items() if mask.edge_move_nm]
+    again = Again(expected.manifest.doe_cell, expected.edges, moved)
     others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]

@@ -23,6 +23,8 @@ class Wafer:
         pitch_m: distance of the dies, metres; the next whole millimetre that a die needs if None.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: how the aperture's chrome is made.
+        compensate: whether masks are drawn with their edges moved against the line-width bias that the process is
+            known for (`Process.expected`).
     """
 
     diameter_m: float = 100 * MM
@@ -32,6 +34,7 @@ class Wafer:
     pitch_m: float | None = None
     zero_layer: bool = False
     chrome: Literal["liftoff", "etch"] = "liftoff"
+    compensate: bool = False
 
     def __post_init__(self) -> None:
         """Check the values.

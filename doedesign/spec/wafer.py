@@ -29,6 +29,7 @@ class WaferSpec(Table, frozen=True):
         pitch_m: distance of the dies; the next whole millimetre that a die needs if none is given.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: "liftoff" or "etch".
+        compensate: whether masks are drawn against the mean line-width bias of the process.
     """
 
     diameter_m: Size = unsaid(_USUAL.diameter_m)
@@ -38,3 +39,4 @@ class WaferSpec(Table, frozen=True):
     pitch_m: Size | None = unsaid()
     zero_layer: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.zero_layer)
     chrome: Literal["liftoff", "etch"] = unsaid(_USUAL.chrome)
+    compensate: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.compensate)

@@ -7,8 +7,9 @@ import klayout.db as kdb
 import numpy as np
 import pytest
 
+from fab.doe import mask_layout
 from fab.grid import Grid
-from fab.layout import Chrome, mask_layout
+from fab.layout import Chrome
 from fab.levels import Levels, height_of, quantise
 from fab.masks import planes
 from fab.order import write_order

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fab.doe import mask_layout
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout import (
@@ -11,7 +12,6 @@ from fab.layout import (
     Shapes,
     chrome_layer,
     etch_layer,
-    mask_layout,
     pixel_edges,
     require_name,
 )

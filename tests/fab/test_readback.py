@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fab.doe import mask_layout
 from fab.grid import Grid
-from fab.layout import Cell, Layer, Layout, Shapes, mask_layout, pixel_edges
+from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.polygons import rectangles
 from fab.readback import Again
 from fab.stream import write_gds, write_oasis

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fab.doe import mask_layout
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.grid import Grid
-from fab.layout import Cell, Chrome, Layer, Layout, Shapes, mask_layout
+from fab.layout import Cell, Chrome, Layer, Layout, Shapes
 from fab.levels import Levels
 from fab.polygons import rectangles
 from fab.stream import oasis_to_gds, write_gds, write_oasis

@@ -1,0 +1,76 @@
+"""Orders whose masks are drawn against the line-width bias of the process."""
+
+import shutil
+from dataclasses import replace
+
+import klayout.db as kdb
+import numpy as np
+import pytest
+
+from fab.grid import Grid
+from fab.layout import Layer, Shapes, pixel_edges
+from fab.levels import Levels
+from fab.manifest import read_manifest
+from fab.order import write_order
+from fab.process import Process, Spread
+from fab.stream import write_gds
+from fab.verify import read_level_map, verify_order
+from fab.wafer import Wafer
+from fab.walker import read_gds
+
+
+@pytest.fixture(scope="module")
+def compensated(tmp_path_factory):
+    """A map of blocks against a bias of 0.1 um on every mask, 0.3 um less on the third; and the same as drawn."""
+    levels, grid = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
+    level_map = np.kron(np.random.default_rng(8).integers(0, 16, (12, 10)), np.ones((3, 3), int)).astype(np.uint8)
+    bias = {"common_cd_bias_m": Spread(0.1e-6, 0.0), "cd_bias_m[2]": Spread(-0.3e-6, 0.0)}
+    process = Process(levels, spreads=bias)
+    folders = [tmp_path_factory.mktemp("moved") / name for name in ("moved", "plain")]
+    for folder, wafer in zip(folders, (Wafer(compensate=True), Wafer()), strict=True):
+        write_order(folder, level_map, levels, grid, grid.extent_m[1], "small", {}, process=process, wafer=wafer)
+    return folders
+
+
+def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
+    moved, plain = compensated
+    manifest = read_manifest(moved)
+    assert [mask.edge_move_nm for mask in manifest.masks] == [-100, -100, 200, -100]
+    levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
+    drawn = read_level_map(moved / manifest.combined_gds, levels, edges, manifest.doe_cell, manifest.edge_moves())
+    assert np.array_equal(drawn, np.load(plain / "DOE_SMALL_LEVELS.npy"))
+    # The process moves every edge by its bias: printed like that, by KLayout, the drawing is the plane again.
+    for mask in manifest.masks:
+        regions = []
+        for folder in (moved, plain):
+            layout = kdb.Layout()
+            layout.read(str(folder / mask.file))
+            shapes = layout.cell(manifest.doe_cell).shapes(layout.layer(mask.layer, 0))
+            regions.append(kdb.Region(shapes).merged())
+        assert not (regions[0] ^ regions[1]).is_empty()
+        assert (regions[0].sized(round(-mask.edge_move_nm), 2) ^ regions[1]).is_empty()
+
+
+def test_an_edge_that_was_moved_otherwise_is_told_by_both_readers(compensated, tmp_path):
+    folder = tmp_path / "order"
+    shutil.copytree(compensated[0], folder)
+    file = "DOE_SMALL_M3_B2_300NM.gds"
+    layout = read_gds(folder / file)
+    doe, *around = layout.cells
+    rects = doe.shapes[Layer(3)].rectangles.copy()
+    rects[5, 2] += 1
+    write_gds(folder / file, replace(layout, cells=(replace(doe, shapes={Layer(3): Shapes(rects)}), *around)))
+    told = {c.question: " ".join(c.problems) for c in verify_order(folder).checks if c.file == file}
+    for question in ("own reader, every pixel", "gdstk, every pixel"):
+        assert "layer 3/0: every edge must be a pixel edge moved by 200 nm" in told[question]
+
+
+def test_a_bias_wider_than_the_pixels_allow_is_refused(tmp_path):
+    levels, grid = Levels(4, 75e-9), Grid((12, 12), 1e-6)
+    level_map = np.random.default_rng(0).integers(0, 4, (12, 12)).astype(np.uint8)
+    process = Process(levels, spreads={"common_cd_bias_m": Spread(0.6e-6, 0.0)})
+    with pytest.raises(ValueError, match="edges must move by less than half the narrowest line and space"):
+        write_order(
+            tmp_path / "o", level_map, levels, grid, 12e-6, "s", {}, process=process, wafer=Wafer(compensate=True)
+        )
+    assert not (tmp_path / "o").exists()
