@@ -20,6 +20,7 @@ Map of the package, in the order the work flows:
     rules     narrow lines and spaces, touching corners, density (bits, widths: how they are found)
     repair    a level map changed until the process prints it (moves: how)
     compensation  planes grown or shrunk against a line-width bias
+    doe       the cell of a DOE: its planes as they are drawn, and its chrome
 
   what stands beside the DOE
 

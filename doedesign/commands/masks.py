@@ -12,6 +12,7 @@ from doedesign.build import camera_of, process_of, wafer_of
 from doedesign.drawing import LevelMap
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
+from doedesign.report.wafer import draw_wafer
 from doedesign.runs import open_run
 from doedesign.spec import Spec
 from fab.errors import InputError
@@ -76,17 +77,18 @@ def write_masks(
         level, cost = _fixed(spec, drawing, level, rules, say)
         origin["repair"] = cost
 
-    def add(fresh: Path, order: Order, _: Frame) -> list[str]:
-        marks = f"{order.stem}_MARKS.png"
-        site = alignment_site(order.plates, pixel_edges(order.grid).dbu_m)
+    def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
+        plate, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
+        dbu_m = pixel_edges(order.grid).dbu_m
+        draw_wafer(fresh / plate, order.wafer, frame, order.aperture_m, dbu_m, f"{order.stem}: what lies where")
+        site = alignment_site(order.plates, dbu_m)
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
         found = order.rules()
         if found.clean:
-            return [marks]
-        name = f"{order.stem}_RULES.png"
+            return [plate, marks]
         title = f"{order.stem}: where the masks break the rules of {process.name}"
         draw_rules(fresh / name, found, order.level_map, order.levels, order.grid, order.aperture_m, title)
-        return [marks, name]
+        return [plate, marks, name]
 
     proof = write_order(
         folder,
