@@ -91,9 +91,15 @@ def masks(
     scale: str | None = None,
     aperture: str | None = None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
+    probe: str | None = None,
+    as_built: Path | None = None,
+    order: Path | None = None,
+    process: Path | None = None,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
+
+    With --as-built, take the filled run sheet of a finished wafer instead and predict its plate into RUN/as-built.
 
     Args:
         source: Run folder, or a height map (.exr, .npy, .tif, .png).
@@ -104,9 +110,23 @@ def masks(
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
         on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
+        probe: Wavelength of the laser that the lab tests the plate with; 520 nm by default.
+        as_built: JSON of the run sheet with measured numbers filled in.
+        order: With --as-built, the order that was made; masks/NAME by default.
+        process: With --as-built, a TOML file with the [process] table for what was not measured.
     """
+    if as_built is not None:
+        from doedesign.commands.asbuilt import as_built as work
+
+        folder = work(source, as_built, order, process=process, say=_say)
+        _print_paths([folder, *sorted(folder.iterdir())], json_)
+        return
+    for option, value in (("--order", order), ("--process", process)):
+        if value is not None:
+            raise InputError(option, "goes with --as-built only", value, "Leave it out.")
     from doedesign.commands.masks import write_masks
     from doedesign.drawing import level_map_from
+    from doedesign.outlook import PROBE_M
 
     drawing = level_map_from(
         source,
@@ -116,7 +136,8 @@ def masks(
         scale_m=_length("--scale", scale),
         aperture_m=_length("--aperture", aperture),
     )
-    folder, report = write_masks(source, drawing, out, on_violation, _say)
+    probe_m = PROBE_M if probe is None else _length("--probe", probe) or PROBE_M
+    folder, report = write_masks(source, drawing, out, on_violation, probe_m, _say)
     _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
     _print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
 

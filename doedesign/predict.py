@@ -143,16 +143,18 @@ def plate_rows(drawn: Drawn, surface: Surface, bank: PsfBank) -> list[dict[str, 
 
 
 class _ById:
-    """A design as a key of a cache, by identity: its level map is large and never changes."""
+    """A design as a key of a cache: its staircase and, by identity, its level map, which is large and never changes."""
 
     def __init__(self, drawn: Drawn) -> None:
         self.drawn = drawn
 
     def __hash__(self) -> int:
-        return id(self.drawn.level)
+        return hash((id(self.drawn.level), self.drawn.levels))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ById) and other.drawn.level is self.drawn.level
+        if not isinstance(other, _ById):
+            return False
+        return other.drawn.level is self.drawn.level and other.drawn.levels == self.drawn.levels
 
 
 @lru_cache(maxsize=1)

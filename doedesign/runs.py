@@ -40,7 +40,7 @@ CHECKPOINT = "checkpoint.npz"
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
-    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|calibration|explanations)\.new)\.[a-z0-9_]{8}"
+    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
 )
 
 

@@ -37,6 +37,8 @@ Map of the package, in the order the work flows:
     cells, mesh, meshfile  the relief as a closed mesh in 3MF, GLB and STL
     relief    height maps for other programs
     models    the solids and height maps of an order, and their proof
+    sheet, recipe, runsheet  what the lab does step by step, as a page and as JSON
+    asbuilt   the same JSON with measured numbers filled in
     manifest  what every file of a mask order is
     inventory what the manifest says of a cell
     preview   the picture of a mask set

@@ -113,7 +113,13 @@ class _Collector(_Counter):
         """Put everything together."""
         rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
         nothing = np.zeros((0, 0), dtype=np.int32)
-        return Reading(self.layer, nothing, 0, self.polygons, Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons)))
+        return Reading(
+            self.layer,
+            nothing,
+            0,
+            self.polygons,
+            Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons)),
+        )
 
 
 def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:

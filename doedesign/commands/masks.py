@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from doedesign.build import camera_of, process_of, wafer_of
 from doedesign.drawing import LevelMap
+from doedesign.outlook import PROBE_M, Foretold, foretold
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
@@ -20,12 +21,15 @@ from fab.files import sha256_file
 from fab.frame import Frame
 from fab.layout import Chrome, pixel_edges
 from fab.levels import Levels
+from fab.manifest import map_digest
 from fab.marks import alignment_site
 from fab.masks import unetched_outside
 from fab.order import Order, write_order
 from fab.process import Process, Variation
 from fab.repair import repaired
 from fab.rules import Rules, check
+from fab.runsheet import write_run_sheet
+from fab.sheet import Die, PlateFile, RunSheet
 from fab.verify import Report, verify_order
 from fab.wafer import Wafer
 
@@ -37,6 +41,7 @@ def write_masks(
     drawing: LevelMap,
     out: Path | None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
+    probe_m: float = PROBE_M,
     say: Say = lambda _: None,
 ) -> tuple[Path, Report]:
     """Write and prove the mask order of a level map.
@@ -46,6 +51,7 @@ def write_masks(
         drawing: what to draw.
         out: order folder; `masks/NAME` by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
+        probe_m: wavelength of the laser that the lab tests the plate with.
         say: told what is going on.
 
     Returns:
@@ -83,12 +89,14 @@ def write_masks(
         draw_wafer(fresh / plate, order.wafer, frame, order.aperture_m, dbu_m, f"{order.stem}: what lies where")
         site = alignment_site(order.plates, dbu_m)
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
+        say("writing the run sheet")
+        sheets = write_run_sheet(fresh, *_run_sheet(spec, fresh, order, frame, probe_m, say))
         found = order.rules()
         if found.clean:
-            return [plate, marks]
+            return [plate, marks, *sheets]
         title = f"{order.stem}: where the masks break the rules of {process.name}"
         draw_rules(fresh / name, found, order.level_map, order.levels, order.grid, order.aperture_m, title)
-        return [plate, marks, name]
+        return [plate, marks, *sheets, name]
 
     proof = write_order(
         folder,
@@ -105,6 +113,51 @@ def write_masks(
         say=say,
     )
     return folder, proof
+
+
+def _run_sheet(
+    spec: Spec | None, folder: Path, order: Order, frame: Frame, probe_m: float, say: Say
+) -> tuple[RunSheet, bytes | None]:
+    """The run sheet of an order in the making, and the picture of what the lab should see."""
+    dbu_m = pixel_edges(order.grid).dbu_m
+    moves_m = [move * dbu_m for move in order.edge_moves()]
+    told = None if spec is None else _foretold(spec, order, moves_m, probe_m, say)
+    files = {
+        plate.name: PlateFile(
+            file=f"{order.plate_stem(plate)}.gds",
+            sha256=sha256_file(folder / f"{order.plate_stem(plate)}.gds"),
+            cell=order.plate_stem(plate),
+            edge_move_m=0.0 if plate.bit is None else moves_m[plate.bit],
+        )
+        for plate in order.plates
+    }
+    sheet = RunSheet(
+        stem=order.stem,
+        level_map_sha256=map_digest(order.level_map),
+        levels=order.levels,
+        plates=order.plates,
+        files=files,
+        process=order.process,
+        aperture_m=order.aperture_m,
+        opening_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[0],
+        wafer=order.wafer,
+        places=frame.places,
+        dies=tuple(Die(f"die {number}", x, y) for number, (x, y) in enumerate(frame.dies, 1)),
+        outlook=None if told is None else told.outlook,
+    )
+    return sheet, None if told is None else told.picture
+
+
+def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, say: Say) -> Foretold | None:
+    from doedesign.predict import Drawn
+
+    camera, scene = camera_of(spec), spec.scene
+    drawn = Drawn(spec.name, order.level_map, order.levels, camera, scene.near_m, scene.far_m)
+    try:
+        return foretold(drawn, order.process, spec.optics.design_wavelength_m, probe_m, moves_m)
+    except InputError as error:
+        say(f"warning: the run sheet says nothing of the light: {error}")
+        return None
 
 
 def _process(spec: Spec | None, levels: Levels) -> Process:

@@ -134,7 +134,7 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
 
     from fab.polygons import rectangles
 
-    monkeypatch.setattr("fab.layout.rectangles", crooked)
+    monkeypatch.setattr("fab.compensation.rectangles", crooked)
     with pytest.raises(CheckFailed, match=r"ALL\.gds: own reader, every pixel: layer 1/0: \d+ pixel"):
         write_order(tmp_path / "o", level_map, levels, grid, grid.extent_m[1], "bad", {})
     assert list(tmp_path.iterdir()) == []

@@ -181,6 +181,7 @@ def test_whatever_changes_around_the_doe_is_told_by_both_readers(order_folder, c
     layout = around(read_gds(order_folder / MASKS[0]), cell, change)
     if words == "OTHER":
         wafer = layout.cell("DOE_SMALL_WAFER")
+        assert wafer is not None
         renamed = tuple(replace(r, cell="OTHER") if r.cell == "DOE_SMALL_TEST" else r for r in wafer.references)
         layout = around(layout, "_WAFER", lambda _: {"references": renamed})
     write_gds(order_folder / MASKS[0], layout)

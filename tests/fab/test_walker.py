@@ -149,8 +149,9 @@ def test_cells_that_make_no_drawing_are_refused(tmp_path, change, words):
 
 
 def test_turned_mirrored_and_slanted_references_are_refused(tmp_path):
-    raster = {"columns": 2, "rows": 2, "spacing": (1, 1)}
-    for options in ({"rotation": 1.0}, {"x_reflection": True}, {**raster, "rotation": 0.1}):
+    raster: dict[str, Any] = {"columns": 2, "rows": 2, "spacing": (1, 1)}
+    ways: list[dict[str, Any]] = [{"rotation": 1.0}, {"x_reflection": True}, {**raster, "rotation": 0.1}]
+    for options in ways:
         library = gdstk.Library()
         cell, top = library.new_cell("A"), library.new_cell("TOP")
         cell.add(gdstk.rectangle((0, 0), (1, 1)))

@@ -1,0 +1,132 @@
+"""`doedesign masks RUN --as-built FILE`: what the plate does that the lab measured, and what the run sheet foretold."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from doedesign.asbuilt import Plate, compared, gratings_compared, plate_of
+from doedesign.build import process_for
+from doedesign.commands.psf import Say, require_own
+from doedesign.predict import Drawn, drawn_of, predict
+from doedesign.report.pictures import draw_psfs
+from doedesign.runs import alone_in, open_run
+from doedesign.spec import variation_to_toml
+from fab.asbuilt import AsBuilt, read_as_built
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
+from fab.process import ERRORS, Process
+from sim.store import write_bank
+
+FORMAT = "doedesign as-built 1"
+
+_TITLES = {
+    "strehl": "Strehl ratio",
+    "zeroth_order": "0th order",
+    "throughput": "throughput",
+    "ring_to_disc": "ring:disc",
+    "far_spot": "far spot",
+}
+
+
+def as_built(
+    run_folder: Path,
+    file: Path,
+    masks: Path | None = None,
+    *,
+    process: Path | None = None,
+    say: Say = lambda _: None,
+) -> Path:
+    """Predict the plate of a filled run sheet and write what was found into RUN/as-built.
+
+    Args:
+        run_folder: the finished run that the wafer was made from.
+        file: the JSON of its run sheet, with measured numbers; what is null is taken at the process's mean.
+        masks: its mask order, whose files are read; `masks/NAME` if there is one, else the run's own map.
+        process: TOML file with a [process] table; the run's own process by default.
+        say: told what was found.
+
+    Returns:
+        the folder: the PSF bank `as-built.exr` and its picture, `as-built.json` with every error, where it comes from
+        and the comparison with the sheet, and `variation.toml`, which `psf --fabricated --variation` reads.
+
+    Raises:
+        InputError: a file that cannot be read or is not of this design, a value that cannot be, or errors beyond the
+            model.
+    """
+    run = open_run(run_folder)
+    drawn = drawn_of(run, masks)
+    made_by = process_for(drawn.levels, run.spec.process, process)
+    measured = read_as_built(file, drawn.levels, drawn.digest())
+    plate = plate_of(measured, made_by)
+    say(_told(plate))
+    folder = run.path("as-built")
+    require_own(folder)
+    with alone_in(run.folder), atomic_folder(folder) as fresh:
+        rows = _write(fresh, drawn, made_by, measured, plate, file)
+    for line in _lines(rows):
+        say(line)
+    return folder
+
+
+def _told(plate: Plate) -> str:
+    """Say how much of the plate is known."""
+    count = {source: 0 for source in ("measured", "process mean", "not measured, taken as 0")}
+    for one in plate.taken:
+        count[one.source] += 1
+    return ", ".join(f"{number} errors: {source}" for source, number in count.items() if number)
+
+
+def _write(
+    folder: Path, drawn: Drawn, process: Process, measured: AsBuilt, plate: Plate, file: Path
+) -> list[dict[str, Any]]:
+    try:
+        prediction = predict(drawn, process, plate.variation)
+    except InputError as error:
+        raise InputError(f"{file}: {error.where}", error.rule, error.got, error.cure) from error
+    rows = compared(prediction.rows, measured.predicted)
+    found = {
+        "format": FORMAT,
+        "design": drawn.name,
+        "level_map_sha256": drawn.digest(),
+        "units": "SI; a depth of null is infinity; null in a comparison is what the sheet does not say",
+        "notes": dict(measured.notes),
+        "errors": [{**one._asdict(), "unit": ERRORS[one.error.partition("[")[0]].unit} for one in plate.taken],
+        "etch_lag_per_nm": plate.lag_per_nm,
+        "comparison": rows,
+        "gratings": gratings_compared(measured, process, plate.variation, drawn.camera.material),
+    }
+    write_bank(folder / "as-built.exr", prediction.bank, {"design": drawn.name, "plate": "as built"})
+    draw_psfs(folder / "as-built_psf.png", drawn.camera, prediction.bank, drawn.near_m, drawn.far_m)
+    (folder / "as-built.json").write_bytes(canonical_json(found))
+    head = [f"plate of {drawn.name} as it was measured"]
+    (folder / "variation.toml").write_text(variation_to_toml(plate.variation, head), encoding="utf-8")
+    digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
+    manifest = {
+        "format": FORMAT,
+        "run": drawn.name,
+        "level_map_sha256": drawn.digest(),
+        "measured_sha256": sha256_file(file),
+        "results_sha256": digests,
+    }
+    (folder / MANIFEST_NAME).write_bytes(canonical_json(manifest))
+    return rows
+
+
+def _lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Put the worst row of every quantity into words."""
+    lines = []
+    for quantity, title in _TITLES.items():
+        of = [row for row in rows if row["quantity"] == quantity]
+        if not of:
+            continue
+        row = (max if quantity == "zeroth_order" else min)(of, key=lambda row: row["as_built"])
+        before = [
+            f"{row[kind]:.4g} {kind.replace('_', ' ')}" for kind in ("as_drawn", "expected") if _number(row[kind])
+        ]
+        said = f" (the sheet: {', '.join(before)})" if before else ""
+        lines.append(f"{title}, worst colour and depth: {row['as_built']:.4g}{said}")
+    return lines
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,214 @@
+"""The run sheet as values, as JSON and as a page."""
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+
+from fab.errors import InputError
+from fab.levels import Levels
+from fab.recipe import depths_m, etch_time_s, next_target_m, resist_thickness_m
+from fab.runsheet import BARS, PADS, html_page, record, write_run_sheet
+from fab.units import NM, UM
+from tests.fab.sheets import DIGEST, STEM, outlook, sheet, spreads_of
+
+VOID = {"meta", "img", "br"}
+PICTURE = b"\x89PNG not really"
+
+
+class Page(HTMLParser):
+    """Reads a page, and notes every tag that is closed in the wrong place or not at all."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(f"{tag} at {self.getpos()}")
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def page_of(content, picture: bytes | None = PICTURE) -> Page:
+    return Page(html_page(content, f"{STEM}_RUNSHEET.json", picture))
+
+
+@pytest.mark.parametrize("count", [2, 4, 16, 64])
+@pytest.mark.parametrize(("chrome", "zero_layer", "tone"), [("liftoff", False, "clear"), ("etch", True, "dark")])
+def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, zero_layer, tone):
+    levels = Levels(count, 75 * NM)
+    made = sheet(levels, tuple(reversed(range(levels.bits))), tone, chrome, zero_layer)
+    page = page_of(record(made))
+    assert (page.wrong, page.open) == ([], [])
+    for number, plate in enumerate(made.plates, start=1):
+        assert f"{number}. {plate.name.capitalize()}: " in page.text
+        assert made.files[plate.name].file in page.text
+        assert made.files[plate.name].sha256 in page.text
+        if plate.bit is not None:
+            assert f"Target depth {plate.depth}" in page.text
+    for depth in depths_m(levels):
+        assert re.search(rf"\b{depth / NM:.10g}\b", page.text)
+    assert DIGEST in page.text
+    assert "None" not in page.text
+    assert "right-reading chrome down" in page.text
+
+
+def test_the_page_needs_nothing_else_and_repeats_job_and_digest_on_every_printed_page():
+    text = html_page(record(sheet(outlook=outlook())), "x.json", PICTURE)
+    page = Page(text)
+    assert not [tag for tag, _ in page.tags if tag in ("script", "link", "iframe")]
+    sources = [attrs["src"] or "" for _, attrs in page.tags if "src" in attrs]
+    assert len(sources) == 1
+    assert sources[0].startswith("data:image/png;base64,")
+    assert "http" not in text
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert f'content: "Run sheet {STEM}"' in style
+    assert f'content: "level map {DIGEST[:12]}"' in style
+    assert "size: A4" in style
+    assert "break-before: page" in style
+
+
+def test_words_from_outside_stay_words():
+    page = page_of(record(sheet()))
+    assert 'edges of <all> masks "+50 nm"' in page.text
+    assert "all" not in {tag for tag, _ in page.tags}
+
+
+def test_without_predictions_the_page_promises_none():
+    assert "Strehl" not in page_of(record(sheet()), None).text
+    seen = page_of(record(sheet(outlook=outlook()))).text
+    for words in ("0.810 / 0.810", "3.21 / 3.21", "0.654", "infinity", "50 mm", "552.1 nm", "6.45 % over-etched"):
+        assert words in seen, words
+    assert "one measurement only: overlay of mask 4" in seen
+    assert "For the 0th order it is line width (CD bars) of every mask" in seen
+
+
+def test_the_same_sheet_gives_the_same_bytes_and_is_json(tmp_path):
+    bytes_of = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        names = write_run_sheet(tmp_path / name, sheet(outlook=outlook()), PICTURE)
+        assert names == (f"{STEM}_RUNSHEET.html", f"{STEM}_RUNSHEET.json")
+        bytes_of.append([(tmp_path / name / file).read_bytes() for file in names])
+    assert bytes_of[0] == bytes_of[1]
+    assert json.loads(bytes_of[0][1]) == json.loads(json.dumps(record(sheet(outlook=outlook()))))
+
+
+def test_steps_come_in_the_order_of_use_and_say_how_to_align():
+    steps = record(sheet(order=(3, 1, 2, 0), chrome="etch", zero_layer=True))["steps"]
+    assert [step["code"] for step in steps] == ["Z0", "M4", "M2", "M3", "M1", "CR"]
+    # The plates after the first are aligned to its marks, in their own slot.
+    for step in steps[1:]:
+        align = next(action["how"] for action in step["before"] if action["task"] == "Align")
+        assert f"aligned to the Z0 marks in slot {step['code']}" in align
+        assert {(row["axis"], row["where"]) for row in step["overlay"]} == {
+            (axis, where) for axis in "xy" for where in ("left site", "right site", "middle die")
+        }
+        assert step["marks"]
+    assert steps[0]["overlay"] == steps[0]["marks"] == []
+    # 600, 150, 300 and 75 nm one after the other.
+    assert [step["etch"]["deepest_floor_nm"] for step in steps[1:5]] == [600, 750, 1050, 1125]
+    # Blanket chrome comes before the resist of a chrome etch, and after it in a lift-off.
+    assert [a["task"] for a in steps[-1]["before"]][:3] == ["Clean", "Deposit", "Prime"]
+    lifted = record(sheet())["steps"][-1]
+    assert "Deposit" not in [a["task"] for a in lifted["before"]]
+    assert [a["task"] for a in lifted["after"]] == ["Descum", "Deposit", "Lift off"]
+
+
+def test_resist_is_thick_enough():
+    plates = {plate.name: plate for plate in sheet(Levels(64, 75 * NM)).plates}
+    # A published rule: five times evaporated metal, ten times sputtered.
+    assert resist_thickness_m(plates["chrome"], 100 * NM, "evaporated") == pytest.approx(0.5 * UM)
+    assert resist_thickness_m(plates["chrome"], 100 * NM, "sputtered") == pytest.approx(1.0 * UM)
+    assert resist_thickness_m(plates["mask 1"], 100 * NM, "evaporated") == pytest.approx(1.0 * UM)
+    assert resist_thickness_m(plates["mask 6"], 100 * NM, "evaporated") == pytest.approx(1.6 * UM)
+
+
+def test_times_are_depth_over_rate():
+    assert etch_time_s(600 * NM, 20 * NM / 60) == pytest.approx(1800)
+    times = record(sheet())["steps"][3]["etch"]["times"]
+    assert [(row["rate_nm_per_min"], row["time_s"]) for row in times] == [(10, 3600), (20, 1800), (30, 1200)]
+    assert "30:00 min" in page_of(record(sheet())).text
+
+
+def test_the_correction_keeps_the_sum_of_all_etches():
+    next_m = next_target_m(75 * NM, 80 * NM, 150 * NM)
+    assert next_m == pytest.approx(145 * NM)
+    assert 80 * NM + next_m == pytest.approx(75 * NM + 150 * NM)
+    etch = record(sheet(order=(3, 0, 1, 2)))["steps"][0]["etch"]
+    assert etch["next"] == "mask 1"
+    assert {row["off_by_nm"]: row["next_target_nm"] for row in etch["corrections"]} == {-10: 85, -5: 80, 5: 70, 10: 65}
+    assert record(sheet())["steps"][3]["etch"]["next"] is None
+
+
+def test_line_widths_are_those_at_which_the_doe_comes_out_as_designed():
+    """A mask whose edges were drawn 50 nm inward is right where the process moves them 50 nm outward."""
+    levels = Levels(4, 75 * NM)
+    spreads = spreads_of(levels, common_cd_bias_m=(0.05 * UM, 0.03 * UM), cd_bias_m=(0.0, 0.04 * UM))
+    made = sheet(levels, spreads=spreads, moves_m=(-0.05 * UM, 0.0))
+    first, second = (record(made)["steps"][step]["widths"] for step in (0, 1))
+    assert [row["bar"] for row in first] == list(BARS)
+    assert {row["bar"]: row["target_um"] for row in first if "2 um" in row["bar"]} == {
+        "2 um line": pytest.approx(2.1),
+        "2 um gap": pytest.approx(1.9),
+    }
+    assert all(row["target_um"] == row["drawn_um"] for row in second)
+    # Two standard deviations of 50 nm (30 and 40 in quadrature) at each of two edges.
+    assert {row["tolerance_um"] for row in first} == {0.2}
+    # The process prints lines of 1.2 um and says nothing of gaps.
+    assert [row["bar"] for row in first if row["below_process"]] == ["1 um line"]
+    assert all(row["x_mm"] is not None for row in (*first, *second))
+
+
+def test_depth_pads_say_what_etch_lag_does():
+    levels = Levels(16, 75 * NM)
+    pads = record(sheet(levels, spreads=spreads_of(levels, etch_lag=(0.1, 0.0))))["steps"][3]["etch"]["pads"]
+    assert [row["pad"] for row in pads] == list(PADS)
+    # 600 nm x (1 - 0.1 x 0.6 um / 20 um) and so on.
+    assert [row["expected_nm"] for row in pads] == [598.2, 599.64, 599.93]
+    assert {row["target_nm"] for row in pads} == {600}
+
+
+def test_nothing_is_measured_yet():
+    def values(table):
+        for value in table.values():
+            yield from values(value) if isinstance(value, dict) else [value]
+
+    measured = record(sheet())["measured"]
+    assert set(values(measured)) == {None}
+    # The first mask that is etched makes the marks, and there is no overlay of it.
+    assert [name for name, table in measured.items() if "overlay_x_um" in table] == [
+        "mask 2",
+        "mask 3",
+        "mask 4",
+        "chrome",
+    ]
+    assert "overlay_x_um" in record(sheet(zero_layer=True))["measured"]["mask 1"]
+    assert list(measured) == ["mask 1", "mask 2", "mask 3", "mask 4", "chrome", "plate", "notes"]
+
+
+def test_a_sheet_without_its_files_or_in_another_order_is_refused():
+    made, other = sheet(order=(0, 1, 2, 3)), sheet(order=(3, 2, 1, 0))
+    with pytest.raises(InputError, match="file"):
+        replace(made, files={})
+    with pytest.raises(InputError, match="order of the process"):
+        replace(made, plates=other.plates)
