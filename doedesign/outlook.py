@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.predict import Drawn, Prediction, plate_rows, predict
+from doedesign.predict import Drawn, Prediction, plate_rows, predict, process_with_moves
 from doedesign.report.pictures import draw_psfs
 from doedesign.tolerance.analysis import table_of
 from doedesign.tolerance.draws import EXPECTED, one_at_a_time_keys, variation_at
@@ -35,7 +35,7 @@ from sim.material import full_wave_wavelength_m, refractive_index
 from sim.psf import surface_bank
 from sim.surface import Surface, as_fabricated
 
-__all__ = ["Foretold", "foretold", "grating_orders", "matters_of", "process_with_moves", "seen_of"]
+__all__ = ["Foretold", "foretold", "grating_orders", "matters_of", "seen_of"]
 
 # A laser of the kind that most optics labs have, and that of the published prototype.
 PROBE_M = 520e-9
@@ -51,21 +51,6 @@ _MEASURED = {
     "lag": "etch lag (depth of the small pads)",
     "roughness": "roughness of the floors",
 }
-
-
-def process_with_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
-    """Return the process as the design sees it through masks whose edges were moved.
-
-    Args:
-        process: what the lab does.
-        edge_moves_m: how far every edge of each mask was moved outward, mask 0 first; empty for none.
-    """
-    if not any(edge_moves_m):
-        return process
-    names = [f"cd_bias_m[{mask}]" for mask in range(process.masks)]
-    old = [process.spreads.get(name, Spread()) for name in names]
-    moved = {name: Spread(one.mean + move, one.sigma) for name, one, move in zip(names, old, edge_moves_m, strict=True)}
-    return replace(process, spreads={**process.spreads, **moved})
 
 
 def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[Seen, ...]:

@@ -3,7 +3,8 @@
 `predict` is one draw of every tolerance study, the model of every calibration, and `doedesign psf --fabricated`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +17,10 @@ from doedesign.drawing import drawn_in_masks, levels_of_run
 from doedesign.runs import Run
 from fab.files import MANIFEST_NAME, sha256_bytes
 from fab.levels import Levels
+from fab.manifest import read_manifest
 from fab.masks import unetched_outside
-from fab.process import Process, Variation
+from fab.process import Process, Spread, Variation
+from fab.units import NM
 from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.metrics import energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m
@@ -36,6 +39,8 @@ class Drawn:
         camera: optics.
         near_m: depths of obstructions.
         far_m: depths of the scene.
+        edge_moves_m: how far the masks draw the edges of etched areas outward to make up for the process, mask 0 first;
+            empty for nowhere. A variation is relative to the design, so these are in it (`process_with_moves`).
     """
 
     name: str
@@ -44,6 +49,7 @@ class Drawn:
     camera: Camera
     near_m: tuple[float, ...]
     far_m: tuple[float, ...]
+    edge_moves_m: tuple[float, ...] = ()
 
     @property
     def depths_m(self) -> tuple[float, ...]:
@@ -67,12 +73,30 @@ def drawn_of(run: Run, masks: Path | None = None) -> Drawn:
     """
     drawing = levels_of_run(run)
     folder = masks or Path("masks") / run.spec.name
+    moves_m: tuple[float, ...] = ()
     if masks is not None or (folder / MANIFEST_NAME).is_file():
         level = drawn_in_masks(folder, drawing)
+        moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     else:
         level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    scene = run.spec.scene
-    return Drawn(run.spec.name, level, drawing.levels, camera_of(run.spec), scene.near_m, scene.far_m)
+    scene, camera = run.spec.scene, camera_of(run.spec)
+    moves_m = moves_m if any(moves_m) else ()
+    return Drawn(run.spec.name, level, drawing.levels, camera, scene.near_m, scene.far_m, moves_m)
+
+
+def process_with_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
+    """Return the process as the design sees it through masks whose edges were moved.
+
+    Args:
+        process: what the lab does.
+        edge_moves_m: how far every edge of each mask was moved outward, mask 0 first; empty for none.
+    """
+    if not any(edge_moves_m):
+        return process
+    names = [f"cd_bias_m[{mask}]" for mask in range(process.masks)]
+    old = [process.spreads.get(name, Spread()) for name in names]
+    moved = {name: Spread(one.mean + move, one.sigma) for name, one, move in zip(names, old, edge_moves_m, strict=True)}
+    return replace(process, spreads={**process.spreads, **moved})
 
 
 class Prediction(NamedTuple):

@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from doedesign.calibrate import Calibration, Explanation, Family, Measurement, T
 from doedesign.calibrate import calibrate as fitted
 from doedesign.calibrate.unknowns import unknowns_of
 from doedesign.commands.psf import require_own
-from doedesign.predict import drawn_of
+from doedesign.predict import drawn_of, process_with_moves
 from doedesign.progress import meter
 from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
@@ -66,7 +67,7 @@ def calibrate(
     require_own(folder)
     drawn = drawn_of(run, masks)
     spec = _process_spec(run, process)
-    believed = process_for(drawn.levels, run.spec.process, process)
+    believed = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
     unknowns = unknowns_of(believed, errors, drawn.camera.grid.pitch_m)  # mistakes are told before files are read
     measured = load_shots(measurement, drawn.camera, lambda name: say(f"reading {name}"))
     for name, pixels in measured.full.items():
@@ -77,6 +78,9 @@ def calibrate(
         with _models("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
             settings = {"evaluations": evaluations, "polish": polish, "seed": seed, "on_model": on_model}
             result = fitted(drawn, believed, measured, errors, **settings)
+            # What was found is relative to the design; what the process does, to the masks.
+            back = [-move for move in drawn.edge_moves_m]
+            result = replace(result, process=process_with_moves(result.process, back))
         _write(fresh, run, spec, measured, result)
     say(summary(result))
     return folder, result
@@ -117,7 +121,7 @@ def explain(
     folder = out or run.path("explanations")
     require_own(folder)
     drawn = drawn_of(run, masks)
-    believed = process_for(drawn.levels, run.spec.process, process)
+    believed = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
     with _written(run, folder) as fresh:
         # About ten plates for every error and six for a pair.
         with _models("explanations", 200) as on_model:

@@ -7,7 +7,7 @@ import numpy as np
 
 from doedesign.build import process_for
 from doedesign.commands.psf import Say, require_own
-from doedesign.predict import Drawn, drawn_of, plate_rows
+from doedesign.predict import Drawn, drawn_of, plate_rows, process_with_moves
 from doedesign.progress import meter
 from doedesign.report.pictures import draw_psfs, draw_split
 from doedesign.runs import alone_in, open_run
@@ -55,7 +55,7 @@ def fabricated(
     """
     run = open_run(run_folder)
     drawn = drawn_of(run, masks)
-    made_by = process_for(drawn.levels, run.spec.process, process)
+    made_by = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
     plate, source = _plate(drawn, made_by, variation, seed, draw)
     say(f"plate: {source}")
     folder = run.path("fabricated")

@@ -298,6 +298,10 @@ def study(
     made = _process(process, spec, drawn)
     if errors:
         made = with_errors(made, errors)
+    if drawn.edge_moves_m:
+        from doedesign.predict import process_with_moves
+
+        made = process_with_moves(made, drawn.edge_moves_m)
     if not sources_of(made):
         raise InputError(
             "process.errors",
