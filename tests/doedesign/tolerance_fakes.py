@@ -40,6 +40,7 @@ class FakeDrawn:
     camera: FakeCamera = FakeCamera()
     near_m: tuple[float, ...] = (0.05,)
     far_m: tuple[float, ...] = (np.inf,)
+    edge_moves_m: tuple[float, ...] = ()
 
 
 def drawn(name: object = "fake") -> FakeDrawn:
