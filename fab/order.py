@@ -17,9 +17,10 @@ import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +118,7 @@ class Order:
         process, wafer = self.process, self.wafer
         return plates_of(self.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
 
+    @cached_property
     def rules(self) -> RulesReport:
         """Check every etch mask against what the process prints."""
         return check(self.level_map, self.levels, self.grid, self.aperture_m, Rules.of(self.process))
@@ -167,6 +169,16 @@ def order_id(name: str, digest: str) -> str:
     if not plain:
         raise InputError("mask order name", "must hold a letter A-Z or a digit", repr(name), "Choose another name.")
     return plain if len(plain) <= _LONGEST_ID else f"{plain[:8].rstrip('_')}_{digest[:4].upper()}"
+
+
+class Content(NamedTuple):
+    """What the manifest says of a file besides its bytes; of a mask file also top cell, DOE layers and other cells."""
+
+    file: str
+    format: str
+    cell: str | None = None
+    layers: Sequence[Layer] = ()
+    cells: Sequence[CellEntry] = ()
 
 
 def _merged(parts: list[Shapes]) -> Shapes:
@@ -296,6 +308,43 @@ def _around(layout: Layout) -> list[CellEntry]:
     return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[1:]]
 
 
+def _write_masks(
+    folder: Path,
+    order: Order,
+    layout: Layout,
+    doe_layers: list[Layer],
+    gds: str,
+    oasis: str,
+    say: Callable[[str], None],
+) -> list[Content]:
+    """Write the review files and one file per mask."""
+    say("writing GDSII")
+    write_gds(folder / gds, layout)
+    contents = [Content(gds, "GDSII", layout.top.name, doe_layers, _around(layout))]
+    for plate in order.plates:
+        name, layer = order.plate_stem(plate), Layer(plate.layer)
+        one = mask_file(layout, layer, name)
+        write_gds(folder / f"{name}.gds", one)
+        on = [layer] if layer in doe_layers else []
+        contents.append(Content(f"{name}.gds", "GDSII", name, on, _around(one)))
+    say("writing OASIS")
+    write_oasis(folder / oasis, folder / gds, layout.layers)
+    return [*contents, Content(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
+
+
+def _file_entry(folder: Path, content: Content) -> FileEntry:
+    path = folder / content.file
+    return FileEntry(
+        file=content.file,
+        format=content.format,
+        bytes=path.stat().st_size,
+        sha256=sha256_file(path),
+        cell=content.cell,
+        layers=[str(layer) for layer in content.layers],
+        cells=list(content.cells),
+    )
+
+
 def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
     """Write everything but the manifest, and return it."""
     say("drawing the masks")
@@ -312,20 +361,9 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     gds, oasis, levels_file, preview = (
         f"{order.stem}_{end}" for end in ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
     )
-    say("writing GDSII")
-    write_gds(folder / gds, layout)
-    files = [(gds, "GDSII", layout, doe_layers)]
-    for plate in order.plates:
-        name, layer = order.plate_stem(plate), Layer(plate.layer)
-        one = mask_file(layout, layer, name)
-        write_gds(folder / f"{name}.gds", one)
-        files.append((f"{name}.gds", "GDSII", one, [layer] if layer in doe_layers else []))
-    say("writing OASIS")
-    write_oasis(folder / oasis, folder / gds, layout.layers)
-    files.append((oasis, "OASIS", layout, doe_layers))
+    contents = _write_masks(folder, order, layout, doe_layers, gds, oasis, say)
     dbu_m = layout.dbu_m
-    contents = [(name, kind, one.top.name, on, _around(one)) for name, kind, one, on in files]
-    del layout, files
+    del layout
     say("drawing the preview")
     _write_map(folder / levels_file, order.level_map)
     digest = map_digest(order.level_map)
@@ -340,9 +378,8 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
         order.level_map, order.levels, order.grid, order.aperture_m, order.chrome, frame.die_m, order.wafer.thickness_m
     )
     models = write_models(folder, order.stem, shown)
-    contents += [(model.file, Path(model.file).suffix[1:].upper(), None, [], []) for model in models]
-    contents += [(name, Path(name).suffix[1:].upper(), None, [], []) for name in add(folder, order, frame)]
-    contents += [(levels_file, "NPY", None, [], []), (preview, "PNG", None, [], [])]
+    others = [*(model.file for model in models), *add(folder, order, frame), levels_file, preview]
+    contents += [Content(name, Path(name).suffix[1:].upper()) for name in others]
     return Manifest(
         format=FORMAT,
         name=order.name,
@@ -363,22 +400,11 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
         doe_cell=doe_cell,
         plates=[_plate_entry(order, plate) for plate in order.plates],
         wafer=_wafer_entry(order, frame),
-        rules=order.rules().as_record(),
+        rules=order.rules.as_record(),
         masks=masks,
         chrome=chrome,
         models=models,
-        files=[
-            FileEntry(
-                file=name,
-                format=kind,
-                bytes=(folder / name).stat().st_size,
-                sha256=sha256_file(folder / name),
-                cell=top,
-                layers=[str(layer) for layer in on],
-                cells=around,
-            )
-            for name, kind, top, on, around in contents
-        ],
+        files=[_file_entry(folder, content) for content in contents],
         tools={"python": platform.python_version(), **{tool: version(tool) for tool in _TOOLS}},
     )
 

@@ -15,7 +15,7 @@ from doedesign.calibrate import Calibration, Explanation, Family, Measurement, T
 from doedesign.calibrate import calibrate as fitted
 from doedesign.calibrate.unknowns import unknowns_of
 from doedesign.commands.psf import require_own
-from doedesign.predict import drawn_of, process_with_moves
+from doedesign.predict import Drawn, drawn_of, process_with_moves
 from doedesign.progress import meter
 from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
@@ -23,6 +23,7 @@ from doedesign.report.tolerance import error_label
 from doedesign.runs import Run, alone_in, open_run
 from doedesign.spec import ProcessSpec, load_process, process_to_toml, variation_to_toml
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
+from fab.process import Process
 
 Say = Callable[[str], None]
 
@@ -62,12 +63,8 @@ def calibrate(
     Raises:
         InputError: something that cannot be used.
     """
-    run = open_run(run_folder)
-    folder = out or run.path("calibration")
-    require_own(folder)
-    drawn = drawn_of(run, masks)
+    run, folder, drawn, believed = _begun(run_folder, out, "calibration", masks, process)
     spec = _process_spec(run, process)
-    believed = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
     unknowns = unknowns_of(believed, errors, drawn.camera.grid.pitch_m)  # mistakes are told before files are read
     measured = load_shots(measurement, drawn.camera, lambda name: say(f"reading {name}"))
     for name, pixels in measured.full.items():
@@ -117,11 +114,7 @@ def explain(
     Raises:
         InputError: something that cannot be used.
     """
-    run = open_run(run_folder)
-    folder = out or run.path("explanations")
-    require_own(folder)
-    drawn = drawn_of(run, masks)
-    believed = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
+    run, folder, drawn, believed = _begun(run_folder, out, "explanations", masks, process)
     with _written(run, folder) as fresh:
         # About ten plates for every error and six for a pair.
         with _models("explanations", 200) as on_model:
@@ -132,6 +125,18 @@ def explain(
         draw_family(fresh / "explanations.png", family)
     say(text)
     return folder, family
+
+
+def _begun(
+    run_folder: Path, out: Path | None, name: str, masks: Path | None, process: Path | None
+) -> tuple[Run, Path, Drawn, Process]:
+    """A run, the folder for what is found, what its masks draw, and the process as the design sees it through them."""
+    run = open_run(run_folder)
+    folder = out or run.path(name)
+    require_own(folder)
+    drawn = drawn_of(run, masks)
+    made = process_for(drawn.levels, run.spec.process, process)
+    return run, folder, drawn, process_with_moves(made, drawn.edge_moves_m)
 
 
 def _process_spec(run: Run, process: Path | None) -> ProcessSpec:

@@ -91,7 +91,7 @@ def write_masks(
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
         say("writing the run sheet")
         sheets = write_run_sheet(fresh, *_run_sheet(spec, fresh, order, frame, probe_m, say))
-        found = order.rules()
+        found = order.rules
         if found.clean:
             return [plate, marks, *sheets]
         title = f"{order.stem}: where the masks break the rules of {process.name}"

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import doedesign.commands.optimize
 from doedesign.asbuilt import compared, gratings_compared, plate_of
-from doedesign.cli import main
 from doedesign.commands.asbuilt import as_built
 from doedesign.outlook import seen_of
 from doedesign.predict import Drawn, drawn_of, predict
@@ -19,13 +17,13 @@ from doedesign.runs import open_run
 from doedesign.spec import load_variation
 from fab.asbuilt import AsBuilt, ChromeMeasured, MaskMeasured
 from fab.errors import InputError
-from fab.files import write_atomic
 from fab.levels import Levels
 from fab.process import Process, Spread, Variation
 from fab.runsheet import record
 from fab.structures import PAD_SIDES_UM
 from fab.units import NM, UM
 from sim.store import read_bank
+from tests.doedesign.small_runs import finished_run
 from tests.fab.sheets import outlook, sheet, spreads_of
 
 LEVELS = Levels(4, 300 * NM)
@@ -120,13 +118,7 @@ def numbers_of(plate: Variation, levels: Levels) -> dict[str, Any]:
 def run(tmp_path_factory) -> Path:
     """A finished run of 64 x 64 cells; pictures, which take most of the time, are left out."""
     folder = tmp_path_factory.mktemp("asbuilt")
-    (folder / "small.toml").write_text(SPEC)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in dir(doedesign.commands.optimize):
-            if name.startswith("draw_"):
-                patch.setattr(doedesign.commands.optimize, name, lambda path, *_, **__: write_atomic(path, b"picture"))
-        assert main(["optimize", str(folder / "small.toml"), "--out", str(folder / "run")]) == 0
-    return folder / "run"
+    return finished_run(folder, SPEC)
 
 
 @pytest.fixture(scope="module")

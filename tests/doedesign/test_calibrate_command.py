@@ -1,22 +1,18 @@
 """`doedesign calibrate` from the command line to its files, on a plate of 64 x 64 cells with four levels."""
 
-import contextlib
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import doedesign.commands.calibrate
-import doedesign.commands.optimize
 from doedesign.build import process_of
-from doedesign.cli import main
 from doedesign.predict import drawn_of
 from doedesign.runs import open_run
 from doedesign.spec import load_process, load_variation
-from fab.files import sha256_file, write_atomic
+from fab.files import sha256_file
 from tests.doedesign.calibration_fakes import light_of, photograph, usual_process
+from tests.doedesign.small_runs import call, finished_run
 
 SPEC = """
 name = "small"
@@ -63,23 +59,10 @@ HIDDEN = {"common_depth_scale": 0.02, "overlay_y_m[1]": 0.4e-6, "overlay_x_m[1]"
 LIMITS = {"common_depth_scale": 0.005, "overlay_y_m": 0.1e-6, "overlay_x_m": 0.1e-6, "common_cd_bias_m": 0.05e-6}
 
 
-def call(*arguments: object) -> tuple[int, str, str]:
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([str(argument) for argument in arguments])
-    return code, out.getvalue(), err.getvalue()
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small")
-    (folder / "small.toml").write_text(SPEC)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in dir(doedesign.commands.optimize):
-            if name.startswith("draw_"):  # looked at elsewhere
-                patch.setattr(doedesign.commands.optimize, name, lambda path, *_: write_atomic(path, b"picture"))
-        code, _, said = call("optimize", folder / "small.toml", "--out", folder / "run")
-    assert code == 0, said
+    finished_run(folder, SPEC)
     drawn = drawn_of(open_run(folder / "run"))
     depths = (3e-3, np.inf)
     photograph(folder, light_of(drawn, usual_process(drawn), HIDDEN, depths), depths, electrons=1e7)

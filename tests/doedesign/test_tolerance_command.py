@@ -1,8 +1,6 @@
 """`doedesign tolerance` from the command line to its files, with the real prediction on a plate of 48 x 48 cells."""
 
-import contextlib
 import csv
-import io
 import json
 import math
 from collections.abc import Callable
@@ -13,10 +11,10 @@ import pytest
 
 import doedesign.commands.optimize
 import doedesign.commands.tolerance
-from doedesign.cli import main
 from doedesign.spec import load_variation
 from doedesign.tolerance import study
 from fab.files import sha256_file, write_atomic
+from tests.doedesign.small_runs import call, finished_run
 
 SPEC = """
 name = "small"
@@ -62,24 +60,10 @@ min = 0.9
 """
 
 
-def call(*arguments: object) -> tuple[int, str, str]:
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main([str(argument) for argument in arguments])
-    return code, out.getvalue(), err.getvalue()
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small")
-    (folder / "small.toml").write_text(SPEC)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in dir(doedesign.commands.optimize):
-            if name.startswith("draw_"):  # looked at elsewhere
-                patch.setattr(doedesign.commands.optimize, name, lambda path, *_: write_atomic(path, b"picture"))
-        code, _, said = call("optimize", folder / "small.toml", "--out", folder / "run")
-    assert code == 0, said
-    return folder / "run"
+    return finished_run(folder, SPEC)
 
 
 ASKED = ("--draws", 4, "--budget", "overlay", "--yield", 0.6, "--workers", 1)
