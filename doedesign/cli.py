@@ -137,7 +137,7 @@ def masks(
         aperture_m=_length("--aperture", aperture),
     )
     probe_m = PROBE_M if probe is None else _length("--probe", probe) or PROBE_M
-    folder, report = write_masks(source, drawing, out, on_violation, probe_m, _say)
+    folder, report = write_masks(source, drawing, out, on_violation=on_violation, probe_m=probe_m, say=_say)
     _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
     _print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
 

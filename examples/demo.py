@@ -51,7 +51,7 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
         report = verify(order)
         report.require()
     else:
-        order, report = write_masks(run.folder, level_map_from(run.folder, run.spec.process.levels), order, say)
+        order, report = write_masks(run.folder, level_map_from(run.folder, run.spec.process.levels), order, say=say)
 
     light = run.path("psf")
     say(f"3/3 PSFs of the continuous, the quantised and the drawn design into {light}")

@@ -40,6 +40,7 @@ def write_masks(
     source: Path,
     drawing: LevelMap,
     out: Path | None,
+    *,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
     probe_m: float = PROBE_M,
     say: Say = lambda _: None,
