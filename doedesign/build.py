@@ -4,12 +4,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from doedesign.spec import DefectsSpec, ProcessSpec, Spec, load_process, process_from_json
+from doedesign.spec import DefectsSpec, ProcessSpec, Spec, WaferSpec, load_process, process_from_json
 from fab.errors import InputError
+from fab.files import MANIFEST_NAME
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import ERRORS, Defects, Process, Spread, error_names
-from fab.units import format_length
 from fab.wafer import Wafer
 from sim.camera import Camera, Colour
 
@@ -34,25 +34,44 @@ def camera_of(spec: Spec) -> Camera:
     )
 
 
-def levels_of(spec: Spec) -> Levels:
-    """The staircase of heights the process can make."""
-    return Levels(spec.process.levels, spec.process.level_step_m)
+def levels_of(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
+    """The staircase of heights that a process makes.
+
+    Args:
+        spec: the process of a spec, or of a file of its own.
+        chosen: what to take where the depths of the etches are to be chosen by `doedesign optimize`.
+
+    Raises:
+        InputError: the depths are still to be chosen.
+    """
+    depths_m = spec.etch_depths_m
+    if isinstance(depths_m, str):
+        if chosen is None:
+            rule = "the depths must be known here"
+            cure = f"Give them as numbers; those that a run chose are in its {MANIFEST_NAME}."
+            raise InputError("process.etch_depths", rule, f'"{depths_m}"', cure)
+        return chosen
+    return Levels(spec.levels, spec.level_step_m, depths_m or ())
 
 
-def process_of(spec: ProcessSpec) -> Process:
+def process_of(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
     """What the fab lab does, with what the spec leaves out taken from its stock process.
 
     Args:
         spec: the process of a spec, or of a file of its own.
+        chosen: the staircase where the spec leaves its choice to the optimisation (`levels_of`).
 
     Returns:
         The process; errors whose mean and standard deviation are zero are left out of its spreads.
+
+    Raises:
+        InputError: the depths are still to be chosen.
     """
     full = spec.filled()
     spreads = dict(_spreads(full))
     defects = full.defects.in_si()
     return Process(
-        levels=Levels(spec.levels, spec.level_step_m),
+        levels=levels_of(spec, chosen),
         order=tuple(etch.mask for etch in full.etches),
         spreads=spreads,
         defects=Defects(**defects),
@@ -61,13 +80,13 @@ def process_of(spec: ProcessSpec) -> Process:
     )
 
 
-def wafer_of(spec: Spec) -> Wafer:
+def wafer_of(spec: WaferSpec) -> Wafer:
     """What the masks of an order are filled with.
 
     Raises:
         InputError: numbers that do not go together.
     """
-    return Wafer(**spec.wafer.model_dump())
+    return Wafer(**spec.model_dump())
 
 
 def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> Process:
@@ -76,7 +95,8 @@ def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> 
     Raises:
         InputError: the file cannot be read, or is for another staircase.
     """
-    return matching(levels, process_of(spec if file is None else load_process(file)), str(file or "process"))
+    made = process_of(spec if file is None else load_process(file), levels)
+    return matching(levels, made, str(file or "process"))
 
 
 def matching(levels: Levels, process: Process, where: str) -> Process:
@@ -85,11 +105,8 @@ def matching(levels: Levels, process: Process, where: str) -> Process:
     Raises:
         InputError: it makes another one.
     """
-    made = process.levels
-    if (made.count, made.step_m) != (levels.count, levels.step_m):
-        rule = f"must be for {levels.count} levels of {format_length(levels.step_m)}"
-        got = f"{made.count} of {format_length(made.step_m)}"
-        raise InputError(where, rule, got, "Give a process for this design.")
+    if process.levels != levels:
+        raise InputError(where, f"must be for {levels.told}", process.levels.told, "Give a process for this design.")
     return process
 
 
@@ -119,10 +136,11 @@ def process_spec_of(process: Process, like: ProcessSpec) -> ProcessSpec:
                 "mean": _one_or_each([float(spread.mean) for spread in spreads]),
                 "sigma": _one_or_each([float(spread.sigma) for spread in spreads]),
             }
-    in_order = process.order == tuple(range(process.masks))
+    in_order = process.order == Process(process.levels).order
     data: dict[str, Any] = {
         "levels": process.levels.count,
         "level_step_m": process.levels.step_m,
+        **({} if process.levels.is_binary else {"etch_depths_m": process.levels.depths_m}),
         "chrome_overlap_m": like.chrome_overlap_m,
         "etches": [] if in_order else [{"mask": k, "depth_m": process.depths_m()[k]} for k in process.order],
         "errors": errors,

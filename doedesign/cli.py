@@ -63,6 +63,22 @@ def _length(option: str, text: str | None) -> float | None:
         raise InputError(option, "must be a length with a unit", f'"{text}"', 'For example "75 nm".') from error
 
 
+def _patch(step: str | None, mesh: str | None) -> Any:
+    """The patch of --patch or --mesh-patch, or None."""
+    if step is not None and mesh is not None:
+        raise InputError("--mesh-patch", "does not go with --patch", mesh, "Leave one out; --patch writes both kinds.")
+    option, text = ("--mesh-patch", mesh) if step is None else ("--patch", step)
+    if text is None:
+        return None
+    from fab.patch import Patch
+
+    lengths = [_length(option, part.strip()) or 0.0 for part in text.split(",")]
+    if len(lengths) != 3:
+        cure = f'Write x and y of its middle and its edge: {option} "0 um, 100 um, 50 um".'
+        raise InputError(option, "must be three lengths", f'"{text}"', cure)
+    return Patch(*lengths, step=step is not None)
+
+
 @app.command
 def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_: AsJson = False) -> None:
     """Optimise a spec into a run folder, or resume it where it was stopped.
@@ -87,14 +103,18 @@ def masks(
     levels: int | None = None,
     out: Path | None = None,
     step: str | None = None,
+    etch_depths: str | None = None,
     pitch_um: float | None = None,
     scale: str | None = None,
     aperture: str | None = None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
     probe: str | None = None,
+    patch: str | None = None,
+    mesh_patch: str | None = None,
     as_built: Path | None = None,
     order: Path | None = None,
     process: Path | None = None,
+    wafer: Path | None = None,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -106,24 +126,29 @@ def masks(
         levels: Number of heights; the run's own by default.
         out: Order folder; masks/NAME by default.
         step: Height of one level, such as "75 nm"; for a bare height map.
+        etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.
         pitch_um: Pixel pitch of a bare height map in micrometres.
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
         on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
         probe: Wavelength of the laser that the lab tests the plate with; 520 nm by default.
+        patch: Also write a window of the relief, "X, Y, EDGE" about its middle, as STEP (at most 2000 boxes) and mesh.
+        mesh_patch: Also write a window of the relief as a mesh alone, up to 1000 x 1000 pixels.
         as_built: JSON of the run sheet with measured numbers filled in.
         order: With --as-built, the order that was made; masks/NAME by default.
-        process: With --as-built, a TOML file with the [process] table for what was not measured.
+        process: A TOML file with another [process] table; with --as-built, for what was not measured.
+        wafer: A TOML file with another [wafer] table.
     """
     if as_built is not None:
+        if wafer is not None:
+            raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
         from doedesign.commands.asbuilt import as_built as work
 
         folder = work(source, as_built, order, process=process, say=_say)
         _print_paths([folder, *sorted(folder.iterdir())], json_)
         return
-    for option, value in (("--order", order), ("--process", process)):
-        if value is not None:
-            raise InputError(option, "goes with --as-built only", value, "Leave it out.")
+    if order is not None:
+        raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
     from doedesign.commands.masks import write_masks
     from doedesign.drawing import level_map_from
     from doedesign.outlook import PROBE_M
@@ -132,12 +157,24 @@ def masks(
         source,
         levels,
         step_m=_length("--step", step),
+        depths_m=[_length("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
         pitch_m=None if pitch_um is None else pitch_um * 1e-6,
         scale_m=_length("--scale", scale),
         aperture_m=_length("--aperture", aperture),
     )
     probe_m = PROBE_M if probe is None else _length("--probe", probe) or PROBE_M
-    folder, report = write_masks(source, drawing, out, on_violation=on_violation, probe_m=probe_m, say=_say)
+    window = _patch(patch, mesh_patch)
+    folder, report = write_masks(
+        source,
+        drawing,
+        out,
+        on_violation=on_violation,
+        probe_m=probe_m,
+        patch=window,
+        process_file=process,
+        wafer_file=wafer,
+        say=_say,
+    )
     _say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
     _print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
 
@@ -263,6 +300,61 @@ def tolerance(
     plan = Plan(draws, sensitivity, sobol, corners, budget, yield_)
     folder = work(run, plan, out, _say, workers=workers, **settings)
     _print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
+
+
+@app.command
+def simulate(
+    run: Path,
+    *,
+    images: Path | None = None,
+    obstruction: str | None = None,
+    occlusion: str | None = None,
+    out: Path | None = None,
+    count: int | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    process: Path | None = None,
+    variation: Path | None = None,
+    plate_seed: int | None = None,
+    draw: str = "normal/0",
+    masks: Path | None = None,
+    png: Annotated[bool, Parameter(negative="")] = False,
+    set_: Overrides = (),
+    json_: AsJson = False,
+) -> None:
+    """Photograph pictures through dirt, drops or a fence, with the plate of a run and without.
+
+    Writes clean scenes, conventional and DOE captures, masks, alpha, depth, and a contact sheet.
+
+    Args:
+        run: Run folder.
+        images: Folder of pictures; sample pictures of scikit-image by default.
+        obstruction: Kind, such as dirt, raindrop or fence, or a folder of masks; the spec's by default.
+        occlusion: radiometric, paper or paper_release; the spec's by default, and there is no other default.
+        out: Folder; RUN/simulated by default. The same command resumes a stopped simulation.
+        count: Number of items; one per picture and at most six by default.
+        seed: Seed of everything.
+        size: Binned pixels per side of a frame; 512 by default, or what the sensor has.
+        fabricated: Look through a plate with errors: those of --variation, of --plate-seed, or the process's means.
+        process: With --fabricated, a TOML file with a [process] table; the run's own by default.
+        variation: With --fabricated, a TOML file with the errors of the plate.
+        plate_seed: With --fabricated, draw the errors of the plate from the process.
+        draw: With --plate-seed, which draw, as in a tolerance study.
+        masks: The run's mask order; masks/NAME by default.
+        png: Write 16-bit PNG instead of EXR.
+    """
+    if not fabricated and (process is not None or variation is not None or plate_seed is not None):
+        rule = "must be given with --process, --variation or --plate-seed"
+        raise InputError("--fabricated", rule, "not there", "Add it.")
+    from doedesign.commands.simulate import Fabrication, Request
+    from doedesign.commands.simulate import simulate as work
+
+    request = Request(images, obstruction, occlusion, count, seed, size, set_, png)
+    plate = Fabrication(process, variation, plate_seed, draw) if fabricated else None
+    done = work(run, out, request, masks=masks, fabrication=plate, say=_say)
+    paths = [done.folder, *(done.folder / name for name in ("contact.png", "manifest.json", *done.items))]
+    _print_paths(paths, json_, items=list(done.items), skipped=done.skipped)
 
 
 @app.command

@@ -1,5 +1,6 @@
 """What is to be drawn, from wherever it comes: a run, its mask files, an EXR file, or a map the user brings."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isclose
 from pathlib import Path
@@ -7,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from doedesign.build import levels_of
 from doedesign.runs import Run, open_run
 from doedesign.spec import HEIGHT_FILES
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import HeightMap, read_height
 from fab.layout import pixel_edges
-from fab.levels import Levels, quantise
+from fab.levels import Levels, height_of, quantise, quantise_wrapped
 from fab.manifest import read_manifest
 from fab.units import format_length
 from fab.verify import read_level_map
@@ -73,18 +75,31 @@ def read_any_height(
 
 def levels_of_run(run: Run, count: int | None = None) -> LevelMap:
     """What a run draws, or its continuous design rounded to another number of levels over the same full height."""
-    drawn = Levels(run.spec.process.levels, run.spec.process.level_step_m)
+    drawn = levels_of(run.spec.process)
     aperture, name = run.spec.doe.aperture_m, run.spec.name
     if count in (None, drawn.count) and run.spec.optimize.quantisation != "none":
         file = run.path("height.exr")
         height = read_any_height(file)
-        return LevelMap(quantise(height.height_m, drawn), drawn, height.grid, aperture, name, file)
-    levels = drawn if count is None else Levels(count, drawn.count * drawn.step_m / max(count, 1))
+        level = quantise(height.height_m, drawn)
+        _require_on(level, height.height_m, drawn, file)
+        return LevelMap(level, drawn, height.grid, aperture, name, file)
+    levels = drawn if count in (None, drawn.count) else Levels(count, drawn.period_m / max(count, 1))
     file = run.path("height_continuous.exr")
     height = read_any_height(file)
     # The design repeats with the full height, so the top half step rounds to the lowest level.
-    wrapped = np.mod(np.rint(height.height_m / levels.step_m), levels.count).astype(np.uint8)
-    return LevelMap(wrapped, levels, height.grid, aperture, name, file)
+    return LevelMap(quantise_wrapped(height.height_m, levels), levels, height.grid, aperture, name, file)
+
+
+def _require_on(level: NDArray[np.uint8], height_m: NDArray[np.floating], levels: Levels, file: Path) -> None:
+    """Refuse heights that are not those of levels; equal steps, which the spec's digest vouches for, go unlooked at."""
+    if levels.is_binary:
+        return
+    off_m = float(np.abs(height_m - height_of(level, levels)).max())
+    # As much as any two levels are apart, and far above what single precision loses.
+    if off_m > 1e-3 * levels.step_m:
+        got = f"one that is {format_length(float(f'{off_m:.3g}'))} off"
+        cure = "Restore the manifest of the run, or optimise again."
+        raise InputError(str(file), f"every height must be one of the {levels.told}", got, cure)
 
 
 def level_map_from(
@@ -92,11 +107,21 @@ def level_map_from(
     count: int | None,
     *,
     step_m: float | None = None,
+    depths_m: Sequence[float] = (),
     pitch_m: float | None = None,
     scale_m: float | None = None,
     aperture_m: float | None = None,
 ) -> LevelMap:
     """The level map of a run folder or of a height map.
+
+    Args:
+        source: the run folder or height map.
+        count: number of levels.
+        step_m: height of one level; for a bare height map, like the rest.
+        depths_m: depth of every mask where it is not 2^k steps, mask 0 first.
+        pitch_m: pixel pitch.
+        scale_m: metres per count, for integers.
+        aperture_m: diameter of the relief.
 
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
@@ -104,7 +129,8 @@ def level_map_from(
     if not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
     if source.is_dir():
-        options = {"--step": step_m, "--pitch-um": pitch_m, "--scale": scale_m, "--aperture": aperture_m}
+        options = {"--step": step_m, "--etch-depths": depths_m or None, "--pitch-um": pitch_m, "--scale": scale_m}
+        options["--aperture"] = aperture_m
         for option, value in options.items():
             if value is not None:
                 cure = "Leave the option out, or give a height map."
@@ -113,7 +139,7 @@ def level_map_from(
     if count is None or step_m is None:
         missing, example = ("--levels", "--levels 16") if count is None else ("--step", '--step "75 nm"')
         raise InputError(str(source), f"a bare height map needs {missing}", "none", f"Add {example}.")
-    levels = Levels(count, step_m)
+    levels = Levels(count, step_m, tuple(depths_m))
     height = read_any_height(source, pitch_m, scale_m, aperture_m)
     try:
         level = quantise(height.height_m, levels)
@@ -138,7 +164,8 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
     levels, grid = manifest.staircase(), manifest.grid()
     alike = grid.shape == drawing.grid.shape and levels.count == drawing.levels.count
     # The manifest rounds lengths to its units' last digit.
-    lengths = (grid.pitch_m, drawing.grid.pitch_m), (levels.step_m, drawing.levels.step_m)
+    lengths = [(grid.pitch_m, drawing.grid.pitch_m), (levels.step_m, drawing.levels.step_m)]
+    lengths += zip(levels.depths_m, drawing.levels.depths_m, strict=False)
     if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
         raise InputError(
             str(folder),
@@ -152,4 +179,4 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
 
 def _told(grid: Grid, levels: Levels) -> str:
     pixels = f"{grid.shape[0]} x {grid.shape[1]} pixels of {format_length(grid.pitch_m)}"
-    return f"{pixels} in {levels.count} levels of {format_length(levels.step_m)}"
+    return f"{pixels} in {levels.told}"

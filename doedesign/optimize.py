@@ -3,9 +3,14 @@
 A step looks at every colour, one near and one far depth (shuffled rounds), and a random displacement of the image by a
 fraction of a pixel; all follow from the seed and the step number, so a run that was killed and resumed ends
 with the same bytes as one that was not.
+
+Where the depths of the etches are to be chosen, they are further parameters of the same optimisation
+(`doedesign.parametrize.Staircase.depths_m`): which level a cell takes is straight-through as ever, and how high that
+level stands has a true gradient.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,23 +21,42 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from doedesign.etches import choose_depths, heights_of, held
 from doedesign.parametrize import softness_at
 from doedesign.problem import Look, Problem, Scene, compiler_options, judge_height, losses, view_of
 from doedesign.spec import START_NAMES, Spec
 from doedesign.starts import start_heights
 from fab.errors import InputError
-from fab.levels import height_of
+from fab.levels import Levels, height_of
+from sim.aperture import circle_coverage
 from sim.hankel import radial_profile, revolve, ring_count
 
 Start = Callable[[Path], Float[np.ndarray, "y x"]]
 
 
+Free = Array | tuple[Array, Array]
+
+
 class State(NamedTuple):
-    """Everything a step changes: parameters in radians, Adam's moments, and the number of steps done."""
+    """Everything a step changes.
+
+    Attributes:
+        radians: parameters in radians.
+        adam: Adam's moments of all that is free.
+        step: number of steps done.
+        stretch: `[mask]` logarithm of every etch's depth over its first one, in units of
+            `doedesign.parametrize.PACE`; None where the depths are given.
+    """
 
     radians: Array
     adam: optax.OptState
     step: int
+    stretch: Array | None = None
+
+    @property
+    def free(self) -> Free:
+        """What Adam moves: the parameters, and the depths if they are free."""
+        return self.radians if self.stretch is None else (self.radians, self.stretch)
 
 
 class Record(NamedTuple):
@@ -49,10 +73,12 @@ class Design(NamedTuple):
     Attributes:
         drawn_m: what will be made: quantised, unless the spec says `quantisation = "none"`.
         continuous_m: the same parameters before rounding.
+        levels: the staircase that is drawn.
     """
 
     drawn_m: Float[np.ndarray, "y x"]
     continuous_m: Float[np.ndarray, "y x"]
+    levels: Levels
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
@@ -103,29 +129,42 @@ def initial_state(spec: Spec, problem: Problem, scene: Scene, files: Mapping[str
                 )
             heights = profile[: ring_count(camera)]
     radians = jnp.asarray(problem.staircase.radians_of(heights))
-    return State(radians, optimiser_of(spec).init(radians), 0)
+    stretch = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
+    free = radians if stretch is None else (radians, stretch)
+    return State(radians, optimiser_of(spec).init(free), 0, stretch)
 
 
-def _loss(radians: Array, problem: Problem, look: Look, softness: Array) -> tuple[Array, Array]:
-    return losses(problem, view_of(problem, problem.staircase.height_m(radians, softness), look))
+def learns_depths(spec: Spec) -> bool:
+    """Whether depths are parameters of the optimisation; without rounding nothing depends on them."""
+    return spec.process.chooses_depths and spec.optimize.quantisation != "none"
+
+
+def _loss(free: Free, problem: Problem, look: Look, softness: Array) -> tuple[Array, Array]:
+    staircase = problem.staircase
+    if isinstance(free, tuple):
+        radians, stretch = free
+        height = staircase.height_m(radians, softness, staircase.depths_m(stretch))
+    else:
+        height = staircase.height_m(free, softness)
+    return losses(problem, view_of(problem, height, look))
 
 
 Constants = tuple[Problem, Look, Array]
-Update = Callable[[Constants, tuple[Array, optax.OptState]], tuple[tuple[Array, optax.OptState], Array, Array]]
+Update = Callable[[Constants, tuple[Free, optax.OptState]], tuple[tuple[Free, optax.OptState], Array, Array]]
 
 
 def make_update(spec: Spec) -> Update:
-    """The compiled update (constants, (radians, adam)) -> ((radians, adam), loss, terms).
+    """The compiled update (constants, (free, adam)) -> ((free, adam), loss, terms); see `State.free`.
 
     It reuses the memory of the state it is given.
     """
     optimiser = optimiser_of(spec)
 
-    def update(constants: Constants, state: tuple[Array, optax.OptState]) -> Any:
-        radians, adam = state
-        (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(radians, *constants)
+    def update(constants: Constants, state: tuple[Free, optax.OptState]) -> Any:
+        free, adam = state
+        (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(free, *constants)
         updates, adam = optimiser.update(gradient, adam)
-        return (optax.apply_updates(radians, updates), adam), loss, terms
+        return (optax.apply_updates(free, updates), adam), loss, terms
 
     # The overloads do not list jit's own options, which are passed on.
     return eqx.filter_jit(update, donate="all-except-first", compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
@@ -149,8 +188,9 @@ def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[
     update = make_update(spec)
     for step in range(state.step, spec.optimize.steps):
         constants = constants_at(spec, problem, scene, step)
-        (radians, adam), loss, terms = update(constants, (state.radians, state.adam))
-        state = State(radians, adam, step + 1)
+        (free, adam), loss, terms = update(constants, (state.free, state.adam))
+        radians, stretch = free if isinstance(free, tuple) else (free, None)
+        state = State(radians, adam, step + 1, stretch)
         record = Record(step, float(loss), tuple(float(t) for t in terms))
         if not np.isfinite(record.loss):
             raise InputError(
@@ -165,10 +205,24 @@ def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
     continuous = np.asarray(staircase.continuous_m(state.radians))
     if problem.radial:
         continuous = revolve(continuous, grid)
+    levels = _levels_of(spec, problem, state, continuous) if spec.process.chooses_depths else staircase.levels
     if spec.optimize.quantisation == "none":
         drawn = continuous
     else:
         # By way of whole levels, so that the heights are the ones a mask file gives back, to the last bit.
-        level = np.asarray(staircase.level(jnp.asarray(continuous))).astype(np.uint8)
-        drawn = height_of(level, staircase.levels).astype(np.float32)
-    return Design(drawn, continuous)
+        level = np.asarray(replace(staircase, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
+        drawn = height_of(level, levels).astype(np.float32)
+    return Design(drawn, continuous, levels)
+
+
+def _levels_of(spec: Spec, problem: Problem, state: State, continuous_m: Float[np.ndarray, "y x"]) -> Levels:
+    """The staircase that was chosen, as a recipe holds it: the one learnt, or that which suits the heights best."""
+    start = problem.staircase.levels
+    if state.stretch is not None:
+        try:
+            return Levels(start.count, start.step_m, held(np.asarray(problem.staircase.depths_m(state.stretch))))
+        except InputError:
+            pass  # two levels met
+    camera = problem.camera
+    area = circle_coverage(camera.grid, camera.aperture_m)
+    return choose_depths(heights_of(continuous_m, area, start.period_m, camera), start)

@@ -155,7 +155,7 @@ def _measured(error: str) -> str:
 
 def _full_wave_m(levels: Levels, material: str) -> float | None:
     try:
-        return full_wave_wavelength_m(material, levels.count * levels.step_m)
+        return full_wave_wavelength_m(material, levels.period_m)
     except InputError:
         return None  # the sheet says so
 
@@ -223,7 +223,7 @@ def foretold(
         design_m=design_m,
         full_wave_m=_full_wave_m(levels, material),
         probe_m=probe_m,
-        probe_waves=levels.count * levels.step_m * waves_per_m,
+        probe_waves=levels.period_m * waves_per_m,
         gratings=tuple(
             Grating(error, *grating_orders(depths * (1 + error), material, probe_m)) for error in _DEPTH_ERRORS
         ),

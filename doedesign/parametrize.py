@@ -8,6 +8,8 @@ Quantisation in the loop. The forward value is a height the process can make, so
 "straight_through" passes the gradient as if there were no rounding (Y. Bengio et al., arXiv:1308.3432). "annealed"
 blends from the continuous to the quantised height while the cubic schedule of L. Li et al., CVPR 2022
 (quantisation-aware deep optics), runs from a tenth to nine tenths of the steps. "none" leaves heights continuous.
+
+The depths of the etches may be parameters, too. Cells then take the nearest of the levels that these depths make.
 """
 
 from typing import Literal
@@ -16,12 +18,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fab.levels import Levels
 from sim.material import full_wave_height_m
 
 Quantisation = Literal["straight_through", "annealed", "none"]
+
+# A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
+PACE = 0.1
 
 
 class Staircase(eqx.Module):
@@ -42,23 +47,57 @@ class Staircase(eqx.Module):
 
     def continuous_m(self, radians: Float[Array, "*s"]) -> Float[Array, "*s"]:
         """Wrapped height before quantisation, 0 up to L steps, metres."""
-        return jnp.mod(radians * self.metres_per_radian, self.levels.count * self.levels.step_m)
+        return jnp.mod(radians * self.metres_per_radian, self.levels.period_m)
 
     def level(self, height_m: Float[Array, "*s"]) -> Float[Array, "*s"]:
         """Nearest level of a wrapped height, 0 .. L-1 (the top half step belongs to level 0 of the next wave)."""
+        if not self.levels.is_binary:
+            return self._nearest(height_m, jnp.asarray(self.levels.depths_m, jnp.float32)).astype(jnp.float32)
         nearest = jnp.round(height_m / self.levels.step_m)
         return jnp.where(nearest >= self.levels.count, 0.0, nearest)
 
-    def height_m(self, radians: Float[Array, "*s"], softness: Float[Array, ""]) -> Float[Array, "*s"]:
+    def height_m(
+        self, radians: Float[Array, "*s"], softness: Float[Array, ""], depths_m: Float[Array, " k"] | None = None
+    ) -> Float[Array, "*s"]:
         """Height that is optimised: quantised at softness 0, continuous at 1, blended between.
 
-        The gradient is that of the continuous height at softness 0 and 1 (straight-through), and the blend's own
-        otherwise.
+        The gradient by the parameters is that of the continuous height at softness 0 and 1 (straight-through), and the
+        blend's own otherwise. The gradient by the depths is that of the levels' heights; which level is nearest counts
+        as given.
+
+        Args:
+            radians: the parameters.
+            softness: 0 to 1.
+            depths_m: depths of the etches, mask 0 first, if they are not those of the staircase.
         """
         height = self.continuous_m(radians)
-        stepped = _pass_through(height, self.level(height) * self.levels.step_m)
-        blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
-        return jnp.where(softness > 0, blended, stepped)
+        if depths_m is None and self.levels.is_binary:
+            stepped = _pass_through(height, self.level(height) * self.levels.step_m)
+            blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
+            return jnp.where(softness > 0, blended, stepped)
+        depths = jnp.asarray(self.levels.depths_m, jnp.float32) if depths_m is None else depths_m
+        level = self._nearest(height, depths)
+        stepped = sum(jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths))
+        blended = softness * height + (1.0 - softness) * stepped
+        return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
+
+    def _nearest(self, height_m: Float[Array, "*s"], depths_m: Float[Array, " k"]) -> Int[Array, "*s"]:
+        """Nearest level of a wrapped height if the etches have these depths (`fab.levels.wrapped_cells`)."""
+        count, period = self.levels.count, self.levels.period_m
+        depths = jax.lax.stop_gradient(depths_m)
+        closed = (np.arange(count)[:, None] >> np.arange(self.levels.bits)) & 1
+        places = jnp.mod(closed.astype(np.float32) @ depths, period)
+        order = jnp.argsort(places)
+        places = places[order]
+        # One comparison per level is faster than a search, and what follows fuses with it.
+        cell = sum((height_m >= edge).astype(jnp.int32) for edge in (places[1:] + places[:-1]) / 2)
+        edge = (places[-1] + places[0] + period) / 2
+        cell = jnp.where(height_m >= edge, 0, jnp.where(height_m < edge - period, count - 1, cell))
+        return order[cell]
+
+    def depths_m(self, stretch: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""
+        return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(PACE * stretch)
 
     def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Parameters that make a given height, float32."""
@@ -75,6 +114,18 @@ def _pass_through(height_m: Array, stepped_m: Array) -> Array:
 @_pass_through.defjvp
 def _pass_through_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     return primals[1], tangents[0]
+
+
+@jax.custom_jvp
+def _add_tangent(stepped_m: Array, height_m: Array) -> Array:
+    """`stepped_m`, exactly, with the gradients of both."""
+    del height_m
+    return stepped_m
+
+
+@_add_tangent.defjvp
+def _add_tangent_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    return primals[0], tangents[0] + tangents[1]
 
 
 def softness_at(quantisation: Quantisation, step: int, steps: int) -> float:

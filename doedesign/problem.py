@@ -14,6 +14,7 @@ from doedesign.build import camera_of, levels_of
 from doedesign.objectives import Term, View, terms_of
 from doedesign.parametrize import Staircase
 from doedesign.spec import Spec
+from fab.levels import Levels
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.farfield import FarField, displaced, plan_far_field
@@ -130,7 +131,9 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
     Raises:
         InputError: objectives that cannot be read, or a direct path that eq. 6 forbids.
     """
-    camera = camera_of(spec)
+    camera, process = camera_of(spec), spec.process
+    # Depths that are to be chosen begin at 2^k steps.
+    levels = levels_of(process, Levels(process.levels, process.level_step_m))
     radial = spec.optimize.parametrization == "radial"
     direct = spec.optics.propagation == "fresnel"
     sparse = spec.optimize.sampling == "sparse" and not radial and not direct
@@ -150,7 +153,7 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
             far.append(_sources(camera, spec.scene.far_m, wavelength, radial))
     problem = Problem(
         camera=camera,
-        staircase=Staircase.at(camera.material, spec.optics.design_wavelength_m, levels_of(spec)),
+        staircase=Staircase.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=terms,
         lines=tuple(lines),
         coverage=None if radial else jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)),

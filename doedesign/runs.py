@@ -1,7 +1,8 @@
 """Run folders: one design from its spec to its results, named by what made it.
 
     runs/NAME/
-        manifest.json           what this is: spec digest, inputs, version, and digests of all results when done
+        manifest.json           what this is: spec digest, inputs, version, digests of all results when done, and the
+                                depths of the etches if the run was to choose them
         spec.toml               the spec with every default and override filled in
         checkpoint.npz          parameters, Adam's moments and history; only while the run is unfinished
         height.exr              what is drawn, metres
@@ -31,12 +32,13 @@ from typing import Any
 import numpy as np
 
 from doedesign import __version__
-from doedesign.spec import Spec, load_spec, spec_digest, spec_to_toml
+from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
 
 FORMAT = "doedesign run 1"
 CHECKPOINT = "checkpoint.npz"
+_DEPTHS = "etch_depths_m"
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
@@ -46,7 +48,13 @@ _UNFINISHED = re.compile(
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder and the spec it belongs to."""
+    """A run folder and the spec it belongs to.
+
+    Attributes:
+        folder: the folder.
+        spec: what was asked for; of a finished run, with the depths of the etches that it chose.
+        done: whether the run is finished.
+    """
 
     folder: Path
     spec: Spec
@@ -165,9 +173,25 @@ def begin_run(run: Run, inputs: Mapping[str, str], overrides: Sequence[str]) -> 
     write_atomic(run.path("spec.toml"), spec_to_toml(run.spec, comments).encode())
 
 
-def finish_run(run: Run, inputs: Mapping[str, str], overrides: Sequence[str], results: Sequence[str]) -> None:
-    """Record the digests of all results and mark the run done; the checkpoint is no longer needed."""
+def finish_run(
+    run: Run,
+    inputs: Mapping[str, str],
+    overrides: Sequence[str],
+    results: Sequence[str],
+    depths_m: Sequence[float] = (),
+) -> None:
+    """Record the digests of all results and mark the run done; the checkpoint is no longer needed.
+
+    Args:
+        run: a claimed run.
+        inputs: digests of the files the spec names.
+        overrides: `--set` overrides that led to the spec.
+        results: names of all files.
+        depths_m: depths of the etches, mask 0 first, where the run was to choose them.
+    """
     manifest = _manifest(run.spec, inputs, overrides, "done")
+    if run.spec.process.chooses_depths:
+        manifest[_DEPTHS] = list(depths_m)
     manifest["results_sha256"] = {name: sha256_file(run.path(name)) for name in sorted(results)}
     write_atomic(run.path(MANIFEST_NAME), canonical_json(manifest))
     run.path(CHECKPOINT).unlink(missing_ok=True)
@@ -204,7 +228,15 @@ def open_run(folder: Path) -> Run:
                 "a changed file",
                 f"Restore it, or remove {folder} and optimise again.",
             )
-    return Run(folder, spec, done=True)
+    return Run(folder, _with_depths(spec, manifest, folder / MANIFEST_NAME), done=True)
+
+
+def _with_depths(spec: Spec, manifest: Mapping[str, Any], path: Path) -> Spec:
+    """The spec of a finished run as if the depths that it chose had been given."""
+    if not spec.process.chooses_depths:
+        return spec
+    process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.get(_DEPTHS)}
+    return spec_from_json(spec_to_json(spec) | {"process": process}, str(path))
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:

@@ -26,6 +26,7 @@ Map of the package, in the order the work flows:
 
     part      Part, Plate: things drawn about their own origin, and the plates they are drawn for
     lettering, marks, structures  polygon text, alignment marks, test structures
+    split     Split: dies that draw the DOE differently on purpose
     wafer     Wafer: the glass, its mask blanks, and how it is filled
     frame     dies, sites, test structures and labels around a DOE
 
@@ -33,10 +34,11 @@ Map of the package, in the order the work flows:
 
     stream    GDSII and OASIS files
     walker    this package's own GDSII reader
-    solid, step      STEP: glass, chrome, exact rings, patches; and its reader
+    solid, step      STEP: glass, chrome, wafers; and its reader
+    rings, patch     maps that are rings, as exact circles; a window at full resolution
     cells, mesh, meshfile  the relief as a closed mesh in 3MF, GLB and STL
     relief    height maps for other programs
-    models    the solids and height maps of an order, and their proof
+    models, modelcheck  the solids and height maps of an order, and their proof
     sheet, recipe, runsheet  what the lab does step by step, as a page and as JSON
     asbuilt   the same JSON with measured numbers filled in
     manifest  what every file of a mask order is
@@ -45,12 +47,14 @@ Map of the package, in the order the work flows:
     order     the folder that goes to the lab, with its manifest
     readback  the same files read by a library that had no part in the writing
     compare   what was read against what should be there
+    receipt   what a mask shop looks at whatever is drawn
     verify    the proof of such a folder
 
 Units and axes. Everything inside is SI and the unit stands in the name (``pitch_m``). Arrays are
 ``[y, x]``; row 0 is the lowest y and +y is up, so the row index grows with y in the drawing as well.
 Heights are measured from the deepest etched floor, so ``height_m >= 0``. Level l of L stands
-``l * step`` high; bit k of ``L - 1 - l`` set means that mask k opens there and etches ``2**k * step``.
+``l * step`` high; bit k of ``L - 1 - l`` set means that mask k opens there and etches ``2**k * step``
+(or any other depth, see ``levels``).
 A polygon in an etch layer means "etched here", a polygon in the chrome layer "chrome here".
 Mask bit k is drawn on layer k + 1. Importing this package imports nothing heavy.
 """

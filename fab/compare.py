@@ -4,7 +4,7 @@ Pure comparisons, no files. The sentences name the layer, how many pixels or sha
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from fab.compensation import read_back
 from fab.errors import InputError
-from fab.inventory import cell_entry
+from fab.inventory import cell_entry, shapes_digest
 from fab.layout import Cell, Layer, Layout, PixelEdges, Shapes
-from fab.manifest import CellEntry, ChromeEntry, FileEntry, Manifest, MaskEntry
+from fab.manifest import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
 from fab.polygons import doubled_area, paint
 from fab.readback import Reading
 from fab.units import MM, NM, UM
+
+Drawn = MaskEntry | DrawnEntry
 
 __all__ = ["Expected", "cell_problems", "layout_problems", "reading_problems"]
 
@@ -36,10 +38,16 @@ class Expected:
     planes: NDArray[np.uint8]
     edges: PixelEdges
 
-    def etch_layers(self, entry: FileEntry) -> dict[Layer, MaskEntry]:
-        """Return the etch layers that a file should hold, each with its mask."""
-        layers = {Layer(mask.layer, mask.datatype): mask for mask in self.manifest.masks}
-        return {layer: mask for layer, mask in layers.items() if str(layer) in entry.layers}
+    def etch_layers(self, entry: FileEntry) -> dict[str, dict[Layer, Drawn]]:
+        """Return for every cell of the DOE the etch layers that a file should hold, each with what it draws."""
+        return {
+            cell: {
+                Layer(one.layer, one.datatype): one
+                for one in drawn
+                if str(Layer(one.layer, one.datatype)) in entry.layers
+            }
+            for cell, drawn in self.manifest.drawn().items()
+        }
 
     def chrome_layer(self, entry: FileEntry) -> Layer | None:
         """Return the chrome layer if a file should hold it."""
@@ -61,7 +69,7 @@ def _count_problem(layer: Layer, count: int, what: str) -> list[str]:
 
 
 def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: ChromeEntry, dbu_m: float) -> list[str]:
-    """Check that polygons make the stated annulus: count, radii, chords, and area to the chords' error."""
+    """Check that polygons make the stated annulus: count, radii, chords, area, and every vertex."""
     if len(polygons) != chrome.polygons:
         return [f"layer {layer}: {len(polygons)} chrome polygons instead of {chrome.polygons}"]
     inner, outer = (mm * MM / 2 / dbu_m for mm in (chrome.opening_diameter_mm, chrome.outer_diameter_mm))
@@ -83,10 +91,13 @@ def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: 
     off = abs(area - math.pi * (outer**2 - inner**2))
     if off > 2 * math.pi * (outer + inner) * chord:
         problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
+    drawn = Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygon.astype(np.int32) for polygon in polygons))
+    if shapes_digest(drawn) != chrome.shapes_sha256:
+        problems.append(f"layer {layer}: the chrome has another vertex, or one elsewhere")
     return problems
 
 
-def _etch_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expected) -> list[str]:
+def _etch_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expected) -> list[str]:
     """Compare one etch layer, as the own reader found it, with its plane."""
     missing = abs(len(shapes) - mask.polygons)
     counted = _count_problem(layer, missing, f"polygons more or less than the {mask.polygons} of the manifest")
@@ -105,10 +116,10 @@ def _etch_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expe
     ]
 
 
-def _moved_problems(layer: Layer, shapes: Shapes, mask: MaskEntry, expected: Expected) -> list[str]:
+def _moved_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expected) -> list[str]:
     """Compare one etch layer whose edges were moved against the bias of the process: moved back, it is its plane."""
     try:
-        plane = read_back(shapes, expected.edges, expected.manifest.edge_moves()[mask.bit])
+        plane = read_back(shapes, expected.edges, round(mask.edge_move_nm / expected.manifest.dbu_nm))
     except InputError as error:
         return [f"layer {layer}: {error.rule}, but got {error.got}"]
     return _pixel_problems(layer, plane != expected.planes[mask.bit])
@@ -131,15 +142,21 @@ def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> lis
     if abs(layout.dbu_m / expected.edges.dbu_m - 1) > 1e-9:
         right = expected.edges.dbu_m
         problems.append(f"the database unit is {layout.dbu_m / NM:.9g} nm instead of {right / NM:.9g} nm")
-    doe = layout.cell(expected.manifest.doe_cell)
-    others = (cell for cell in layout.cells if cell is not doe)
-    problems += cell_problems(others, entry, expected.edges.dbu_m)
-    if doe is None:
-        return [*problems, f"cell {expected.manifest.doe_cell} is missing"]
-    if doe.references:
-        problems.append(f"cell {doe.name} places others")
     etch = expected.etch_layers(entry)
-    chrome = expected.chrome_layer(entry)
+    others = (cell for cell in layout.cells if cell.name not in etch)
+    problems += cell_problems(others, entry, expected.edges.dbu_m)
+    for name, layers in etch.items():
+        problems += _doe_problems(layout.cell(name), name, layers, expected.chrome_layer(entry), expected)
+    return problems
+
+
+def _doe_problems(
+    doe: Cell | None, name: str, etch: Mapping[Layer, Drawn], chrome: Layer | None, expected: Expected
+) -> list[str]:
+    """Compare one cell of the DOE with what it should draw."""
+    if doe is None:
+        return [f"cell {name} is missing"]
+    problems = [f"cell {name} places others"] if doe.references else []
     none = Shapes(np.empty((0, 4), dtype=np.int32))
     for layer, shapes in doe.shapes.items():
         if layer not in etch and layer != chrome:
@@ -149,8 +166,9 @@ def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> lis
     if chrome is not None:
         shapes = doe.shapes.get(chrome, none)
         problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
-        problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, layout.dbu_m)
-    return problems
+        problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, expected.edges.dbu_m)
+    # A split has the layers of the plate itself, so its problems need its name.
+    return problems if name == expected.manifest.doe_cell else [f"cell {name}: {problem}" for problem in problems]
 
 
 def cell_problems(cells: Iterable[Cell], entry: FileEntry, dbu_m: float) -> list[str]:
@@ -200,9 +218,14 @@ def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> 
     Returns:
         One sentence per difference.
     """
+    problems = _reading_problems(reading, expected.etch_layers(entry)[reading.cell].get(reading.layer), expected)
+    plate = reading.cell == expected.manifest.doe_cell
+    return problems if plate else [f"cell {reading.cell}: {problem}" for problem in problems]
+
+
+def _reading_problems(reading: Reading, mask: Drawn | None, expected: Expected) -> list[str]:
     layer, winding = reading.layer, reading.winding
     problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
-    mask = expected.etch_layers(entry).get(layer)
     if mask is not None and reading.moved is not None:
         return problems + _moved_problems(layer, reading.moved, mask, expected)
     if mask is None:

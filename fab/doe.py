@@ -25,6 +25,7 @@ def mask_layout(
     cell: str,
     chrome: Chrome | None = None,
     edge_moves: Sequence[int] = (),
+    bits: Sequence[int] = (),
 ) -> Layout:
     """Draw the planes and the chrome of one DOE as one cell, centred on the clear aperture.
 
@@ -37,6 +38,7 @@ def mask_layout(
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
         edge_moves: per mask, how far every edge of an etched area is moved outward, database units; nowhere if left
             out (`fab.compensation`).
+        bits: which plane each mask draws, its own if left out (`fab.split`).
 
     Returns:
         One layer per etch mask, mask 0 first, and the chrome last.
@@ -51,9 +53,10 @@ def mask_layout(
     edges = pixel_edges(grid)
     inside = unetched_outside(level_map, levels, grid, aperture_m)
     moves = edge_moves or (0,) * levels.bits
+    drawn = planes(inside, levels)[list(bits)] if bits else planes(inside, levels)
     # The kernel lets go of the interpreter lock, so the planes share the cores.
     with ThreadPoolExecutor() as pool:
-        found = pool.map(lambda plane, move: grown(plane, edges, move), planes(inside, levels), moves)
-        shapes = {etch_layer(bit, levels): drawn for bit, drawn in enumerate(found)}
+        found = pool.map(lambda plane, move: grown(plane, edges, move), drawn, moves)
+        shapes = {etch_layer(mask, levels): rectangles for mask, rectangles in enumerate(found)}
     shapes[chrome_layer(levels)] = chrome_shapes(grid, aperture_m, edges.dbu_m, chrome or Chrome())
     return Layout(edges.dbu_m, (Cell(require_name(cell), shapes),))

@@ -16,10 +16,11 @@ import numpy as np
 
 from fab.errors import InputError
 from fab.layout import Cell, Layer, Reference, Shapes
-from fab.lettering import label_block, mask_label
+from fab.lettering import label_block, mask_label, written
 from fab.levels import Levels
 from fab.marks import alignment_site, die_marks
 from fab.part import Part, Plate, centred, joined, moved, prefixed, row
+from fab.split import Split
 from fab.structures import process_monitor
 from fab.units import MM, UM, format_length
 from fab.wafer import READING, Wafer
@@ -34,6 +35,7 @@ OUTLINES = (BLANK, WAFER, APERTURE, DIE)
 _RIM_M = 4 * MM
 _GAP_M = 200 * UM
 _LETTERS_M = 0.5 * MM
+_TITLE_STROKE_UM = 16
 # A circle of so many corners has no more vertices than every reader knows.
 _CORNERS = 180
 
@@ -45,12 +47,14 @@ class Frame(NamedTuple):
         cells: die, sites, test structures, wafer and plate, each after those that it places.
         places: where on the wafer people measure, ``(x_m, y_m)`` by name.
         dies: middles of the dies, ``(x_m, y_m)``, row by row from the lowest y.
+        splits: how each of them is drawn, by number; 0 is the plate as ordered.
         die_m: edge of a die, metres.
     """
 
     cells: tuple[Cell, ...]
     places: Mapping[str, tuple[float, float]]
     dies: tuple[tuple[float, float], ...]
+    splits: tuple[int, ...]
     die_m: float
 
 
@@ -59,7 +63,7 @@ def draw_frame(
     plates: Sequence[Plate],
     levels: Levels,
     *,
-    doe_cell: str,
+    splits: Sequence[Split],
     stem: str,
     digest: str,
     pitch_m: float,
@@ -74,8 +78,8 @@ def draw_frame(
         wafer: what is filled.
         plates: the masks in the order in which they are used.
         levels: the staircase.
-        doe_cell: name of the DOE's cell.
-        stem: name of the job; that of the top cell.
+        splits: how the DOE is drawn, the plate as ordered first; the others take one die each, the last ones.
+        stem: name of the job; that of the top cell. The cells of the DOE are named after it and the split's code.
         digest: digest of the level map, for the labels.
         pitch_m: edge of a DOE pixel, metres.
         minimum_line_m: narrowest line that the process prints, metres.
@@ -100,20 +104,21 @@ def draw_frame(
     dies = _raster(wafer.dies, pitch)
     site_m, monitor_m = _beside(wafer, dies, pitch, site, monitor)
     unit = _Unit(dbu_m)
-    names = {part: f"{stem}_{part}" for part in ("DIE", "SITE", "TEST", "WAFER")}
-    rows, columns = wafer.dies
-    die_cell = Cell(
-        names["DIE"],
-        {DIE: unit.square(pitch), APERTURE: unit.circle(aperture_m), **marks.shapes},
-        (Reference(doe_cell),),
-    )
-    step = unit(pitch)
-    first = (unit(dies[0][0]), unit(dies[0][1]))
+    names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
+    die_cells = [
+        Cell(
+            f"{stem}_DIE" if number == 0 else f"{stem}_{split.code}_DIE",
+            {DIE: unit.square(pitch), APERTURE: unit.circle(aperture_m), **_titled(marks, split, plates[0]).shapes},
+            (Reference(f"{stem}_{split.code}"),),
+        )
+        for number, split in enumerate(splits)
+    ]
+    drawn = (*(0,) * (len(dies) - len(splits) + 1), *range(1, len(splits)))
     wafer_cell = Cell(
         names["WAFER"],
         {WAFER: unit.circle(wafer.diameter_m)},
         (
-            Reference(names["DIE"], *first, columns, rows, step * (columns > 1), step * (rows > 1)),
+            *_die_references(wafer, dies, drawn, die_cells, unit, pitch),
             Reference(names["SITE"], -unit(site_m), 0),
             Reference(names["SITE"], unit(site_m), 0),
             Reference(names["TEST"], 0, unit(monitor_m)),
@@ -127,7 +132,32 @@ def draw_frame(
     beside = prefixed(moved(marks, *middle), "middle die: ")
     places = joined([*sites, beside, moved(monitor, 0, monitor_m), labels]).places
     small = (Cell(names["SITE"], site.shapes), Cell(names["TEST"], monitor.shapes))
-    return Frame((die_cell, *small, wafer_cell, top), places, dies, pitch)
+    return Frame((*die_cells, *small, wafer_cell, top), places, dies, drawn, pitch)
+
+
+def _titled(marks: Part, split: Split, plate: Plate) -> Part:
+    """Add what is special about a die above its DOE, where the marks are below."""
+    if not split.lettering:
+        return marks
+    title = centred(written(plate, split.lettering, _TITLE_STROKE_UM, marks.dbu_m))
+    _, y0, _, y1 = marks.box
+    return joined([marks, moved(title, 0, -(y0 + y1) / 2 * marks.dbu_m)])
+
+
+def _die_references(
+    wafer: Wafer,
+    dies: Sequence[tuple[float, float]],
+    drawn: Sequence[int],
+    cells: Sequence[Cell],
+    unit: "_Unit",
+    pitch_m: float,
+) -> tuple[Reference, ...]:
+    """Place the dies: as one raster where all are alike, else one by one."""
+    if any(drawn):
+        return tuple(Reference(cells[n].name, unit(x), unit(y)) for n, (x, y) in zip(drawn, dies, strict=True))
+    (rows, columns), step = wafer.dies, unit(pitch_m)
+    first = (unit(dies[0][0]), unit(dies[0][1]))
+    return (Reference(cells[0].name, *first, columns, rows, step * (columns > 1), step * (rows > 1)),)
 
 
 class _Unit:

@@ -1,9 +1,13 @@
 """Levels: the staircase that lithography can make, and the nearest step for every height.
 
-Level l of L stands ``l * step`` above the deepest etched floor. The blank glass is the top level
-``L - 1``; a pixel of level l is etched ``(L - 1 - l) * step`` deep.
+Every level is a choice of masks: mask k opens where bit k of ``L - 1 - l`` is set and etches its depth there, so
+level l stands as high above the deepest floor as the depths of the masks that stay closed, those whose bit in l is set,
+add up to. The blank glass is the top level ``L - 1``. By default mask k etches ``2**k`` steps, and level l is l steps
+high. Any other depths will do; then the numbers of the levels are still choices of masks, but no longer an order of
+height.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,45 +17,111 @@ from fab.errors import InputError
 from fab.height import refuse_where, require_heights
 from fab.units import format_length
 
-__all__ = ["Levels", "height_of", "quantise", "require_levels"]
+__all__ = ["Levels", "height_of", "quantise", "quantise_wrapped", "require_levels", "wrapped_cells"]
 
 # Rows that are handled at once, so that a 4400 x 4400 map needs no second copy in float64.
 _ROWS = 256
+# Depths that agree so closely with 2^k steps are meant to be 2^k steps.
+_SAME = 1e-9
+# Heights of two levels must differ by this part of a step. No process tells less apart, and single precision keeps a
+# height to 1e-5 of a step, so that a stored height always says which level it is.
+_APART = 1e-3
 
 
 @dataclass(frozen=True)
 class Levels:
-    """An equal staircase of `count` heights, made by log2(count) etches.
+    """A staircase of `count` heights, made by log2(count) etches.
 
     Attributes:
         count: number of levels L, a power of two from 2 to 64.
-        step_m: height of one step, metres.
+        step_m: height of one step, metres; `count` steps are the height of one wave of the design, after which heights
+            repeat.
+        depths_m: how deep each mask etches, metres, mask 0 first; ``2**k * step_m`` where none are given.
     """
 
     count: int
     step_m: float
+    depths_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the values.
+        """Check the values, and fill in the depths.
 
         Raises:
-            InputError: a count that is not a power of two from 2 to 64, or a step that is not positive.
+            InputError: a count that is not a power of two from 2 to 64, a step that is not positive, or depths that
+                are not one per mask, not positive, or leave two levels at one height.
         """
         if self.count not in (2, 4, 8, 16, 32, 64):
             raise InputError(
                 "levels", "must be a power of two from 2 to 64", self.count, "Choose 2, 4, 8, 16, 32 or 64."
             )
-        if not 0 < self.step_m < float("inf"):
+        if not 0 < self.step_m < math.inf:
             raise InputError("level step", "must be positive and finite", self.step_m, 'Give a step such as "75 nm".')
+        binary = tuple(2**bit * self.step_m for bit in range(self.bits))
+        depths = tuple(float(depth) for depth in self.depths_m)
+        if depths and len(depths) != self.bits:
+            rule = f"{self.count} levels must have {self.bits} etches"
+            raise InputError("etch depths", rule, f"{len(depths)} depths", "Give one depth per mask, mask 0 first.")
+        for depth in depths:
+            if not 0 < depth < math.inf:
+                raise InputError("etch depths", "must be positive and finite", depth, 'Give depths such as "75 nm".')
+        even = all(math.isclose(depth, due, rel_tol=_SAME) for depth, due in zip(depths, binary, strict=False))
+        object.__setattr__(self, "depths_m", binary if even else depths)
+        if not even:
+            self._refuse_twins()
+
+    def _refuse_twins(self) -> None:
+        order, heights = self.by_height()
+        twins = np.flatnonzero(np.diff(heights) < _APART * self.step_m)
+        if twins.size:
+            # The shallowest pair is made by the fewest masks.
+            pair = slice(twins[-1], twins[-1] + 2)
+            lower, upper = (_told_masks(self.count - 1 - int(level)) for level in order[pair])
+            depth = format_length(float(f"{self.total_m - heights[pair][0]:.6g}"))
+            got = f"{depth} deep both by {lower} and by {upper}"
+            cure = "Change one of the depths; otherwise a level is made in two ways and another is missing."
+            raise InputError("etch depths", "no two levels may have the same height", got, cure)
 
     @property
     def bits(self) -> int:
         """Number of etch masks, log2 of the count."""
         return self.count.bit_length() - 1
 
+    @property
+    def is_binary(self) -> bool:
+        """Whether mask k etches ``2**k`` steps, so that level l is l steps high."""
+        return self.depths_m == tuple(2**bit * self.step_m for bit in range(self.bits))
+
+    @property
+    def period_m(self) -> float:
+        """Height of one wave of the design, metres: heights are taken modulo this."""
+        return self.count * self.step_m
+
+    @property
+    def total_m(self) -> float:
+        """Height of the blank glass above the deepest floor, metres."""
+        return (self.count - 1) * self.step_m if self.is_binary else math.fsum(self.depths_m)
+
+    @property
+    def told(self) -> str:
+        """The staircase in words: "16 levels of 75 nm", or "4 levels by etches of 80 nm and 150 nm"."""
+        if self.is_binary:
+            return f"{self.count} levels of {format_length(self.step_m)}"
+        *most, last = (format_length(depth) for depth in self.depths_m)
+        depths = f"{', '.join(most)} and {last}" if most else last
+        return f"{self.count} levels by etches of {depths}" if most else f"{self.count} levels by an etch of {depths}"
+
     def heights_m(self) -> NDArray[np.float64]:
         """Return the height of every level above the deepest floor, metres, shape ``(count,)``."""
-        return np.arange(self.count, dtype=np.float64) * np.float64(self.step_m)
+        if self.is_binary:
+            return np.arange(self.count, dtype=np.float64) * np.float64(self.step_m)
+        closed = [[d for bit, d in enumerate(self.depths_m) if level >> bit & 1] for level in range(self.count)]
+        return np.array([math.fsum(depths) for depths in closed])
+
+    def by_height(self) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Return the levels from the lowest to the highest, and their heights, metres, both of shape ``(count,)``."""
+        heights = self.heights_m()
+        order = np.argsort(heights, kind="stable").astype(np.uint8)
+        return order, heights[order]
 
     def etch_depth_m(self, bit: int) -> float:
         """Return how deep one mask etches.
@@ -60,14 +130,19 @@ class Levels:
             bit: the mask, from 0 to ``bits - 1``.
 
         Returns:
-            ``2**bit * step_m`` in metres.
+            ``depths_m[bit]``, metres.
 
         Raises:
             ValueError: there is no such mask.
         """
         if not 0 <= bit < self.bits:
             raise ValueError(f"`bit` must lie from 0 to {self.bits - 1}, but got {bit}")
-        return 2**bit * self.step_m
+        return self.depths_m[bit]
+
+
+def _told_masks(bits: int) -> str:
+    masks = [str(bit) for bit in range(bits.bit_length()) if bits >> bit & 1]
+    return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
 
 def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
@@ -108,22 +183,64 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
             (the message says how many and where the first is), or an array of another kind.
     """
     require_heights(height_m, "height map")
-    top = (levels.count - 0.5) * levels.step_m
+    top = (levels.count - 0.5) * levels.step_m if levels.is_binary else levels.total_m + 0.5 * levels.step_m
     # One part in 1e6 of a step keeps a float32 height that means exactly half a step above the top.
     refuse_where(
         height_m,
         height_m > top + 1e-6 * levels.step_m,
         "height map",
-        f"no height may lie more than half a step above the top level ({format_length(top)} for "
-        f"{levels.count} levels of {format_length(levels.step_m)})",
+        f"no height may lie more than half a step above the top level ({format_length(top)} for {levels.told})",
         "Wrap the map to one wave of height, or choose more levels or a larger step.",
     )
+    order, heights = levels.by_height()
+    halfway = (heights[1:] + heights[:-1]) / 2
     level_map = np.empty(height_m.shape, dtype=np.uint8)
     for start in range(0, height_m.shape[0], _ROWS):
         rows = height_m[start : start + _ROWS].astype(np.float64)
-        nearest = np.floor(rows / levels.step_m + 0.5)
-        level_map[start : start + _ROWS] = np.minimum(nearest, levels.count - 1)
+        if levels.is_binary:
+            nearest = np.minimum(np.floor(rows / levels.step_m + 0.5), levels.count - 1)
+        else:
+            nearest = order[np.searchsorted(halfway, rows, side="right")]
+        level_map[start : start + _ROWS] = nearest
     return level_map
+
+
+def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Divide one wave of height among the levels, each of which gets what is nearest to it, waves taken off.
+
+    Args:
+        levels: the staircase.
+
+    Returns:
+        Edges in ascending order, metres, ``(count,)``, and the level below the first edge, between any two, and above
+        the last one, ``(count + 1,)``. The first and the last are the same: the wave begins within that level's share.
+    """
+    period = np.float64(levels.period_m)
+    places = np.mod(levels.heights_m(), period)
+    order = np.argsort(places, kind="stable").astype(np.uint8)
+    places = places[order]
+    edges = np.append((places[1:] + places[:-1]) / 2, (places[-1] + places[0] + period) / 2)
+    if edges[-1] < period:
+        return edges, np.append(order, order[0])
+    return np.roll(edges, 1) - np.append(period, np.zeros(edges.size - 1)), np.append(order[-1], order)
+
+
+def quantise_wrapped(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8]:
+    """Give every pixel the nearest level if heights repeat after one wave of the design.
+
+    The top of the wave is as near to the lowest level as its foot is.
+
+    Args:
+        height_m: heights, metres, ``[y, x]``.
+        levels: the staircase.
+
+    Returns:
+        Level numbers from 0 to ``levels.count - 1``, ``[y, x]``.
+    """
+    if levels.is_binary:
+        return np.mod(np.rint(height_m / levels.step_m), levels.count).astype(np.uint8)
+    edges, cells = wrapped_cells(levels)
+    return cells[np.searchsorted(edges, np.mod(height_m, levels.period_m), side="right")]
 
 
 def height_of(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.float64]:
@@ -134,7 +251,7 @@ def height_of(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.floa
         levels: the staircase.
 
     Returns:
-        Heights ``level * step_m`` in metres, ``[y, x]``.
+        Heights ``levels.heights_m()[level]`` in metres, ``[y, x]``.
 
     Raises:
         InputError: the array is not a level map of this staircase.

@@ -4,7 +4,7 @@ Lengths stand here in the units of the order form (nm, um, mm), with the unit in
 depends on the time or the place, so the same inputs give the same manifest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -24,12 +24,14 @@ __all__ = [
     "FORMAT",
     "CellEntry",
     "ChromeEntry",
+    "DrawnEntry",
     "FileEntry",
     "LayerEntry",
     "Manifest",
     "MaskEntry",
     "ModelEntry",
     "PlateEntry",
+    "SplitEntry",
     "WaferEntry",
     "map_digest",
     "plane_digest",
@@ -41,8 +43,9 @@ FORMAT = "doedesign mask order 1"
 CONVENTIONS = {
     "etch layers": "polygon = etched here (digitised data clear)",
     "chrome layer": "polygon = chrome stays here",
-    "levels": "level l of L stands l steps high; the blank glass is level L-1",
-    "masks": "bit k of (L-1-level) set = mask k opens and etches 2^k steps; bit k is layer k+1, datatype 0",
+    "levels": "level l of L stands as high as the depths of the masks that stay closed there sum up to (l steps where "
+    "mask k etches 2^k steps); the blank glass is level L-1",
+    "masks": "bit k of (L-1-level) set = mask k opens and etches its depth_nm; bit k is layer k+1, datatype 0",
     "axes": "seen from the etched side, +x right, +y up, origin at the centre of the wafer; not mirrored",
     "datatypes": "0 the DOE, 1 alignment marks, 2 test structures, 3 lettering; one mask carries them all",
     "outlines": "layers 100 to 110 show the blank, the wafer, the clear aperture and the die; they are on no mask",
@@ -113,6 +116,29 @@ class MaskEntry:
 
 
 @dataclass(frozen=True)
+class DrawnEntry:
+    """What one layer of a split draws: a plane (`bit`) of the level map, its edges moved."""
+
+    layer: int
+    datatype: int
+    bit: int
+    edge_move_nm: float
+    polygons: int
+    area_um2: float
+    box_um: list[float] | None
+
+
+@dataclass(frozen=True)
+class SplitEntry:
+    """A die that draws the DOE differently on purpose: its cell, what is special, which die, and what it draws."""
+
+    cell: str
+    words: str
+    die: int
+    layers: list[DrawnEntry]
+
+
+@dataclass(frozen=True)
 class PlateEntry:
     """One mask as the shop makes it, in the order of use: what polygons are on the plate, and how it is read."""
 
@@ -141,18 +167,23 @@ class WaferEntry:
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """A solid or a height map: its content, its volumes by part and how exact they are, or its scale."""
+    """A solid or a height map: its content; by part its volume, how exact that is, and its centre; or its scale.
+
+    The window is row, column, rows and columns of the pixels that it shows, if not all.
+    """
 
     file: str
     content: str
     volumes_mm3: dict[str, Any]
+    centres_mm: dict[str, Any]
     relative_error: float
     metres_per_count: float | None
+    window_px: list[int] | None
 
 
 @dataclass(frozen=True)
 class ChromeEntry:
-    """The chrome aperture, a true circle drawn with the stated chord error."""
+    """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`."""
 
     layer: int
     datatype: int
@@ -166,6 +197,7 @@ class ChromeEntry:
     polygons: int
     area_um2: float
     box_um: list[float]
+    shapes_sha256: str
 
 
 @dataclass(frozen=True)
@@ -193,6 +225,7 @@ class Manifest:
     wafer: WaferEntry
     rules: dict[str, Any]
     masks: list[MaskEntry]
+    splits: list[SplitEntry]
     chrome: ChromeEntry
     models: list[ModelEntry]
     files: list[FileEntry]
@@ -202,9 +235,14 @@ class Manifest:
         """Return how far the edges of every mask were moved outward, in database units."""
         return tuple(round(mask.edge_move_nm / self.dbu_nm) for mask in self.masks)
 
+    def drawn(self) -> dict[str, Sequence[MaskEntry | DrawnEntry]]:
+        """Return every cell of the DOE with what its etch layers draw."""
+        return {self.doe_cell: self.masks, **{split.cell: split.layers for split in self.splits}}
+
     def staircase(self) -> Levels:
-        """Return the levels of the order."""
-        return Levels(self.levels, round(self.step_nm * NM, 18))
+        """Return the levels of the order, with the depth that stands at every mask."""
+        depths = [round(mask.depth_nm * NM, 18) for mask in sorted(self.masks, key=lambda mask: mask.bit)]
+        return Levels(self.levels, round(self.step_nm * NM, 18), tuple(depths))
 
     def grid(self) -> Grid:
         """Return the pixel raster of the order."""
@@ -294,8 +332,15 @@ def read_manifest(folder: str | Path) -> Manifest:
             raise InputError(
                 str(path), "every file must be listed by its plain name", repr(name), "Write the order again."
             )
-    if len(manifest.shape) != 2 or len(manifest.masks) != manifest.staircase().bits:
+    etched = sorted(mask.bit for mask in manifest.masks)
+    if len(manifest.shape) != 2 or etched != list(range(Levels(manifest.levels, 1.0).bits)):
         got = f"shape {manifest.shape} and {len(manifest.masks)} masks"
         raise InputError(str(path), "shape and masks must fit the levels", got, "Write the order again.")
+    bits = range(len(manifest.masks))
+    for cell, layers in manifest.drawn().items():
+        if [one.layer for one in layers] != [bit + 1 for bit in bits] or sorted(one.bit for one in layers) != [*bits]:
+            rule = "every cell of the DOE must draw every plane once, bit 0 of the plate on layer 1"
+            raise InputError(str(path), rule, cell, "Write the order again.")
     manifest.grid()
+    manifest.staircase()
     return manifest

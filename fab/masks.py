@@ -1,7 +1,7 @@
 """Bit planes: which pixels each etch mask opens, and the level map that they make together.
 
-Mask k opens a pixel of level l where bit k of ``L - 1 - l`` is 1 and etches ``2**k`` steps there, so the
-etches add up to ``(L - 1 - l)`` steps. Splitting and joining are exact inverses.
+Mask k opens a pixel of level l where bit k of ``L - 1 - l`` is 1. By default it etches ``2**k`` steps there, so that
+the etches add up to ``(L - 1 - l)`` steps. Splitting and joining are exact inverses, whatever the depths are.
 """
 
 import numpy as np

@@ -1,40 +1,47 @@
 """The solids and height maps of an order, for people and programs that read no masks.
 
-    DOE_<ID>_PLATE.step     one die of glass with its chrome and the clear aperture in the datum plane
+    DOE_<ID>_PLATE.step     one die of glass with its chrome and the clear aperture in the datum plane; with its rings
+                            as exact circles if the map is radial
+    DOE_<ID>_WAFER.step     the wafer with the chrome and the clear aperture of every die
     DOE_<ID>_RELIEF.3mf     the relief as a closed mesh, block-reduced where it is large; also .glb and _MM.stl
+    DOE_<ID>_PATCH.step     on request a window at full resolution, also as .3mf, .glb and _MM.stl
     DOE_<ID>_HEIGHT.tif     heights in 16 bits; also .npy, in metres
     DOE_<ID>_GREY.png       the picture for greyscale and two-photon writers
     DOE_<ID>_SAG.DAT        grid sag for ray tracers: the middle of the relief
 
-What each of them must measure is in the manifest, and `model_problems` reads every file back and compares.
+What each of them must measure is in the manifest, and `fab.modelcheck` reads every file back and compares.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.cells import Window, reduced_cells
-from fab.errors import CheckFailed, InputError
+from fab.cells import Cells, Window, reduced_cells
 from fab.grid import Grid
 from fab.layout import Chrome
-from fab.levels import Levels, height_of
-from fab.manifest import Manifest, ModelEntry
+from fab.levels import Levels
+from fab.manifest import ModelEntry
 from fab.mesh import closed_volume_m3, relief_mesh
-from fab.meshfile import read_mesh, write_3mf, write_glb, write_stl
+from fab.meshfile import write_3mf, write_glb, write_stl
+from fab.patch import Patch, patch_body, patch_step
 from fab.relief import write_greymap, write_npy, write_tiff, write_zemax_sag
-from fab.solid import ChromeRing, Substrate, substrate_step, substrate_volumes_m3
-from fab.step import step_volumes_m3
+from fab.rings import pixel_share, ring_levels, rings_of
+from fab.solid import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
+from fab.step import Body
 from fab.units import MM, format_length
+from fab.wafer import Wafer
 
-__all__ = ["Relief", "model_problems", "write_models"]
+__all__ = ["MESH_CELLS", "Relief", "write_models"]
 
-_MESH_CELLS, _SAG_CELLS = 400, 500
+MESH_CELLS = 400
+_SAG_CELLS = 500
 _BASE_M = 10e-6
 # What is left of a volume: double precision in STEP; picometres as text or single precision in meshes.
 _STEP_OFF, _MESH_OFF = 1e-11, 1e-6
+_SINGLE = 2.0**-23
 
 
 class Relief(NamedTuple):
@@ -46,8 +53,10 @@ class Relief(NamedTuple):
         grid: the raster.
         aperture_m: diameter of the clear aperture, metres.
         chrome: how the chrome is drawn.
+        wafer: the glass.
         die_m: edge of the die, metres.
-        thickness_m: thickness of the glass, metres.
+        dies: middles of the dies on the wafer x, y, metres.
+        patch: the window that is wanted at full resolution, if any.
     """
 
     level_map: NDArray[np.uint8]
@@ -55,13 +64,10 @@ class Relief(NamedTuple):
     grid: Grid
     aperture_m: float
     chrome: Chrome
+    wafer: Wafer
     die_m: float
-    thickness_m: float
-
-
-def _middle(grid: Grid) -> Window:
-    rows, columns = (min(n, _SAG_CELLS) for n in grid.shape)
-    return Window((grid.shape[0] - rows) // 2, (grid.shape[1] - columns) // 2, rows, columns)
+    dies: Sequence[tuple[float, float]]
+    patch: Patch | None = None
 
 
 def write_models(folder: Path, stem: str, relief: Relief) -> list[ModelEntry]:
@@ -76,118 +82,127 @@ def write_models(folder: Path, stem: str, relief: Relief) -> list[ModelEntry]:
         one entry per file; a file that a small map cannot have (grid sag of fewer than 5 points) is left out.
     """
     level_map, levels, grid = relief.level_map, relief.levels, relief.grid
-    glass = Substrate("die", relief.die_m, relief.thickness_m)
-    chrome = ChromeRing(*relief.chrome.radii_m(grid, relief.aperture_m))
-    step = f"{stem}_PLATE.step"
-    substrate_step(folder / step, glass, relief.aperture_m, chrome)
-    entries = [_solid(step, "millimetres; one die, relief plane at z = 0", substrate_volumes_m3(glass, chrome))]
-    cells = reduced_cells(level_map, levels, grid, _MESH_CELLS)
+    cells = reduced_cells(level_map, levels, grid, MESH_CELLS)
+    about = f"relief on {format_length(_BASE_M)} of glass, mean height of {cells.block} x {cells.block} pixels"
+    return [
+        _write_plate(folder, f"{stem}_PLATE.step", relief),
+        _write_wafer(folder, f"{stem}_WAFER.step", relief),
+        *_write_meshes(folder, f"{stem}_RELIEF", cells, about),
+        *(_write_patch(folder, f"{stem}_PATCH", relief, relief.patch) if relief.patch else ()),
+        *_write_heights(folder, stem, level_map, levels, grid),
+    ]
+
+
+def _write_plate(folder: Path, file: str, relief: Relief) -> ModelEntry:
+    """Write one die, with its rings if the map is radial."""
+    level_map, levels, grid, aperture_m = relief.level_map, relief.levels, relief.grid, relief.aperture_m
+    glass = Substrate("die", relief.die_m, relief.wafer.thickness_m)
+    chrome = ChromeRing(*relief.chrome.radii_m(grid, aperture_m))
+    levels_of_rings, rings = ring_levels(level_map, levels, grid, aperture_m), None
+    about = "millimetres; one die, relief plane at z = 0, where the clear aperture is drawn flat"
+    if levels_of_rings is not None:
+        rings = rings_of(levels_of_rings, levels, grid, aperture_m)
+        share = 100 * pixel_share(level_map, levels_of_rings, grid, aperture_m)
+        about = (
+            f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
+            f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
+        )
+    substrate_step(folder / file, glass, aperture_m, chrome, rings)
+    return _solid(file, about, substrate_bodies(glass, chrome, rings))
+
+
+def _write_wafer(folder: Path, file: str, relief: Relief) -> ModelEntry:
+    """Write the wafer, with a flat unless the dies need its place."""
+    wafer = relief.wafer
+    chrome = ChromeRing(*relief.chrome.radii_m(relief.grid, relief.aperture_m))
+    glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m, wafer.usual_flat_m)
+    told = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"
+    if not glass.flat_m or not all(glass.holds(x, y, chrome.outer_m) for x, y in relief.dies):
+        glass, told = Substrate("wafer", wafer.diameter_m, wafer.thickness_m), "no flat"
+    wafer_step(folder / file, glass, relief.aperture_m, chrome, relief.dies)
+    about = f"millimetres; the wafer before it is diced, {told}; chrome of {len(relief.dies)} dies, no relief"
+    return _solid(file, about, wafer_bodies(glass, chrome, relief.dies))
+
+
+def _write_meshes(folder: Path, name: str, cells: Cells, about: str, window: Window | None = None) -> list[ModelEntry]:
+    """Write a relief as a mesh in every format."""
     mesh = relief_mesh(cells, _BASE_M)
     closed_volume_m3(mesh)
-    volume = {"RELIEF": cells.volume_m3 + cells.area_m2 * _BASE_M}
-    about = f"relief on {format_length(_BASE_M)} of glass, mean height of {cells.block} x {cells.block} pixels"
-    for name, unit, write, off in (
-        (f"{stem}_RELIEF.3mf", "millimetres", write_3mf, _MESH_OFF),
-        (f"{stem}_RELIEF.glb", "metres", write_glb, _MESH_OFF),
-        (f"{stem}_RELIEF_MM.stl", "millimetres", write_stl, _MESH_OFF),
+    volume = {"RELIEF": (cells.volume_m3 + cells.area_m2 * _BASE_M) / MM**3}
+    # In single precision walls stand aside, the more so the farther out; over a whole map that cancels out.
+    aside = 0.0
+    if window is not None:
+        edges, closest = (np.concatenate([f(cells.x_edges_m), f(cells.y_edges_m)]) for f in (np.abs, np.diff))
+        aside = _SINGLE * float(edges.max() / closest.min())
+    entries = []
+    for end, unit, write, off in (
+        (".3mf", "millimetres", write_3mf, _MESH_OFF),
+        (".glb", "metres", write_glb, _MESH_OFF + aside),
+        ("_MM.stl", "millimetres", write_stl, _MESH_OFF + aside),
     ):
-        write(folder / name, mesh)
-        entries.append(_solid(name, f"{unit}; {about}", volume, off))
-    tif, npy, grey, sag = (f"{stem}_{end}" for end in ("HEIGHT.tif", "HEIGHT.npy", "GREY.png", "SAG.DAT"))
-    per_count = write_tiff(folder / tif, level_map, levels, grid)
-    entries.append(ModelEntry(tif, "height above the deepest floor, first row at the highest y", {}, 0.0, per_count))
-    write_npy(folder / npy, level_map, levels)
-    entries.append(ModelEntry(npy, "height above the deepest floor, row 0 at the lowest y", {}, 0.0, 1.0))
-    per_count = write_greymap(folder / grey, level_map, levels, grid)
-    entries.append(ModelEntry(grey, "white is the blank surface, first row at the highest y", {}, 0.0, per_count))
-    window = _middle(grid)
-    if min(window.rows, window.columns) >= 5:
-        write_zemax_sag(folder / sag, level_map, levels, grid, window)
-        content = (
-            f"sag from the blank surface, the middle {window.rows} x {window.columns} pixels, seen as an exit face"
-        )
-        entries.append(ModelEntry(sag, content, {}, 0.0, MM))
+        write(folder / f"{name}{end}", mesh)
+        entries.append(_entry(f"{name}{end}", f"{unit}; {about}", window, volumes_mm3=volume, relative_error=off))
     return entries
 
 
-def _solid(file: str, content: str, volumes_m3: dict[str, float], off: float = _STEP_OFF) -> ModelEntry:
-    return ModelEntry(file, content, {name: v / MM**3 for name, v in volumes_m3.items()}, off, None)
+def _write_patch(folder: Path, name: str, relief: Relief, patch: Patch) -> list[ModelEntry]:
+    """Write a window at full resolution."""
+    level_map, levels, grid = relief.level_map, relief.levels, relief.grid
+    patch.require(level_map, levels, grid)
+    window = patch.window(grid)
+    middle = ", ".join(format_length(value) for value in window.centre_m(grid))
+    about = (
+        f"{window.rows} x {window.columns} pixels of {format_length(grid.pitch_m)} about {middle} of the DOE, "
+        f"on {format_length(_BASE_M)} of glass"
+    )
+    entries = []
+    if patch.step:
+        file = f"{name}.step"
+        patch_step(folder / file, level_map, levels, grid, window, _BASE_M)
+        body = patch_body(level_map, levels, grid, window, _BASE_M)
+        entries.append(_solid(file, f"millimetres; boxes side by side, {about}", {"PATCH": body}, window))
+    return [*entries, *_write_meshes(folder, name, patch.cells(level_map, levels, grid), about, window)]
 
 
-def model_problems(folder: Path, entry: ModelEntry, manifest: Manifest, level_map: NDArray[np.uint8]) -> list[str]:
-    """Read a model back and compare it with what the manifest says and with the level map.
-
-    Args:
-        folder: the order.
-        entry: the model; its bytes are known to be those of the manifest.
-        manifest: the manifest.
-        level_map: the level map of the order.
-
-    Returns:
-        One sentence per difference.
-    """
-    path = folder / entry.file
-    levels, grid = manifest.staircase(), manifest.grid()
-    try:
-        if entry.volumes_mm3:
-            return _volume_problems(entry, _measured_m3(path))
-        found = _HEIGHTS[path.suffix](path, entry.metres_per_count or 1.0)
-    except (InputError, CheckFailed) as error:
-        return [str(error)]
-    wanted = height_of(level_map, levels)
-    if path.suffix == ".DAT":
-        wanted = height_of(_middle(grid).cut(level_map), levels) - (levels.count - 1) * levels.step_m
-    if found.shape != wanted.shape:
-        return [f"{found.shape} heights instead of {wanted.shape}"]
-    # Grey values are rounded to half a count; text and floating point to far less.
-    most = 0.5001 * (entry.metres_per_count or 0.0) if path.suffix in (".png", ".tif") else 1e-12
-    wrong = int(np.count_nonzero(np.abs(found - wanted) > most))
-    return [f"{wrong} heights differ from the level map"] if wrong else []
+def _write_heights(
+    folder: Path, stem: str, level_map: NDArray[np.uint8], levels: Levels, grid: Grid
+) -> list[ModelEntry]:
+    """Write the height maps."""
+    tif, npy, grey, sag = (f"{stem}_{end}" for end in ("HEIGHT.tif", "HEIGHT.npy", "GREY.png", "SAG.DAT"))
+    per_count = write_tiff(folder / tif, level_map, levels, grid)
+    about = "height above the deepest floor, first row at the highest y"
+    entries = [_entry(tif, about, metres_per_count=per_count)]
+    write_npy(folder / npy, level_map, levels)
+    entries.append(_entry(npy, "height above the deepest floor, row 0 at the lowest y", metres_per_count=1.0))
+    per_count = write_greymap(folder / grey, level_map, levels, grid)
+    about = "white is the blank surface, first row at the highest y"
+    entries.append(_entry(grey, about, metres_per_count=per_count))
+    rows, columns = (min(n, _SAG_CELLS) for n in grid.shape)
+    if min(rows, columns) >= 5:
+        window = Window((grid.shape[0] - rows) // 2, (grid.shape[1] - columns) // 2, rows, columns)
+        write_zemax_sag(folder / sag, level_map, levels, grid, window)
+        about = f"sag from the blank surface, the middle {rows} x {columns} pixels, seen as an exit face"
+        entries.append(_entry(sag, about, window, metres_per_count=MM))
+    return entries
 
 
-def _measured_m3(path: Path) -> dict[str, float]:
-    if path.suffix == ".step":
-        return step_volumes_m3(path)
-    return {"RELIEF": read_mesh(path, "mm" if path.suffix == ".stl" else None).volume_m3}
+def _solid(file: str, content: str, bodies: Mapping[str, Body], window: Window | None = None) -> ModelEntry:
+    volumes = {name: body.volume_m3 / MM**3 for name, body in bodies.items()}
+    centres = {name: [value / MM for value in body.centre_m] for name, body in bodies.items()}
+    return _entry(file, content, window, volumes_mm3=volumes, centres_mm=centres, relative_error=_STEP_OFF)
 
 
-def _volume_problems(entry: ModelEntry, found_m3: dict[str, float]) -> list[str]:
-    problems = []
-    for name in sorted(entry.volumes_mm3.keys() | found_m3.keys()):
-        found, wanted = found_m3.get(name, 0.0) / MM**3, entry.volumes_mm3.get(name, 0.0)
-        if not abs(found - wanted) <= entry.relative_error * wanted:
-            problems.append(f"{name}: {found:.12g} mm3 instead of {wanted:.12g} mm3")
-    return problems
-
-
-def _from_tiff(path: Path, per_count: float) -> NDArray[np.float64]:
-    import tifffile
-
-    return tifffile.imread(path)[::-1] * per_count
-
-
-def _from_png(path: Path, per_count: float) -> NDArray[np.float64]:
-    from PIL import Image
-
-    with Image.open(path) as picture:
-        return np.asarray(picture)[::-1] * per_count
-
-
-def _from_npy(path: Path, _: float) -> NDArray[np.float64]:
-    return np.load(path, allow_pickle=False)
-
-
-def _from_sag(path: Path, per_count: float) -> NDArray[np.float64]:
-    with open(path) as lines:
-        columns, rows = (int(word) for word in lines.readline().split()[:2])
-        sag = np.loadtxt(lines, usecols=0)
-    # The first point is at the lowest x and the highest y.
-    return sag.reshape(rows, columns)[::-1] * per_count
-
-
-_HEIGHTS: dict[str, Callable[[Path, float], Any]] = {
-    ".tif": _from_tiff,
-    ".png": _from_png,
-    ".npy": _from_npy,
-    ".DAT": _from_sag,
-}
+def _entry(
+    file: str,
+    content: str,
+    window: Window | None = None,
+    *,
+    volumes_mm3: Mapping[str, float] | None = None,
+    centres_mm: Mapping[str, list[float]] | None = None,
+    relative_error: float = 0.0,
+    metres_per_count: float | None = None,
+) -> ModelEntry:
+    pixels = None if window is None else [window.row, window.column, window.rows, window.columns]
+    return ModelEntry(
+        file, content, dict(volumes_mm3 or {}), dict(centres_mm or {}), relative_error, metres_per_count, pixels
+    )

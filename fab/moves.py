@@ -1,7 +1,7 @@
 """Moves of a repair: rectangles of pixels that take another depth, and what they do to the rules and to the light.
 
 The energy of a map is the weighted sum of the pixels by which runs are too short and of the corners that touch, over
-all bit planes at once, and of the error of every pixel. A depth is a number of steps, whose bits are the masks. The
+all bit planes at once, and of the error of every pixel. A depth is a number whose bits are the masks that etch. The
 functions look at no more than the surroundings of a rectangle, so moves far apart know nothing of each other.
 """
 
@@ -17,7 +17,7 @@ __all__ = ["Task", "broken", "loss", "offends", "sweep"]
 class Task(NamedTuple):
     """A level map in work, on maps that are padded by `pad` pixels of blank glass.
 
-    `etched` and `wanted` hold how many steps deep each pixel is etched now and should be, `free` what may change,
+    `etched` and `wanted` hold by which masks each pixel is etched now and should be, `free` what may change,
     `error[a, b]` what depth a costs where b is wanted; `line` and `space` are the narrowest ones in pixels, and
     `gravity` how many kissing corners one missing pixel of width is as bad as.
     """

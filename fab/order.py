@@ -31,7 +31,7 @@ from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.frame import Frame, draw_frame
 from fab.grid import Grid
-from fab.inventory import cell_entry, geometry
+from fab.inventory import cell_entry, geometry, shapes_digest
 from fab.layout import (
     Cell,
     Chrome,
@@ -49,10 +49,12 @@ from fab.manifest import (
     FORMAT,
     CellEntry,
     ChromeEntry,
+    DrawnEntry,
     FileEntry,
     Manifest,
     MaskEntry,
     PlateEntry,
+    SplitEntry,
     WaferEntry,
     map_digest,
     plane_digest,
@@ -61,10 +63,12 @@ from fab.manifest import (
 from fab.masks import planes, unetched_outside
 from fab.models import Relief, write_models
 from fab.part import Plate, plates_of
+from fab.patch import Patch
 from fab.polygons import smallest_runs
 from fab.preview import preview_png
 from fab.process import Process
 from fab.rules import Rules, RulesReport, check
+from fab.split import Split, splits_of
 from fab.stream import write_gds, write_oasis
 from fab.units import MM, NM, UM, format_length
 from fab.verify import Report, verify_order
@@ -100,6 +104,7 @@ class Order:
         source: where the height map came from.
         process: in which order the masks are etched, and what their polygons are on the plates.
         wafer: what the masks are filled with.
+        patch: a window that is wanted as a solid at full resolution, if any.
     """
 
     name: str
@@ -111,6 +116,7 @@ class Order:
     source: Mapping[str, Any]
     process: Process
     wafer: Wafer
+    patch: Patch | None = None
 
     @property
     def plates(self) -> tuple[Plate, ...]:
@@ -130,6 +136,11 @@ class Order:
         usual = self.process.expected()
         own = usual.cd_bias_m or (0.0,) * self.levels.bits
         return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], pixel_edges(self.grid).dbu_m)
+
+    @property
+    def splits(self) -> tuple[Split, ...]:
+        """How the dies draw the DOE, the plate as ordered first."""
+        return splits_of(self.wafer, self.levels, self.edge_moves(), pixel_edges(self.grid).dbu_m)
 
     def plate_stem(self, plate: Plate) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
@@ -239,6 +250,7 @@ def _chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
         outer_diameter_mm=round(2 * outer * layout.dbu_m / MM, 9),
         overlap_um=round(order.chrome.overlap_m / UM, 9),
         chord_error_nm=round(order.chrome.chord_error_m / NM, 9),
+        shapes_sha256=shapes_digest(layout.cells[0].shapes[layer]),
         **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
     )
 
@@ -259,12 +271,12 @@ def _edges_told(edges: PixelEdges) -> str:
     )
 
 
-def _frame(order: Order, doe_cell: str, dbu_m: float) -> Frame:
+def _frame(order: Order, dbu_m: float) -> Frame:
     return draw_frame(
         order.wafer,
         order.plates,
         order.levels,
-        doe_cell=doe_cell,
+        splits=order.splits,
         stem=order.stem,
         digest=map_digest(order.level_map),
         pitch_m=order.grid.pitch_m,
@@ -303,9 +315,42 @@ def _wafer_entry(order: Order, frame: Frame) -> WaferEntry:
     )
 
 
-def _around(layout: Layout) -> list[CellEntry]:
-    """What the manifest says of every cell but that of the DOE, which comes first."""
-    return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[1:]]
+def _around(order: Order, layout: Layout) -> list[CellEntry]:
+    """What the manifest says of every cell but those of the DOE, which come first."""
+    return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[len(order.splits) :]]
+
+
+def _drawn_does(order: Order) -> Layout:
+    """Draw the DOE in all the ways that the dies ask for, the plate as ordered first."""
+    drawn = [
+        mask_layout(
+            order.level_map,
+            order.levels,
+            order.grid,
+            order.aperture_m,
+            f"{order.stem}_{split.code}",
+            order.chrome,
+            split.moves,
+            split.bits,
+        )
+        for split in order.splits
+    ]
+    return Layout(drawn[0].dbu_m, tuple(one.top for one in drawn))
+
+
+def _split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float) -> SplitEntry:
+    layers = [
+        DrawnEntry(
+            layer=layer.number,
+            datatype=layer.datatype,
+            bit=bit,
+            edge_move_nm=round(move * dbu_m / NM, 9),
+            **geometry(cell.shapes[layer], dbu_m),  # type: ignore[arg-type]
+        )
+        for mask, (bit, move) in enumerate(zip(split.bits, split.moves, strict=True))
+        for layer in [etch_layer(mask, levels)]
+    ]
+    return SplitEntry(cell.name, split.words, die, layers)
 
 
 def _write_masks(
@@ -320,13 +365,13 @@ def _write_masks(
     """Write the review files and one file per mask."""
     say("writing GDSII")
     write_gds(folder / gds, layout)
-    contents = [Content(gds, "GDSII", layout.top.name, doe_layers, _around(layout))]
+    contents = [Content(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
     for plate in order.plates:
         name, layer = order.plate_stem(plate), Layer(plate.layer)
         one = mask_file(layout, layer, name)
         write_gds(folder / f"{name}.gds", one)
         on = [layer] if layer in doe_layers else []
-        contents.append(Content(f"{name}.gds", "GDSII", name, on, _around(one)))
+        contents.append(Content(f"{name}.gds", "GDSII", name, on, _around(order, one)))
     say("writing OASIS")
     write_oasis(folder / oasis, folder / gds, layout.layers)
     return [*contents, Content(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
@@ -348,12 +393,15 @@ def _file_entry(folder: Path, content: Content) -> FileEntry:
 def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
     """Write everything but the manifest, and return it."""
     say("drawing the masks")
-    doe_cell = f"{order.stem}_DOE"
-    moves = order.edge_moves()
-    drawn = mask_layout(order.level_map, order.levels, order.grid, order.aperture_m, doe_cell, order.chrome, moves)
-    frame = _frame(order, doe_cell, drawn.dbu_m)
+    drawn = _drawn_does(order)
+    frame = _frame(order, drawn.dbu_m)
+    splits = [
+        _split_entry(split, cell, frame.splits.index(number) + 1, order.levels, drawn.dbu_m)
+        for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
+        if number
+    ]
     layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
-    doe_layers = list(drawn.top.shapes)
+    doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
     del drawn
     bit_planes = planes(order.level_map, order.levels)
     masks = [_mask_entry(order, layout, bit, plane) for bit, plane in enumerate(bit_planes)]
@@ -367,15 +415,21 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     say("drawing the preview")
     _write_map(folder / levels_file, order.level_map)
     digest = map_digest(order.level_map)
-    title = (
-        f"{order.stem}: {order.levels.count} levels of {format_length(order.levels.step_m)}, level map {digest[:12]}"
-    )
+    title = f"{order.stem}: {order.levels.told}, level map {digest[:12]}"
     radii_m = order.chrome.radii_m(order.grid, order.aperture_m)
     picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
     (folder / preview).write_bytes(picture)
     say("drawing the solids")
     shown = Relief(
-        order.level_map, order.levels, order.grid, order.aperture_m, order.chrome, frame.die_m, order.wafer.thickness_m
+        order.level_map,
+        order.levels,
+        order.grid,
+        order.aperture_m,
+        order.chrome,
+        order.wafer,
+        frame.die_m,
+        frame.dies,
+        order.patch,
     )
     models = write_models(folder, order.stem, shown)
     others = [*(model.file for model in models), *add(folder, order, frame), levels_file, preview]
@@ -402,6 +456,7 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
         wafer=_wafer_entry(order, frame),
         rules=order.rules.as_record(),
         masks=masks,
+        splits=splits,
         chrome=chrome,
         models=models,
         files=[_file_entry(folder, content) for content in contents],
@@ -432,6 +487,7 @@ def write_order(
     chrome: Chrome | None = None,
     process: Process | None = None,
     wafer: Wafer | None = None,
+    patch: Patch | None = None,
     add: Add = _nothing,
     say: Callable[[str], None] = _silent,
 ) -> Report:
@@ -448,6 +504,7 @@ def write_order(
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
         process: order of the etches and tone of the masks; an ideal process if left out.
         wafer: what the masks are filled with; the defaults of `Wafer` if left out.
+        patch: a window to write as a solid at full resolution, too.
         add: writes further files into the folder and returns their names; what needs light to be written.
         say: told the name of each step as it begins.
 
@@ -462,7 +519,9 @@ def write_order(
     _require_own(Path(folder))
     blank = unetched_outside(level_map, levels, grid, aperture_m)
     made = process or Process(levels)
-    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source, made, wafer or Wafer())
+    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source, made, wafer or Wafer(), patch)
+    if patch is not None:
+        patch.require(blank, levels, grid)
     with atomic_folder(folder) as fresh:
         manifest = _write_files(fresh, order, add, say)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())

@@ -29,7 +29,7 @@ _HEIGHTS = "viridis"
 _TEXT = {"fontsize": 9, "color": "#222222"}
 
 
-def _blocks(values: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _blocks(values: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
     """Average over blocks so that neither side has more than `_MOST_PIXELS`; a rest at the edge drops out."""
     sizes = [-(-n // _MOST_PIXELS) for n in values.shape]
     ny, nx = (n // size for n, size in zip(values.shape, sizes, strict=True))
@@ -109,17 +109,23 @@ def _draw_heights(
 
     window = _window(grid)
     step_nm = levels.step_m / NM
-    look = {"cmap": _HEIGHTS, "vmin": -step_nm / 2, "vmax": (levels.count - 0.5) * step_nm}
+    heights_nm = (levels.heights_m() / NM).astype(np.float32)
+    highest = (levels.count - 0.5) * step_nm if levels.is_binary else levels.total_m / NM + step_nm / 2
+    look = {"cmap": _HEIGHTS, "vmin": -step_nm / 2, "vmax": highest}
     title = (
         f"height, mean over blocks: {grid.shape[1]} x {grid.shape[0]} pixels of {grid.pitch_m / UM:.6g} \N{MICRO SIGN}m"
     )
-    _show(axes[0], _blocks(level_map) * step_nm, _box_mm(grid), title, **look)
+    # The means of equal steps are exact; they are what keeps the picture the same to the last bit.
+    means = _blocks(level_map) * step_nm if levels.is_binary else _blocks(heights_nm[level_map])
+    _show(axes[0], means, _box_mm(grid), title, **look)
     x0, x1, y0, y1 = _box_mm(grid, window)
     axes[0].add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=_MARK, lw=1.5))
     title = f"height, window of {level_map[window].shape[1]} pixels (red in the overview)"
-    image = _show(axes[1], level_map[window] * step_nm, _box_mm(grid, window), title, **look)
+    shown = level_map[window] * step_nm if levels.is_binary else heights_nm[level_map[window]]
+    image = _show(axes[1], shown, _box_mm(grid, window), title, **look)
     bar = figure.colorbar(image, ax=axes[1], fraction=0.046, pad=0.03)
-    bar.set_ticks((np.arange(levels.count)[:: max(1, levels.count // 16)] * step_nm).tolist())
+    ticks = np.arange(levels.count) * step_nm if levels.is_binary else levels.by_height()[1] / NM
+    bar.set_ticks(ticks[:: max(1, levels.count // 16)].tolist())
     bar.ax.tick_params(labelsize=7)
     bar.set_label("height above the deepest floor (nm)", **_TEXT)
 

@@ -234,7 +234,7 @@ class Process:
         """
         masks = tuple(range(self.levels.bits))
         if not self.order:
-            object.__setattr__(self, "order", masks)
+            object.__setattr__(self, "order", tuple(sorted(masks, key=self.levels.etch_depth_m)))
         if tuple(sorted(self.order)) != masks:
             rule = f"must name each of the masks 0 to {len(masks) - 1} once"
             raise InputError("process.order", rule, self.order, "List every mask.")
@@ -268,7 +268,7 @@ class Process:
 
     def depths_m(self) -> tuple[float, ...]:
         """Nominal depth of every mask's etch, mask 0 first."""
-        return tuple(2**k * self.levels.step_m for k in range(self.masks))
+        return self.levels.depths_m
 
     def expected(self) -> Variation:
         """The plate with every error at its mean."""

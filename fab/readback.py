@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.layout import Cell, Layer, PixelEdges, Reference, Shapes
-from fab.units import UM
+from fab.units import NM, UM
 
 __all__ = ["Again", "Reading"]
 
@@ -35,6 +35,7 @@ class Reading:
     """One layer as the other library sees it.
 
     Attributes:
+        cell: the cell of a DOE.
         layer: the layer.
         winding: ``[y, x]`` int32, how many rectangles cover each pixel.
         strays: four-point shapes that are no rectangle on the pixel raster; they are not counted in.
@@ -42,6 +43,7 @@ class Reading:
         moved: the shapes as they are, instead of `winding`, of a layer whose edges lie off the pixel raster on purpose.
     """
 
+    cell: str
     layer: Layer
     winding: NDArray[np.int32]
     strays: int
@@ -57,9 +59,10 @@ def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[
 
 
 class _Counter:
-    """Collects the shapes of one layer."""
+    """Collects the shapes of one layer of a cell."""
 
-    def __init__(self, layer: Layer, edges: PixelEdges) -> None:
+    def __init__(self, cell: str, layer: Layer, edges: PixelEdges) -> None:
+        self.cell = cell
         self.layer = layer
         self.edges = edges
         self.steps = np.zeros(edges.y.size * edges.x.size, dtype=np.int32)
@@ -90,14 +93,14 @@ class _Counter:
         winding = self.steps.reshape(self.edges.y.size, self.edges.x.size)
         np.add.accumulate(winding, axis=0, out=winding)
         np.add.accumulate(winding, axis=1, out=winding)
-        return Reading(self.layer, winding[:-1, :-1], self.strays, self.polygons)
+        return Reading(self.cell, self.layer, winding[:-1, :-1], self.strays, self.polygons)
 
 
 class _Collector(_Counter):
     """Collects the shapes of a layer as they are."""
 
-    def __init__(self, layer: Layer, edges: PixelEdges) -> None:
-        super().__init__(layer, edges)
+    def __init__(self, cell: str, layer: Layer, edges: PixelEdges) -> None:
+        super().__init__(cell, layer, edges)
         self.boxes: list[NDArray[np.int32]] = []
 
     def add(self, points_um: NDArray[np.float64]) -> None:
@@ -113,13 +116,8 @@ class _Collector(_Counter):
         """Put everything together."""
         rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
         nothing = np.zeros((0, 0), dtype=np.int32)
-        return Reading(
-            self.layer,
-            nothing,
-            0,
-            self.polygons,
-            Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons)),
-        )
+        shapes = Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons))
+        return Reading(self.cell, self.layer, nothing, 0, self.polygons, shapes)
 
 
 def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
@@ -196,15 +194,13 @@ class _Around:
 
 def _sorted_out(polygons: list[NDArray[np.int64]]) -> Shapes:
     """Rectangles apart from all other polygons."""
-    rects, others = [], []
-    for points in polygons:
-        low, high = points.min(axis=0), points.max(axis=0)
-        sides = np.count_nonzero(points != np.roll(points, -1, axis=0), axis=1)
-        if len(points) == 4 and (sides == 1).all() and (low < high).all():
-            rects.append([*low, *high])
-        else:
-            others.append(points.astype(np.int32))
-    return Shapes(np.array(rects, dtype=np.int32).reshape(-1, 4), tuple(others))
+    fours = np.array([points for points in polygons if len(points) == 4], dtype=np.int64).reshape(-1, 4, 2)
+    low, high = fours.min(axis=1), fours.max(axis=1)
+    sides = np.count_nonzero(fours != np.roll(fours, -1, axis=1), axis=2)
+    upright = (sides == 1).all(axis=1) & (low < high).all(axis=1)
+    others = [*fours[~upright], *(points for points in polygons if len(points) != 4)]
+    rects = np.concatenate([low, high], axis=1)[upright]
+    return Shapes(rects.astype(np.int32), tuple(points.astype(np.int32) for points in others))
 
 
 class Again:
@@ -213,14 +209,14 @@ class Again:
     The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
 
     Attributes:
-        doe: name of the cell with the planes.
+        does: the cells of the DOE, each with its layers whose edges lie off the pixel raster on purpose.
         edges: the pixel raster.
         around: the other cells; complete once every reading was taken.
         problems: one sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
     """
 
-    def __init__(self, doe: str, edges: PixelEdges, moved: Collection[Layer] = ()) -> None:
-        self.doe, self.edges, self._moved = doe, edges, moved
+    def __init__(self, does: Mapping[str, Collection[Layer]], edges: PixelEdges) -> None:
+        self.does, self.edges = does, edges
         self.problems: list[str] = []
         self._around = _Around(edges.dbu_m)
 
@@ -238,7 +234,7 @@ class Again:
             others: all other layers.
 
         Yields:
-            One reading per layer of the DOE, in the order given.
+            One reading per layer, in the order given, and cell of the DOE.
         """
         waiting = list(layers)
         rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
@@ -249,8 +245,7 @@ class Again:
             wanted = {(layer.number, layer.datatype) for layer in group}
             wanted.update(rest)
             rest = []
-            cells: list[Any] = gdstk.read_gds(str(path), unit=UM, filter=wanted).cells
-            yield from self._taken(cells, group)
+            yield from self._taken(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
 
     def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[Reading]:
         """Read an OASIS file, known to be whole, and unfold its repetitions.
@@ -260,25 +255,32 @@ class Again:
             layers: the layers of the DOE.
 
         Yields:
-            One reading per layer of the DOE, in the order given.
+            One reading per layer, in the order given, and cell of the DOE.
         """
-        yield from self._taken(gdstk.read_oas(str(path), unit=UM).cells, list(layers))
+        yield from self._taken(gdstk.read_oas(str(path), unit=UM), list(layers))
 
-    def _taken(self, cells: list[Any], group: list[Layer]) -> Iterator[Reading]:
-        counters = {layer: (_Collector if layer in self._moved else _Counter)(layer, self.edges) for layer in group}
-        for cell in cells:
+    def _taken(self, library: Any, group: list[Layer]) -> Iterator[Reading]:
+        if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:
+            units = [f"{value / NM:.9g} nm" for value in (library.precision, self.edges.dbu_m)]
+            self.problems.append(f"the database unit is {units[0]} instead of {units[1]}")
+        counters = {
+            (name, layer): (_Collector if layer in moved else _Counter)(name, layer, self.edges)
+            for layer in group
+            for name, moved in self.does.items()
+        }
+        for cell in library.cells:
             if cell.labels or cell.paths:
                 self.problems.append(f"cell {cell.name} holds labels or paths")
-            if cell.name != self.doe:
+            if cell.name not in self.does:
                 self._around.add(cell)
                 continue
             if cell.references:
                 self.problems.append(f"cell {cell.name} places others")
             for layer, size, polygons in _runs(cell.polygons):
-                if layer not in counters:
-                    self.problems.append(f"layer {layer} of the DOE holds shapes that should not be there")
+                if layer not in group:
+                    self.problems.append(f"layer {layer} of cell {cell.name} holds shapes that should not be there")
                     continue
                 for points_um in _unfolded(polygons, size):
-                    counters[layer].add(points_um)
-        for layer in group:
-            yield counters.pop(layer).reading()
+                    counters[cell.name, layer].add(points_um)
+        for key in list(counters):
+            yield counters.pop(key).reading()

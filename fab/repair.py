@@ -178,6 +178,14 @@ def _mend(task: Task) -> None:
             pass
 
 
+def _phases(levels: Levels, waves_per_m: float) -> NDArray[np.float64]:
+    """Return by how many radians the light of every level ``[a]`` is ahead of that of every other ``[b]``."""
+    if levels.is_binary:
+        number = np.arange(levels.count)
+        return 2 * math.pi * waves_per_m * levels.step_m * np.subtract.outer(number, number)
+    return 2 * math.pi * waves_per_m * np.subtract.outer(levels.heights_m(), levels.heights_m())
+
+
 def repaired(
     level_map: NDArray[np.integer],
     levels: Levels,
@@ -218,20 +226,21 @@ def repaired(
         # Moves and the runs beside them reach no farther than this.
         pad = 2 * max(line, space) + 2
         top = levels.count - 1
-        difference = np.subtract.outer(np.arange(levels.count), np.arange(levels.count))
-        error = 1 - np.cos(2 * math.pi * waves_per_m * levels.step_m * difference)
+        # By what is etched, the top level first.
+        error = 1 - np.cos(_phases(levels, waves_per_m)[::-1, ::-1])
         target = np.pad(np.uint8(top) - wanted, pad)
         task = Task(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
         _mend(task)
         mended = np.uint8(top) - task.etched[pad:-pad, pad:-pad]
-    steps = mended[free].astype(np.int64) - wanted[free]
+    # How often which level took the place of which.
+    pairs = np.bincount(mended[free].astype(np.int64) * levels.count + wanted[free], minlength=levels.count**2)
+    shares = pairs.reshape(levels.count, levels.count) / max(pairs.sum(), 1)
+    rises_m = np.subtract.outer(levels.heights_m(), levels.heights_m())
     after = before if before.clean else check(mended, levels, grid, aperture_m, rules)
-    rotated = np.exp(2j * math.pi * waves_per_m * levels.step_m * np.arange(1 - levels.count, levels.count))
-    shares = np.bincount(steps + levels.count - 1, minlength=2 * levels.count - 1) / max(steps.size, 1)
     return mended, Cost(
-        changed_share=1.0 - float(shares[levels.count - 1]) if steps.size else 0.0,
-        rms_height_m=levels.step_m * math.sqrt(float(np.mean(steps**2))) if steps.size else 0.0,
-        efficiency=float(abs(np.sum(shares * rotated)) ** 2) if steps.size else 1.0,
+        changed_share=1.0 - float(np.trace(shares)) if pairs.any() else 0.0,
+        rms_height_m=math.sqrt(float(np.sum(shares * rises_m**2))),
+        efficiency=float(abs(np.sum(shares * np.exp(1j * _phases(levels, waves_per_m)))) ** 2) if pairs.any() else 1.0,
         broken_before=sum(plane.breaks for plane in before.planes),
         broken_after=sum(plane.breaks for plane in after.planes),
     )

@@ -6,37 +6,33 @@ relief is etched and the chrome lies), and the z axis the light axis. The glass 
 in the plane z = 0, to be referred to.
 
 A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into
-the top of the substrate. Any other map belongs in a mesh; only a small window of one can be written here, as boxes.
+the top of the substrate. Any other map belongs in a mesh; only a small window of one can be STEP (`fab.patch`).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.cells import Window, require_map
 from fab.errors import InputError
-from fab.grid import Grid
-from fab.levels import Levels
-from fab.polygons import rectangles
-from fab.step import boxes, disc, outline, plate, revolved, write_step
+from fab.step import Body, copies, disc, outline, plate, revolved, slab, write_step
 from fab.units import NM, format_length
 
 __all__ = [
     "ChromeRing",
     "Rings",
     "Substrate",
-    "patch_step",
-    "patch_volume_m3",
+    "substrate_bodies",
     "substrate_step",
     "substrate_volumes_m3",
+    "wafer_bodies",
+    "wafer_step",
 ]
 
-_MOST_BOXES = 2000
-_NO_MORE_BOXES = 20_000
 # The kernel takes points 1e-7 mm apart for one; edges must be clearly longer.
 _SHORTEST_M = 0.3 * NM
 _SAME_M = 1e-3 * NM
@@ -79,6 +75,10 @@ class Substrate:
         """Radius of the largest centred circle on the surface, metres."""
         return math.sqrt((self.width_m / 2) ** 2 - (self.flat_m / 2) ** 2)
 
+    def holds(self, x_m: float, y_m: float, radius_m: float) -> bool:
+        """Whether a circle about x, y lies on the surface of a wafer."""
+        return math.hypot(x_m, y_m) + radius_m <= self.width_m / 2 and radius_m - y_m <= self.inside_m
+
     @property
     def area_m2(self) -> float:
         """Area of the surface, square metres."""
@@ -87,6 +87,12 @@ class Substrate:
         radius = self.width_m / 2
         half_angle = math.asin(self.flat_m / self.width_m)
         return math.pi * radius**2 - radius**2 * (half_angle - math.sin(half_angle) * math.cos(half_angle))
+
+    @property
+    def body(self) -> Body:
+        """The glass without relief; what the flat takes from a disc at -y moves its centre to +y."""
+        y_m = (self.flat_m / 2) ** 3 * 2 / 3 / self.area_m2
+        return Body(self.area_m2 * self.thickness_m, (0.0, y_m, -self.thickness_m / 2))
 
 
 @dataclass(frozen=True)
@@ -115,9 +121,16 @@ class ChromeRing:
             raise InputError("chrome", rule, got, "Check the three lengths.")
 
     @property
-    def volume_m3(self) -> float:
-        """Volume, cubic metres."""
-        return math.pi * (self.outer_m + self.inner_m) * (self.outer_m - self.inner_m) * self.thickness_m
+    def body(self) -> Body:
+        """The ring around the axis, on z = 0."""
+        volume = math.pi * (self.outer_m + self.inner_m) * (self.outer_m - self.inner_m) * self.thickness_m
+        return Body(volume, (0.0, 0.0, self.thickness_m / 2))
+
+    def solid(self) -> Any:
+        """The same as a shape of the kernel."""
+        low, high = 0.0, self.thickness_m
+        corners = [(self.inner_m, low), (self.outer_m, low), (self.outer_m, high), (self.inner_m, high)]
+        return revolved(corners, closed=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +171,13 @@ class Rings:
             raise InputError("rings", "every step must be 0 or at least 0.3 nm high", "a lower one", cure)
 
     @property
-    def removed_m3(self) -> float:
-        """Volume of the glass that is etched away, cubic metres."""
+    def removed(self) -> Body:
+        """The glass that is etched away."""
         inner = np.append(0.0, self.outer_m[:-1])
-        areas = math.pi * (self.outer_m - inner) * (self.outer_m + inner)
-        return math.fsum(areas * (self.blank_m - self.height_m))
+        depths = self.blank_m - self.height_m
+        volumes = math.pi * (self.outer_m - inner) * (self.outer_m + inner) * depths
+        volume = math.fsum(volumes)
+        return Body(volume, (0.0, 0.0, -math.fsum(volumes * depths) / 2 / volume if volume else 0.0))
 
     def profile_m(self) -> list[tuple[float, float]]:
         """Return the corners r, z of the relief's profile from the axis to its rim at z = 0, metres."""
@@ -194,13 +209,27 @@ def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | N
         raise InputError("rings", "must be less deep than the substrate is thick", got, "Check the two lengths.")
 
 
+def substrate_bodies(
+    substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
+) -> dict[str, Body]:
+    """Return volume and centre of every solid that `substrate_step` writes, by closed form and name."""
+    glass = substrate.body
+    if rings is not None:
+        gone = rings.removed
+        volume = glass.volume_m3 - gone.volume_m3
+        x, y, z = (
+            (whole * glass.volume_m3 - part * gone.volume_m3) / volume
+            for whole, part in zip(glass.centre_m, gone.centre_m, strict=True)
+        )
+        glass = Body(volume, (x, y, z))
+    return {"SUBSTRATE": glass, **({"CHROME": chrome.body} if chrome is not None else {})}
+
+
 def substrate_volumes_m3(
     substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
 ) -> dict[str, float]:
     """Return the volume of every solid that `substrate_step` writes, by closed form, cubic metres by name."""
-    removed = rings.removed_m3 if rings is not None else 0.0
-    volumes = {"SUBSTRATE": substrate.area_m2 * substrate.thickness_m - removed}
-    return volumes | ({"CHROME": chrome.volume_m3} if chrome is not None else {})
+    return {name: body.volume_m3 for name, body in substrate_bodies(substrate, chrome, rings).items()}
 
 
 def substrate_step(
@@ -232,67 +261,39 @@ def substrate_step(
         "DATUM_CLEAR_APERTURE": disc(aperture_m / 2),
     }
     if chrome is not None:
-        low, high = 0.0, chrome.thickness_m
-        ring = [(chrome.inner_m, low), (chrome.outer_m, low), (chrome.outer_m, high), (chrome.inner_m, high)]
-        parts["CHROME"] = revolved(ring, closed=True)
+        parts["CHROME"] = chrome.solid()
     write_step(path, "DOE", parts)
 
 
-def patch_volume_m3(
-    level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window, base_m: float = 10e-6
-) -> float:
-    """Return the volume of the boxes that `patch_step` writes, cubic metres."""
-    cut = window.cut(require_map(level_map, levels, grid))
-    counts = np.bincount(cut.ravel(), minlength=levels.count)
-    return math.fsum(counts * (levels.heights_m() + base_m)) * grid.pitch_m**2
+def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
+    """Return volume and centre of every solid that `wafer_step` writes, by closed form and name."""
+    x, y = (math.fsum(axis) / len(places_m) for axis in zip(*places_m, strict=True))
+    one = chrome.body
+    return {"SUBSTRATE": wafer.body, "CHROME": Body(len(places_m) * one.volume_m3, (x, y, one.centre_m[2]))}
 
 
-def patch_step(
-    path: str | Path,
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    window: Window,
-    base_m: float = 10e-6,
-    most_boxes: int = _MOST_BOXES,
+def wafer_step(
+    path: str | Path, wafer: Substrate, aperture_m: float, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
 ) -> None:
-    """Write a window of a map as STEP: boxes side by side, one per rectangle of equal height.
-
-    The part is named PATCH and lies where the window does. Its boxes touch and are not united: uniting takes
-    minutes at the size that is allowed here, and a mesh is the better file for anything larger.
+    """Write a wafer as STEP before it is diced: flat glass, and chrome and clear aperture of every die.
 
     Args:
         path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        window: the pixels to write.
-        base_m: glass below the deepest floor, metres.
-        most_boxes: refuse windows that need more; at most 20000, which make a file of about 140 MB.
+        wafer: the glass.
+        aperture_m: diameter of the clear apertures, metres.
+        chrome: the chrome of one die.
+        places_m: middles of the dies x, y, metres.
 
     Raises:
-        InputError: too many boxes, a window off the map, or a file that cannot be written.
+        InputError: a die does not fit, or the file cannot be written.
     """
-    checked = require_map(level_map, levels, grid)
-    window.require(grid)
-    if not 0 < base_m < math.inf:
-        raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")
-    if not 1 <= most_boxes <= _NO_MORE_BOXES:
-        rule = f"a STEP patch may be allowed 1 to {_NO_MORE_BOXES} boxes"
-        raise InputError("patch", rule, most_boxes, "Write a mesh (3MF, STL) of a larger window.")
-    cut = window.cut(checked)
-    tops = {int(level): rectangles((cut == level).astype(np.uint8)) for level in np.unique(cut)}
-    count = sum(len(found) for found in tops.values())
-    if count > most_boxes:
-        rule = f"a STEP patch may have at most {most_boxes} boxes (a file of about 7 kB each)"
-        cure = "Choose a smaller window, allow more boxes, or write a mesh."
-        raise InputError("patch", rule, f"{count} in {window.rows} x {window.columns} pixels", cure)
-    x_m, y_m = window.edges_m(grid)
-    z_m = levels.heights_m() - levels.heights_m().max()
-    bottom = float(z_m.min()) - base_m
-    corners = (
-        (float(x_m[x0]), float(y_m[y0]), bottom, float(x_m[x1]), float(y_m[y1]), float(z_m[level]))
-        for level, found in tops.items()
-        for x0, y0, x1, y1 in found
-    )
-    write_step(path, "DOE_PATCH", {"PATCH": boxes(corners)})
+    for x, y in places_m:
+        if not wafer.holds(x, y, chrome.outer_m):
+            got = f"a chrome of {format_length(2 * chrome.outer_m)} at {format_length(x)}, {format_length(y)}"
+            raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
+    parts = {
+        "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),
+        "DATUM_CLEAR_APERTURE": copies(disc(aperture_m / 2), places_m),
+        "CHROME": copies(chrome.solid(), places_m),
+    }
+    write_step(path, "WAFER", parts)

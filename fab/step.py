@@ -16,16 +16,40 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fab.errors import CheckFailed, InputError
 from fab.files import explain_os_error, write_atomic
 from fab.units import MM
 
-__all__ = ["boxes", "disc", "outline", "plate", "revolved", "step_volumes_m3", "write_step"]
+__all__ = [
+    "Body",
+    "boxes",
+    "copies",
+    "disc",
+    "outline",
+    "plate",
+    "revolved",
+    "slab",
+    "step_bodies",
+    "step_volumes_m3",
+    "write_step",
+]
 
 _HEADER_TIME = "2000-01-01T00:00:00"
 _COUNTED = re.compile(rb"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\()'\d+',([^;]*);")
+
+
+class Body(NamedTuple):
+    """What a part weighs, and where.
+
+    Attributes:
+        volume_m3: its volume, cubic metres.
+        centre_m: its centre of mass x, y, z, metres.
+    """
+
+    volume_m3: float
+    centre_m: tuple[float, float, float]
 
 
 def _point(x_m: float, y_m: float, z_m: float) -> Any:
@@ -109,6 +133,30 @@ def boxes(corners_m: Iterable[tuple[float, float, float, float, float, float]]) 
     return compound
 
 
+def copies(shape: Any, places_m: Iterable[tuple[float, float]]) -> Any:
+    """Return a compound of copies of a shape, each moved by x, y (metres)."""
+    from OCP.BRep import BRep_Builder
+    from OCP.gp import gp_Trsf, gp_Vec
+    from OCP.TopLoc import TopLoc_Location
+    from OCP.TopoDS import TopoDS_Compound
+
+    builder, compound = BRep_Builder(), TopoDS_Compound()
+    builder.MakeCompound(compound)
+    for x_m, y_m in places_m:
+        move = gp_Trsf()
+        move.SetTranslation(gp_Vec(x_m / MM, y_m / MM, 0))
+        builder.Add(compound, shape.Moved(TopLoc_Location(move)))
+    return compound
+
+
+def slab(surface: Any, thickness_m: float) -> Any:
+    """Return the solid of some thickness (metres) below a face at z = 0."""
+    from OCP.BRepPrimAPI import BRepPrimAPI_MakePrism
+    from OCP.gp import gp_Vec
+
+    return BRepPrimAPI_MakePrism(surface, gp_Vec(0, 0, -thickness_m / MM)).Shape()
+
+
 def _rim(shell: Any, radius_m: float) -> Any:
     """Return the circular edge in which a revolved relief ends at z = 0."""
     from OCP.BRepAdaptor import BRepAdaptor_Curve
@@ -144,18 +192,16 @@ def plate(surface: Any, thickness_m: float, profile_m: list[tuple[float, float]]
     from OCP.BRep import BRep_Builder
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace, BRepBuilderAPI_MakeSolid, BRepBuilderAPI_MakeWire
     from OCP.BRepLib import BRepLib
-    from OCP.BRepPrimAPI import BRepPrimAPI_MakePrism
-    from OCP.gp import gp_Vec
     from OCP.ShapeFix import ShapeFix_Shell
     from OCP.TopoDS import TopoDS_Shell
 
     relief = revolved(profile_m, closed=False)
-    prism = BRepPrimAPI_MakePrism(surface, gp_Vec(0, 0, -thickness_m / MM))
+    prism = slab(surface, thickness_m)
     hole = BRepBuilderAPI_MakeWire(_rim(relief, profile_m[-1][0])).Wire()
     top = BRepBuilderAPI_MakeFace(surface, hole).Face()
     builder, shell = BRep_Builder(), TopoDS_Shell()
     builder.MakeShell(shell)
-    for face in (*(f for f in _faces(prism.Shape()) if not f.IsSame(surface)), top, *_faces(relief)):
+    for face in (*(f for f in _faces(prism) if not f.IsSame(surface)), top, *_faces(relief)):
         builder.Add(shell, face)
     shell.Closed(True)
     fix = ShapeFix_Shell()
@@ -242,14 +288,14 @@ def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
     write_atomic(path, _COUNTED.sub(_recount(), stream.getvalue()))
 
 
-def step_volumes_m3(path: str | Path) -> dict[str, float]:
-    """Read a STEP file back and measure its solids.
+def step_bodies(path: str | Path) -> dict[str, Body]:
+    """Read a STEP file back and weigh its solids.
 
     Args:
         path: the file.
 
     Returns:
-        Cubic metres by part name; parts without a volume are left out.
+        Volume and centre of mass by part name; parts without a volume are left out.
 
     Raises:
         InputError: the file is missing or holds no STEP parts.
@@ -268,11 +314,27 @@ def step_volumes_m3(path: str | Path) -> dict[str, float]:
     except Exception as error:
         cure = "Write the file again from its source."
         raise InputError(str(path), "the file must be STEP with parts in it", str(error), cure) from error
-    volumes = {}
+    bodies = {}
     for shape, name, _, _ in read:
         solids = shape.Solids()
         if not all(solid.isValid() for solid in solids):
             raise CheckFailed([f"{path}: {name} is not a valid solid"])
         if solids:
-            volumes[name.split("/")[-1]] = math.fsum(solid.Volume() for solid in solids) * MM**3
-    return volumes
+            bodies[name.split("/")[-1]] = _body(solids)
+    return bodies
+
+
+def _body(solids: list[Any]) -> Body:
+    volumes = [solid.Volume() for solid in solids]
+    centres = [solid.Center().toTuple() for solid in solids]
+    volume = math.fsum(volumes)
+    x, y, z = (
+        math.fsum(v * c for v, c in zip(volumes, axis, strict=True)) / volume * MM
+        for axis in zip(*centres, strict=True)
+    )
+    return Body(volume * MM**3, (x, y, z))
+
+
+def step_volumes_m3(path: str | Path) -> dict[str, float]:
+    """Read a STEP file back and measure its solids, as `step_bodies` does; cubic metres by part name."""
+    return {name: body.volume_m3 for name, body in step_bodies(path).items()}

@@ -5,7 +5,8 @@ only that a file changed but also what in the drawing is different:
 
 1. Are its bytes those of the manifest (SHA-256)?
 2. Read by this package's own reader, do its polygons give the stored level map, pixel by pixel, without
-   an overlap, an edge off the raster, or a shape that does not belong there?
+   an overlap, an edge off the raster, or a shape that does not belong there? Can every shape be written, and is all of
+   it on the blank (`fab.receipt`)?
 3. Does a library that had no part in the writing (gdstk) see the same?
 
 gdstk is not safe against broken streams. It is therefore given only GDSII files that the own reader
@@ -14,6 +15,7 @@ which refuses what is broken, and then through the own reader.
 """
 
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +31,10 @@ from fab.layout import Layer, PixelEdges, layer_from, pixel_edges
 from fab.levels import Levels
 from fab.manifest import FileEntry, Manifest, map_digest, plane_digest, read_manifest
 from fab.masks import planes
-from fab.models import model_problems
+from fab.modelcheck import model_problems
 from fab.polygons import paint
 from fab.readback import Again
+from fab.receipt import drawing_problems, number_problems
 from fab.stream import oasis_to_gds
 from fab.walker import read_gds
 
@@ -187,6 +190,11 @@ def _check_plane_digests(expected: Expected) -> list[Check]:
     ]
 
 
+def _check_numbers(expected: Expected, reference: NDArray[np.uint8]) -> list[Check]:
+    found = number_problems(expected.manifest, expected.planes, reference)
+    return [Check(file, "numbers of the order form", tuple(problems)) for file, problems in found.items()]
+
+
 def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check, bool]:
     """Return what the own reader finds, and whether the file is fit for a library that trusts it."""
     question = "own reader, every pixel"
@@ -196,12 +204,15 @@ def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check,
         problem = f"it cannot be read: {error.rule}, but got {error.got}"
         return Check(entry.file, question, (problem,)), False
     fit = abs(layout.dbu_m / expected.edges.dbu_m - 1) < 1e-9
-    return Check(entry.file, question, tuple(layout_problems(layout, entry, expected))), fit
+    problems = layout_problems(layout, entry, expected) + drawing_problems(layout, entry, expected)
+    return Check(entry.file, question, tuple(problems)), fit
 
 
 def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
     around = sum(one.polygons for cell in entry.cells for one in cell.layers)
-    most = 2 * (sum(mask.polygons for mask in expected.manifest.masks) + expected.manifest.chrome.polygons + around)
+    does = expected.manifest.drawn().values()
+    etched = sum(one.polygons for drawn in does for one in drawn)
+    most = 2 * (etched + len(does) * expected.manifest.chrome.polygons + around)
     with tempfile.TemporaryDirectory() as folder:
         gds = Path(folder) / "altered.gds"
         try:
@@ -212,12 +223,17 @@ def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
 
 
 def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
-    layers = {layer: mask.polygons for layer, mask in expected.etch_layers(entry).items()}
+    layers: Counter[Layer] = Counter()
+    for drawn in expected.etch_layers(entry).values():
+        layers.update({layer: mask.polygons for layer, mask in drawn.items()})
     chrome = expected.chrome_layer(entry)
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
-    moved = [layer for layer, mask in expected.etch_layers(entry).items() if mask.edge_move_nm]
-    again = Again(expected.manifest.doe_cell, expected.edges, moved)
+    moved = {
+        cell: [layer for layer, mask in drawn.items() if mask.edge_move_nm]
+        for cell, drawn in expected.etch_layers(entry).items()
+    }
+    again = Again(moved, expected.edges)
     others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
@@ -257,7 +273,7 @@ def verify_order(folder: str | Path) -> Report:
         checks = [*byte_checks.values(), *_check_nothing_else(folder, manifest)]
         reference, map_check = _reference(folder, manifest, levels, edges)
         expected = Expected(manifest, planes(reference, levels), edges)
-        checks += [map_check, *_check_plane_digests(expected)]
+        checks += [map_check, *_check_plane_digests(expected), *_check_numbers(expected, reference)]
         for entry in manifest.files:
             if entry.format in (_GDS, _OASIS):
                 checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)

@@ -52,6 +52,14 @@ _SPOILED = "Write the order again, or fetch the file again."
 _BOUNDARY, _LAYER = 4 << 16 | BOUNDARY, 6 << 16 | LAYER
 _ENDEL, _ENDSTR = 4 << 16 | ENDEL, 4 << 16 | ENDSTR
 _SREF, _AREF = 4 << 16 | SREF, 4 << 16 | AREF
+# Records that people know by name and no mask holds.
+_FOREIGN: dict[int | None, str] = {
+    0x0900: "a path",
+    0x0C00: "a text",
+    0x1500: "a node",
+    0x2D00: "a box",
+    0x1A01: "a turned or mirrored reference",
+}
 _MORE, _DONE, _UNEXPECTED, _OPEN, _REFERENCE = 0, 1, 2, 3, 4
 
 
@@ -156,8 +164,8 @@ class _Found:
         }
 
 
-def _refuse(path: str | Path, rule: str, offset: int) -> NoReturn:
-    raise InputError(str(path), rule, f"something else at byte {offset}", _SPOILED)
+def _refuse(path: str | Path, rule: str, offset: int, kind: int | None = None) -> NoReturn:
+    raise InputError(str(path), rule, f"{_FOREIGN.get(kind, 'something else')} at byte {offset}", _SPOILED)
 
 
 class _Stream:
@@ -186,7 +194,7 @@ class _Stream:
         length = self._ahead(4, rule)
         kind = int.from_bytes(self.buffer[2:4].tobytes(), "big")
         if kind not in kinds or length < 4:
-            _refuse(self.path, rule, self.offset)
+            _refuse(self.path, rule, self.offset, kind)
         self._ahead(length, rule)
         data = self.buffer[4:length].tobytes()
         self.drop(length)
@@ -252,7 +260,7 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
             _refuse(stream.path, "every boundary must end at its first point", stream.offset)
         if why == _UNEXPECTED:
             rule = "a cell must hold plain boundaries (layer, datatype, points) and references only"
-            _refuse(stream.path, rule, stream.offset)
+            _refuse(stream.path, rule, stream.offset, int.from_bytes(stream.buffer[2:4].tobytes(), "big"))
         if why == _DONE:
             return Cell(name, found.shapes(), tuple(references))
         if why == _REFERENCE:

@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.build import camera_of, process_of, wafer_of
+from doedesign.build import camera_of, matching, process_of, wafer_of
 from doedesign.drawing import LevelMap
 from doedesign.outlook import PROBE_M, Foretold, foretold
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
 from doedesign.runs import open_run
-from doedesign.spec import Spec
+from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.frame import Frame
@@ -25,13 +25,13 @@ from fab.manifest import map_digest
 from fab.marks import alignment_site
 from fab.masks import unetched_outside
 from fab.order import Order, write_order
+from fab.patch import Patch
 from fab.process import Process, Variation
 from fab.repair import repaired
 from fab.rules import Rules, check
 from fab.runsheet import write_run_sheet
 from fab.sheet import Die, PlateFile, RunSheet
 from fab.verify import Report, verify_order
-from fab.wafer import Wafer
 
 Say = Callable[[str], None]
 
@@ -43,6 +43,9 @@ def write_masks(
     *,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
     probe_m: float = PROBE_M,
+    patch: Patch | None = None,
+    process_file: Path | None = None,
+    wafer_file: Path | None = None,
     say: Say = lambda _: None,
 ) -> tuple[Path, Report]:
     """Write and prove the mask order of a level map.
@@ -53,6 +56,9 @@ def write_masks(
         out: order folder; `masks/NAME` by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
         probe_m: wavelength of the laser that the lab tests the plate with.
+        patch: a window to write as a solid at full resolution, too.
+        process_file: TOML with the process to make it with; that of the run, or an ideal one, if left out.
+        wafer_file: TOML with the wafer to fill; that of the run, or the usual one, if left out.
         say: told what is going on.
 
     Returns:
@@ -66,7 +72,8 @@ def write_masks(
     folder = out or Path("masks") / drawing.name
     spec = open_run(source).spec if source.is_dir() else None
     chrome = Chrome() if spec is None else Chrome(overlap_m=spec.process.chrome_overlap_m)
-    process = _process(spec, drawing.levels)
+    process = _process(spec, drawing.levels, process_file)
+    filled = (spec.wafer if spec else WaferSpec()) if wafer_file is None else load_wafer(wafer_file)
     origin: dict[str, Any] = {
         "kind": "height map" if spec is None else "run",
         "name": drawing.file.name if spec is None else spec.name,
@@ -109,7 +116,8 @@ def write_masks(
         origin,
         chrome=chrome,
         process=process,
-        wafer=Wafer() if spec is None else wafer_of(spec),
+        wafer=wafer_of(filled),
+        patch=patch,
         add=add,
         say=say,
     )
@@ -143,7 +151,10 @@ def _run_sheet(
         opening_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[0],
         wafer=order.wafer,
         places=frame.places,
-        dies=tuple(Die(f"die {number}", x, y) for number, (x, y) in enumerate(frame.dies, 1)),
+        dies=tuple(
+            Die(f"die {number}", x, y, order.splits[split].words)
+            for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
+        ),
         outlook=None if told is None else told.outlook,
     )
     return sheet, None if told is None else told.picture
@@ -161,8 +172,10 @@ def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, sa
         return None
 
 
-def _process(spec: Spec | None, levels: Levels) -> Process:
-    """The process of a spec; for other levels than its own (`--levels`) what it says of the lithography."""
+def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
+    """The process of a file or a spec; for other levels than a spec's (`--levels`) what it says of the lithography."""
+    if file is not None:
+        return matching(levels, process_of(load_process(file), levels), str(file))
     if spec is None:
         return Process(levels)
     made = process_of(spec.process)

@@ -7,8 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from doedesign.etches import heights_of, light_cost
 from doedesign.evaluate import design_metrics, pattern_metrics
-from doedesign.optimize import Design, State, finished_design, initial_state, optimiser_of, steps
+from doedesign.optimize import Design, State, finished_design, initial_state, learns_depths, optimiser_of, steps
 from doedesign.problem import Problem, Scene, problem_of
 from doedesign.progress import meter
 from doedesign.report.pictures import draw_encircled, draw_height, draw_history, draw_mtf, draw_pattern, draw_psfs
@@ -19,11 +20,15 @@ from doedesign.runs import (
     finish_run,
     input_digests,
     load_checkpoint,
+    open_run,
     save_checkpoint,
     write_history,
 )
 from doedesign.spec import Spec, input_files, load_spec
 from fab.files import canonical_json, write_atomic
+from fab.levels import Levels
+from fab.units import NM
+from sim.aperture import circle_coverage
 from sim.psf import PsfBank, psf_bank
 from sim.store import write_height
 from sim.transfer import transfer_bank
@@ -52,16 +57,19 @@ def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), s
     with claim_run(out or Path("runs") / spec.name, spec, inputs) as run:
         if run.done:
             say(f"{run.folder} already holds the finished run of this spec")
-            return run
+            return open_run(run.folder)
         say("preparing sources and propagation")
         problem, scene = problem_of(spec, files)
         state, history = _resume(run, problem, scene, files, say)
         begin_run(run, inputs, overrides)
         state, history = _iterate(run, problem, scene, state, history)
         say("evaluating the design")
-        results = _write_results(run, problem, finished_design(spec, problem, state), history)
-        finish_run(run, inputs, overrides, results)
-    return Run(run.folder, spec, done=True)
+        design = finished_design(spec, problem, state)
+        if spec.process.chooses_depths:
+            say(f"chosen: {design.levels.told}")
+        results = _write_results(run, problem, design, history)
+        finish_run(run, inputs, overrides, results, design.levels.depths_m)
+    return open_run(run.folder)
 
 
 def _resume(
@@ -72,17 +80,21 @@ def _resume(
     optimiser = optimiser_of(run.spec)
     size = len(problem.camera.grid.axis_m("x"))
     shape = (ring_shape(problem),) if problem.radial else (size, size)
-    template = jax.eval_shape(lambda: optimiser.init(np.zeros(shape, np.float32)))
+    # Depths that are learnt stand between the parameters and the moments.
+    shapes = [shape, (run.spec.process.masks,)] if learns_depths(run.spec) else [shape]
+    free = [np.zeros(each, np.float32) for each in shapes]
+    template = jax.eval_shape(lambda: optimiser.init(tuple(free) if len(free) > 1 else free[0]))
     leaves, tree = jax.tree.flatten(template)
-    stored = load_checkpoint(run, [shape, *(leaf.shape for leaf in leaves)])
+    stored = load_checkpoint(run, [*shapes, *(leaf.shape for leaf in leaves)])
     if stored is None:
         say(f'starting from "{run.spec.optimize.start}"')
         start = lambda path: np.asarray(read_any_height(path, pitch_m=run.spec.doe.pitch_m).height_m)  # noqa: E731
         return initial_state(run.spec, problem, scene, files, start), []
     arrays, step, history = stored
     say(f"resuming after step {step}")
-    adam = jax.tree.unflatten(tree, [jax.numpy.asarray(a) for a in arrays[1:]])
-    return State(jax.numpy.asarray(arrays[0]), adam, step), history
+    radians, *stretch = (jax.numpy.asarray(a) for a in arrays[: len(shapes)])
+    adam = jax.tree.unflatten(tree, [jax.numpy.asarray(a) for a in arrays[len(shapes) :]])
+    return State(radians, adam, step, *stretch), history
 
 
 def ring_shape(problem: Problem) -> int:
@@ -102,7 +114,7 @@ def _iterate(
             history.append({"step": record.step, "loss": record.loss, "terms": list(record.terms), "names": names})
             progress.advance(state.step, f"loss {record.loss:.4f}")
             if state.step % every == 0 or state.step == total:
-                arrays = [np.asarray(state.radians), *(np.asarray(leaf) for leaf in jax.tree.leaves(state.adam))]
+                arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.free, state.adam))]
                 save_checkpoint(run, arrays, state.step, history)
     return state, history
 
@@ -113,9 +125,21 @@ def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray) -> PsfBank:
     return psf_bank(problem.camera, height_m, depths, propagation=spec.optics.propagation)
 
 
+def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
+    """The depths that were chosen, and what rounding to them costs, beside 2^k steps (`doedesign.etches`)."""
+    camera, binary = problem.camera, Levels(design.levels.count, design.levels.step_m)
+    area = circle_coverage(camera.grid, camera.aperture_m)
+    heights = heights_of(design.continuous_m, area, binary.period_m, camera)
+    return {
+        "depths_nm": [round(depth / NM, 1) for depth in design.levels.depths_m],
+        "light_cost": light_cost(heights, design.levels),
+        "light_cost_of_equal_steps": light_cost(heights, binary),
+    }
+
+
 def _write_results(run: Run, problem: Problem, design: Design, history: list[dict[str, Any]]) -> list[str]:
     spec, camera = run.spec, problem.camera
-    levels = None if spec.optimize.quantisation == "none" else problem.staircase.levels
+    levels = None if spec.optimize.quantisation == "none" else design.levels
     write_height(run.path("height.exr"), design.drawn_m, camera.grid.pitch_m, spec.doe.aperture_m)
     write_height(run.path("height_continuous.exr"), design.continuous_m, camera.grid.pitch_m, spec.doe.aperture_m)
     write_history(run, history)
@@ -127,6 +151,8 @@ def _write_results(run: Run, problem: Problem, design: Design, history: list[dic
     patterns = pattern_metrics(spec, camera, bank, problem.terms)
     if patterns:
         metrics["patterns"] = patterns
+    if spec.process.chooses_depths:
+        metrics["etches"] = _etch_metrics(problem, design)
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     draw_height(run.path("height.png"), design.drawn_m, levels, camera, spec.name)
     draw_psfs(run.path("psf.png"), camera, bank, near, far)

@@ -69,7 +69,7 @@ def _range_m(heights: Float[np.ndarray, " n"], levels: Levels | None) -> tuple[f
     low, high = (float(heights.min()), float(heights.max())) if heights.size else (0.0, 0.0)
     if levels is not None:
         half = levels.step_m / 2
-        return min(low, 0.0) - half, max(high, (levels.count - 1) * levels.step_m) + half
+        return min(low, 0.0) - half, max(high, levels.total_m) + half
     return (low, high) if high > low else (low - NM, high + NM)
 
 
@@ -169,7 +169,13 @@ def height_shares(
         narrow bins otherwise.
     """
     edges = np.linspace(*ends_m, _FINE_BINS + 1)
-    if levels is not None and heights.size:
+    if levels is not None and heights.size and not levels.is_binary:
+        stairs = levels.by_height()[1]
+        between = (stairs[1:] + stairs[:-1]) / 2
+        if np.abs(heights - stairs[np.searchsorted(between, heights)]).max() < 1e-3 * levels.step_m:
+            edges = np.concatenate([stairs[:1], between, stairs[-1:]])
+            edges[[0, -1]] += np.array([-0.5, 0.5]) * levels.step_m
+    elif levels is not None and heights.size:
         steps = heights / levels.step_m
         whole = np.rint(steps)
         # float32 keeps a level to 1e-6 of a step; a thousandth is far below what any process distinguishes.
@@ -197,11 +203,11 @@ def _draw_shares(
     strip.set_xticks([])
     strip.set_ylabel("height above the deepest floor (nm)", labelpad=3)
     if levels is not None:
-        strip.set_yticks((levels.heights_m() / NM)[:: max(1, levels.count // 16)])
+        strip.set_yticks((levels.by_height()[1] / NM)[:: max(1, levels.count // 16)])
     edges, shares = height_shares(heights, levels, ends_m)
     middles = (edges[:-1] + edges[1:]) / 2 / NM
     fine = len(shares) == _FINE_BINS
-    thickness = (edges[1] - edges[0]) / NM * (1.0 if fine else 0.8)
+    thickness = np.diff(edges) / NM * (1.0 if fine else 0.8)
     hues = look["cmap"](Normalize(low, high)(middles))
     axes.barh(middles, 100 * shares, thickness, color=hues, ec=INK, lw=0.0 if fine else 0.4)
     axes.set_ylim(low, high)

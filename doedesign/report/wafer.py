@@ -24,7 +24,7 @@ def draw_wafer(path: Path, wafer: Wafer, frame: Frame, aperture_m: float, dbu_m:
     Args:
         path: the PNG file.
         wafer: the wafer.
-        frame: the cells around the DOE (`fab.frame.draw_frame`).
+        frame: the cells around the DOE (`fab.frame.draw_frame`); dies that draw it differently bear their number.
         aperture_m: diameter of the clear aperture, metres.
         dbu_m: database unit of the frame, metres.
         title: what stands above.
@@ -39,9 +39,12 @@ def draw_wafer(path: Path, wafer: Wafer, frame: Frame, aperture_m: float, dbu_m:
         axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f3f3f1", edgecolor=INK, lw=1.2))
         axes.add_patch(Circle((0, 0), wafer.diameter_m / 2 / MM, facecolor="white", edgecolor=LINE, lw=1.2))
         side = frame.die_m / MM
-        for x, y in frame.dies:
+        for (x, y), split in zip(frame.dies, frame.splits, strict=True):
             axes.add_patch(Rectangle((x / MM - side / 2, y / MM - side / 2), side, side, fill=False, ec=FAINT, lw=0.8))
             axes.add_patch(Circle((x / MM, y / MM), aperture_m / 2 / MM, facecolor=CHROME, edgecolor="none"))
+            if split:
+                told = {"ha": "left", "va": "top", "fontsize": SMALL, "color": INK}
+                axes.text((x / MM) - 0.46 * side, y / MM + 0.46 * side, f"{split}", **told)
         words = {"SITE": "alignment site", "TEST": "test structures"}
         for reference in around.references:
             kind = reference.cell.rpartition("_")[2]
@@ -58,7 +61,9 @@ def draw_wafer(path: Path, wafer: Wafer, frame: Frame, aperture_m: float, dbu_m:
             f"{format_length(wafer.thickness_m)}, {rows} x {columns} dies {format_length(frame.die_m)} apart.\n"
             f"Seen from the etched side, +y up; {READING}. Grey: clear apertures."
         )
-        note(figure, 0.65, 0.12, told)
+        if any(frame.splits):
+            told += "\nNumbered dies: splits, drawn differently on purpose; the manifest and the run sheet say how."
+        note(figure, 0.65, 0.1, told)
 
 
 def _box(axes: "Axes", cell: Cell, at: Reference, dbu_m: float, words: str) -> None:

@@ -10,6 +10,8 @@ are told together. `spec_warnings` returns what is allowed but probably not mean
     values      the kinds of value a spec holds: lengths, names, options
     table       what all tables have in common
     models      the tables, one per section of the TOML
+    scene       the tables of scene, obstruction and sensor
+    response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good plate
     wafer       the table of the wafer: dies, mask blanks, chrome
     variation   files of their own: a process, the errors of one plate
@@ -32,6 +34,7 @@ from doedesign.spec.models import (
     ColourSpec,
     DoeSpec,
     ObjectiveSpec,
+    ObstructionSpec,
     OpticsSpec,
     OptimizeSpec,
     SceneSpec,
@@ -40,10 +43,12 @@ from doedesign.spec.models import (
 )
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, EtchSpec, LimitSpec, ProcessSpec, SpreadSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
+from doedesign.spec.response import with_response
 from doedesign.spec.table import Table, toml_key
 from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
 from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
 from doedesign.spec.variation import ProcessFile, VariationFile
+from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError
 from fab.files import explain_os_error
 from fab.process import Variation
@@ -59,6 +64,7 @@ __all__ = [
     "EtchSpec",
     "LimitSpec",
     "ObjectiveSpec",
+    "ObstructionSpec",
     "OpticsSpec",
     "OptimizeSpec",
     "Options",
@@ -68,11 +74,13 @@ __all__ = [
     "Spec",
     "SpecError",
     "SpreadSpec",
+    "WaferSpec",
     "explain",
     "input_files",
     "load_process",
     "load_spec",
     "load_variation",
+    "load_wafer",
     "process_from_json",
     "process_to_toml",
     "spec_digest",
@@ -98,13 +106,15 @@ def load_spec(path: str | Path, overrides: Sequence[str] = ()) -> Spec:
             by their number) and a TOML value; quotes round text may be left out.
 
     Returns:
-        The spec with every default filled in. Files it names are not opened; see `input_files`.
+        The spec with every default filled in. Files it names are not opened (see `input_files`), but for a spectral
+        response, whose colours become part of the spec.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
     raw = _read_toml(Path(path), "a spec")
     keys = [_override(raw, text) for text in overrides]
+    raw = with_response(raw, Path(path))
     try:
         spec = Spec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
     except ValidationError as error:
@@ -138,12 +148,29 @@ def load_process(path: str | Path) -> ProcessSpec:
     Raises:
         InputError: the file cannot be read, is no TOML, has no process, or breaks a rule.
     """
-    raw = _read_toml(Path(path), "a process")
-    others = {toml_key(name) for name in Spec.model_fields} - {"process"}
-    process = _model_of_toml(ProcessFile, {key: raw[key] for key in raw if key not in others}, str(path)).process
+    raw = _alone(_read_toml(Path(path), "a process"), "process")
+    process = _model_of_toml(ProcessFile, raw, str(path)).process
     if problems := [p._replace(key=key_as_written(p.key, raw)) for p in process_problems(process)]:
         raise spec_error(str(path), problems)
     return process
+
+
+def load_wafer(path: str | Path) -> WaferSpec:
+    """Read a wafer from the `[wafer]` table of a TOML file: a file of its own, or a whole spec.
+
+    Args:
+        path: the file. Other tables of a spec are passed over.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, has no wafer, or breaks a rule.
+    """
+    return _model_of_toml(WaferFile, _alone(_read_toml(Path(path), "a wafer"), "wafer"), str(path)).wafer
+
+
+def _alone(raw: Mapping[str, Any], table: str) -> dict[str, Any]:
+    """What was read without the other tables of a spec."""
+    others = {toml_key(name) for name in Spec.model_fields} - {table}
+    return {key: raw[key] for key in raw if key not in others}
 
 
 def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
@@ -241,6 +268,7 @@ def _read_toml(path: Path, what: str) -> dict[str, Any]:
 _EXAMPLES = {
     "a spec": "examples/quick.toml",
     "a process": "the [process] table of examples/automotive.toml",
+    "a wafer": "`[wafer]` with `dies = [2, 2]`",
     "a variation": "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`",
 }
 

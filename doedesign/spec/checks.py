@@ -4,6 +4,7 @@ A broken rule is a `Problem`; a doubt is a sentence. Neither changes the spec.
 """
 
 import math
+import operator
 from collections.abc import Iterator
 
 from doedesign.spec.errors import Problem
@@ -37,6 +38,8 @@ def find_problems(spec: Spec) -> list[Problem]:
         _aperture,
         _opening,
         _sensor,
+        _efficiencies,
+        _mosaic,
         _depth_order,
         _source_sampling,
         _fresnel_sampling,
@@ -71,6 +74,24 @@ def _sensor(spec: Spec) -> Iterator[Problem]:
             f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens",
             format_length(defocus),
             "Choose a smaller defocus.",
+        )
+
+
+def _efficiencies(spec: Spec) -> Iterator[Problem]:
+    given, colours = len(spec.sensor.quantum_efficiency), len(spec.optics.colours)
+    if given not in (0, 1, colours):
+        rule = f"must be one number or one per colour, {colours} here"
+        yield Problem("sensor.quantum_efficiency", rule, f"{given}", "Add or remove numbers.")
+
+
+def _mosaic(spec: Spec) -> Iterator[Problem]:
+    means = [sum(map(operator.mul, c.wavelengths_m, c.weights)) for c in spec.optics.colours]
+    if spec.sensor.bayer and not (len(means) == 3 and means[0] > means[1] > means[2]):
+        yield Problem(
+            "sensor.bayer",
+            "a mosaic needs three colours, from the longest wavelength to the shortest",
+            ", ".join(colour.name for colour in spec.optics.colours),
+            "State the colours as red, green, blue, or leave `bayer` out.",
         )
 
 

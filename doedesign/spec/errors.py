@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from doedesign.spec.models import Spec
+from doedesign.spec.response import RESPONSE_KEYS
 from doedesign.spec.table import Table, toml_key
 from doedesign.spec.values import nearest
 from fab.errors import InputError
@@ -190,7 +191,7 @@ def _model_of(field: FieldInfo) -> type[Table] | None:
 
 def _keys(table: type[Table]) -> list[str]:
     keys = [toml_key(name) for name in table.model_fields]
-    return [*keys, "wavelengths"] if "colours" in keys else keys
+    return [*keys, "wavelengths", *RESPONSE_KEYS] if "colours" in keys else keys
 
 
 def _tables(root: type[Table], path: str = "") -> Iterator[tuple[str, type[Table]]]:

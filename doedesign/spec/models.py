@@ -3,7 +3,7 @@
 An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
 (`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
 Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both. The tables of the process are in
-`process`.
+`process`, those of scene and sensor in `scene`.
 """
 
 from typing import Annotated, Any, Literal
@@ -11,17 +11,15 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from doedesign.spec.process import LimitSpec, ProcessSpec
+from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import Table, unsaid
 from doedesign.spec.values import (
     FROM_TOML,
     Aperture,
     ColourName,
     Count,
-    Defocus,
-    FarDepth,
     FocalLength,
     Material,
-    NearDepth,
     ObjectiveName,
     Options,
     OptionsTable,
@@ -39,6 +37,7 @@ __all__ = [
     "ColourSpec",
     "DoeSpec",
     "ObjectiveSpec",
+    "ObstructionSpec",
     "OpticsSpec",
     "OptimizeSpec",
     "SceneSpec",
@@ -80,7 +79,8 @@ class OpticsSpec(Table, frozen=True):
         focal_length_m: focal length of the camera lens the DOE sits on.
         design_wavelength_m: wavelength at which the full height of the levels should be one wave.
         colours: colour channels, in the order of a PSF bank's first axis. In TOML, `wavelengths = ["656 nm",
-            "589 nm"]` is short for one channel of one wavelength each, named after it ("656nm").
+            "589 nm"]` is short for one channel of one wavelength each, named after it ("656nm"), and
+            `spectral_response = "camera.csv"` for those of a measured camera (`doedesign.spec.response`).
         propagation: "far_field" (the lens cancels the quadratic phase, paper eqs. 7-9) or "fresnel" (the wave is
             propagated from the lens to the sensor, eq. 5; needs a fine pitch, eq. 6).
     """
@@ -126,49 +126,6 @@ class DoeSpec(Table, frozen=True):
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
     aperture_m: Aperture = Field(examples=['"4.44 mm"'])
     material: Material = Field(examples=['"fused_silica"'])
-
-
-class SceneSpec(Table, frozen=True):
-    """Where light comes from, measured from the plate.
-
-    Attributes:
-        near_m: depths of the obstruction; may be empty where no objective looks at it.
-        far_m: depths of the scene behind it; "inf" in TOML for a star.
-    """
-
-    near_m: tuple[NearDepth, ...] = ()
-    far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
-
-
-class SensorSpec(Table, frozen=True):
-    """The sensor behind the lens.
-
-    Attributes:
-        pitch_m: distance of neighbouring photosites.
-        resolution: photosites along x and along y (as in "4000 x 3000").
-        binning: photosites per pixel and axis.
-        window: pixels per side of the square, centred on the chief ray, over which PSFs are computed; binned.
-        fill_factor: side of a pixel's light-sensitive square over its pitch; a length ratio, so 0.9 collects
-            81 % of the light.
-        defocus_m: distance of the sensor beyond the focal plane.
-    """
-
-    pitch_m: Pitch = Field(examples=['"1.85 um"'])
-    resolution: tuple[Count, Count] = Field(examples=["[4000, 3000]"])
-    binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
-    window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
-    fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
-    defocus_m: Defocus = 0.0
-
-    @property
-    def pixel_m(self) -> float:
-        """Distance of neighbouring pixels after binning."""
-        return self.pitch_m * self.binning
-
-    @property
-    def window_m(self) -> float:
-        """Side of the window."""
-        return self.pixel_m * self.window
 
 
 class OptimizeSpec(Table, frozen=True):
@@ -224,6 +181,7 @@ class Spec(Table, frozen=True):
         process: what the fab lab makes.
         scene: where light comes from.
         sensor: the sensor behind the lens.
+        obstruction: what stands before the scene.
         optimize: how the height map is found.
         objectives: what it is judged by; `[[objective]]` in TOML.
         limits: when a plate is good; `[[limit]]` in TOML.
@@ -236,6 +194,7 @@ class Spec(Table, frozen=True):
     process: ProcessSpec
     scene: SceneSpec
     sensor: SensorSpec
+    obstruction: ObstructionSpec | None = unsaid()
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
     limits: tuple[LimitSpec, ...] = unsaid(())

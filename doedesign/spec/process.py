@@ -55,12 +55,28 @@ Density = Annotated[float, share(0.0, 1e4)]
 Chance = Annotated[float, share(0.0, 1.0)]
 
 
+OPTIMIZE: Literal["optimize"] = "optimize"
+_DEPTHS: TypeAdapter[tuple[float, ...]] = TypeAdapter(Annotated[tuple[Etch, ...], Field(min_length=1)])
+
+
+def _etch_depths(value: Any, info: ValidationInfo) -> tuple[float, ...] | Literal["optimize"]:
+    if value == OPTIMIZE:
+        return OPTIMIZE
+    if not isinstance(value, list | tuple):
+        raise broken(f'must be a list of depths or "{OPTIMIZE}"', 'For example ["75 nm", "150 nm"] for 4 levels.')
+    return _DEPTHS.validate_python(value, context=info.context)
+
+
+# Any, as below, because the serialiser of what stands here would be wary of a union; `_etch_depths` says what it holds.
+_EtchDepths = Annotated[Any, PlainValidator(_etch_depths)]
+
+
 class EtchSpec(Table, frozen=True):
     """One etch.
 
     Attributes:
         mask: the mask, k = 0 for the shallowest.
-        depth_m: its depth; always 2^k level steps, and checked where it is given.
+        depth_m: its depth; always that of `ProcessSpec.etch_depths_m`, and checked where it is given.
     """
 
     inline: ClassVar[bool] = True
@@ -192,7 +208,9 @@ class ProcessSpec(Table, frozen=True):
 
     Attributes:
         levels: number of heights L, a power of two.
-        level_step_m: height of one level.
+        level_step_m: height of one level; `levels` times this is the height of one wave of the design.
+        etch_depths_m: depth of every mask, mask 0 first, where it is not 2^k level steps; "optimize" has
+            `doedesign optimize` choose them.
         chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
             little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
         stock: a process of `fab.stock.STOCK` that stands in for what is not given here.
@@ -208,6 +226,7 @@ class ProcessSpec(Table, frozen=True):
 
     levels: LevelCount = Field(examples=["16"])
     level_step_m: LevelStep = Field(examples=['"75 nm"'])
+    etch_depths_m: _EtchDepths = unsaid()
     chrome_overlap_m: ChromeOverlap = 5e-6
     stock: Annotated[str, AfterValidator(_stock_name)] | None = unsaid()
     etches: tuple[EtchSpec, ...] = unsaid(())
@@ -224,6 +243,19 @@ class ProcessSpec(Table, frozen=True):
         """Number of etch masks."""
         return self.levels.bit_length() - 1
 
+    @property
+    def chooses_depths(self) -> bool:
+        """Whether `doedesign optimize` is to choose the depths of the etches."""
+        return self.etch_depths_m == OPTIMIZE
+
+    def depth_m(self, mask: int) -> float:
+        """Return what a mask etches; 2^k level steps where depths are still to be chosen."""
+        depths = self.etch_depths_m
+        # A list that is too short is told of elsewhere.
+        if isinstance(depths, tuple) and mask < len(depths):
+            return depths[mask]
+        return 2**mask * self.level_step_m
+
     def filled(self) -> "ProcessSpec":
         """Return the process with everything given: by itself, by its stock process, or as the ideal process has it."""
         stock = STOCK[self.stock] if self.stock else IDEAL
@@ -233,7 +265,7 @@ class ProcessSpec(Table, frozen=True):
             "minimum_space_m": stock.minimum_space_m.value,
             "die_m": (0.0, 0.0),
             "wafer_radius_m": stock.wafer_radius_m.value,
-            "etches": tuple(EtchSpec(mask=mask) for mask in range(self.masks)),
+            "etches": tuple(EtchSpec(mask=mask) for mask in sorted(range(self.masks), key=self.depth_m)),
         }
         tables = {"errors": _filled_errors(self.errors, stock), "defects": _filled_defects(self.defects, stock)}
         return self.model_copy(update=usual | self.said() | tables)

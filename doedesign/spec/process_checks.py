@@ -13,6 +13,8 @@ from doedesign.spec.process import ProcessSpec
 from doedesign.spec.table import toml_key
 from doedesign.spec.values import nearest
 from doedesign.spec.variation import VariationFile
+from fab.errors import InputError
+from fab.levels import Levels
 from fab.units import format_length
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "wafer_problem",
 ]
 
+_SET = "process.etch_depths"
 _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all others exist at every depth
 
 
@@ -33,6 +36,7 @@ def process_problems(process: ProcessSpec) -> Iterator[Problem]:
     Args:
         process: a process whose single values are valid.
     """
+    yield from _depths(process)
     yield from _etches(process)
     yield from _one_value_per_mask(process)
     defects = process.filled().defects
@@ -51,15 +55,29 @@ def _etches(process: ProcessSpec) -> Iterator[Problem]:
         rule = f"every mask of {process.levels} levels, 0 to {process.masks - 1}, must be etched once"
         yield Problem("process.etches", rule, ", ".join(wrong + beyond), "List each mask once.")
     for index, etch in enumerate(process.etches):
-        due_m = 2**etch.mask * process.level_step_m
+        if etch.depth_m is None or etch.mask >= process.masks:
+            continue
+        key, got = f"process.etches[{index}].depth", format_length(etch.depth_m)
+        if process.chooses_depths:
+            rule = f"must not be given where {_SET} is to be chosen"
+            yield Problem(key, rule, got, f"Leave it out, or give all depths as {_SET}.")
+            continue
+        due_m = process.depth_m(etch.mask)
         # A part in a million is far below what an etch holds, and above what decimals lose.
-        if etch.depth_m is not None and not math.isclose(etch.depth_m, due_m, rel_tol=1e-6):
-            yield Problem(
-                f"process.etches[{index}].depth",
-                f"mask {etch.mask} must etch 2^{etch.mask} level steps, {format_length(due_m)}",
-                format_length(etch.depth_m),
-                "Correct the depth, or leave it out.",
-            )
+        if not math.isclose(etch.depth_m, due_m, rel_tol=1e-6):
+            what = f"2^{etch.mask} level steps" if process.etch_depths_m is None else f"as deep as in {_SET}"
+            rule = f"mask {etch.mask} must etch {what}, {format_length(due_m)}"
+            yield Problem(key, rule, got, "Correct the depth, or leave it out.")
+
+
+def _depths(process: ProcessSpec) -> Iterator[Problem]:
+    """Yield what is wrong with the set of depths."""
+    if not isinstance(process.etch_depths_m, tuple):
+        return
+    try:
+        Levels(process.levels, process.level_step_m, process.etch_depths_m)
+    except InputError as error:
+        yield Problem(_SET, error.rule, str(error.got), error.cure)
 
 
 def _one_value_per_mask(process: ProcessSpec) -> Iterator[Problem]:

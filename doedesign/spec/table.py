@@ -1,8 +1,9 @@
 """What all tables of a spec have in common: frozen, strict about keys, units in the names of attributes.
 
 An attribute that holds a length ends in `_m` and is metres, one that holds an angle ends in `_rad`; its TOML key has no
-suffix and is text with a unit. What a table need not say (`unsaid`) leaves no trace in JSON or TOML where it is not
-said, so a spec that knows nothing of a newer key keeps its digest.
+suffix and is text with a unit. A number of electrons ends in `_e`, which its TOML key has not. What a table need not
+say (`unsaid`) leaves no trace in JSON or TOML where it is not said, so a spec that knows nothing of a newer key keeps
+its digest.
 """
 
 from typing import Any, ClassVar
@@ -17,7 +18,7 @@ _SINGULAR = {"objectives": "objective", "limits": "limit", "particles": "particl
 
 def toml_key(attribute: str) -> str:
     """Return the TOML key of an attribute: the name without its unit."""
-    return _SINGULAR.get(attribute, attribute.removesuffix("_m").removesuffix("_rad"))
+    return _SINGULAR.get(attribute, attribute.removesuffix("_m").removesuffix("_rad").removesuffix("_e"))
 
 
 def unsaid(default: Any = None) -> Any:

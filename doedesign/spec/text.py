@@ -81,6 +81,8 @@ def _text(name: str, value: Any) -> str:
         return f"{{ {', '.join(parts)} }}" if "mean" in value.said() else _text(name, value.sigma)
     if isinstance(value, Table):
         return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.said().items())} }}"
+    if isinstance(value, str):
+        return _value_text(value)
     if name.endswith("_m"):
         return '"inf"' if value == float("inf") else _quantity_text(value, "m", format_length, parse_length)
     if name.endswith("_rad"):

@@ -6,13 +6,14 @@ from pydantic import Field
 
 from doedesign.spec.table import Table, unsaid
 from doedesign.spec.values import length
-from fab.units import MM
+from fab.units import MM, UM
 from fab.wafer import Wafer
 
-__all__ = ["WaferSpec"]
+__all__ = ["WaferFile", "WaferSpec"]
 
 Size = Annotated[float, length(1 * MM, 0.5)]
 Thickness = Annotated[float, length(0.01 * MM, 50 * MM)]
+Move = Annotated[float, length(-100 * UM, 100 * UM)]
 Dies = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
 _USUAL = Wafer()
@@ -30,6 +31,8 @@ class WaferSpec(Table, frozen=True):
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: "liftoff" or "etch".
         compensate: whether masks are drawn against the mean line-width bias of the process.
+        line_splits_m: for each entry one die whose edges of etched areas are drawn so much further out.
+        order_control: whether one die draws the planes in the opposite order of depths.
     """
 
     diameter_m: Size = unsaid(_USUAL.diameter_m)
@@ -40,3 +43,15 @@ class WaferSpec(Table, frozen=True):
     zero_layer: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.zero_layer)
     chrome: Literal["liftoff", "etch"] = unsaid(_USUAL.chrome)
     compensate: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.compensate)
+    line_splits_m: tuple[Move, ...] = unsaid(_USUAL.line_splits_m)
+    order_control: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.order_control)
+
+
+class WaferFile(Table, frozen=True):
+    """A file that holds a wafer.
+
+    Attributes:
+        wafer: the wafer.
+    """
+
+    wafer: WaferSpec

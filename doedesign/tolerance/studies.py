@@ -51,6 +51,7 @@ from doedesign.tolerance.pool import (
 from doedesign.tolerance.sensitivity import Change, Share, one_at_a_time, sobol
 from fab.errors import InputError
 from fab.files import sha256_bytes
+from fab.levels import Levels
 from fab.process import ERRORS, Process, Spread, Variation, error_names
 
 if TYPE_CHECKING:
@@ -337,7 +338,7 @@ def _process(given: "str | Path | Process | None", spec: Any, drawn: "Drawn") ->
         return process_for(drawn.levels, spec.process, None if given is None else Path(given))
     if given is None:
         return Process(drawn.levels)
-    return matching(drawn.levels, process_of(load_process(Path(given))), str(given))
+    return matching(drawn.levels, process_of(load_process(Path(given)), drawn.levels), str(given))
 
 
 def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
@@ -384,6 +385,12 @@ def _at_least(least: int, name: str, value: int) -> int:
     return value
 
 
+def _levels_record(levels: Levels) -> dict[str, Any]:
+    """A staircase as JSON; depths that follow from the step stay unsaid, as they were before there were others."""
+    depths = {} if levels.is_binary else {"depths_m": list(levels.depths_m)}
+    return {"count": levels.count, "step_m": levels.step_m, **depths}
+
+
 def identity(drawn: "Drawn", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Everything a plate's numbers depend on besides its key, as JSON.
 
@@ -398,7 +405,7 @@ def identity(drawn: "Drawn", process: Process, seed: int, evaluate: Evaluate) ->
             "name": drawn.name,
             "level_sha256": sha256_bytes(drawn.level.tobytes()),
             "shape": [ny, nx],
-            "levels": asdict(drawn.levels),
+            "levels": _levels_record(drawn.levels),
             "camera": asdict(drawn.camera),
             "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*drawn.near_m, *drawn.far_m)],
             "near": len(drawn.near_m),

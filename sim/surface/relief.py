@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.levels import Levels
 from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
@@ -160,8 +161,15 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
         bowl=jnp.asarray(variation.radial_nonuniformity, jnp.float32) / radius**2,
         tilt=tilt / radius,
         rough_m=rough_m,
-        height_m=jnp.float32(process.levels.count - 1) * jnp.float32(process.levels.step_m),
+        height_m=_blank_m(process.levels),
     )
+
+
+def _blank_m(levels: Levels) -> Array:
+    """Height of the blank glass above the deepest floor."""
+    if levels.is_binary:
+        return jnp.float32(levels.count - 1) * jnp.float32(levels.step_m)
+    return jnp.asarray(levels.total_m, jnp.float32)
 
 
 def require_possible(grid: Grid, process: Process, variation: Variation) -> None:

@@ -7,6 +7,7 @@ from doedesign.report.wafer import draw_wafer
 from fab.frame import draw_frame
 from fab.levels import Levels
 from fab.part import plates_of
+from fab.split import splits_of
 from fab.wafer import Wafer
 
 
@@ -16,7 +17,7 @@ def drawn(path, wafer):
         wafer,
         plates_of(levels, (0, 1), "clear", wafer.chrome, wafer.zero_layer),
         levels,
-        doe_cell="A_DOE",
+        splits=splits_of(wafer, levels, (0,) * levels.bits, 1e-9),
         stem="A",
         digest="0" * 64,
         pitch_m=2e-6,

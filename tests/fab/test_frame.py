@@ -9,6 +9,7 @@ from fab.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
 from fab.layout import Cell, Layer, Layout, Shapes
 from fab.levels import Levels
 from fab.part import plates_of
+from fab.split import splits_of
 from fab.stream import write_gds
 from fab.wafer import Wafer
 
@@ -23,7 +24,7 @@ def framed(wafer=None, chrome_m=7.4e-3, order=(0, 1, 2, 3)):
         wafer,
         plates,
         LEVELS,
-        doe_cell="A_DOE",
+        splits=splits_of(wafer, LEVELS, (0,) * LEVELS.bits, 1e-9),
         stem="A",
         digest="ab" * 32,
         pitch_m=1.85e-6,

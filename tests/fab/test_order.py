@@ -32,6 +32,7 @@ NAMES = [
     "DOE_SMALL_RELIEF.glb",
     "DOE_SMALL_RELIEF_MM.stl",
     "DOE_SMALL_SAG.DAT",
+    "DOE_SMALL_WAFER.step",
     "manifest.json",
 ]
 

@@ -4,20 +4,18 @@ import cadquery
 import numpy as np
 import pytest
 
-from fab.cells import Window
 from fab.errors import InputError
-from fab.grid import Grid
-from fab.levels import Levels, height_of
 from fab.solid import (
     ChromeRing,
     Rings,
     Substrate,
-    patch_step,
-    patch_volume_m3,
+    substrate_bodies,
     substrate_step,
     substrate_volumes_m3,
+    wafer_bodies,
+    wafer_step,
 )
-from fab.step import step_volumes_m3
+from fab.step import step_bodies, step_volumes_m3
 from fab.units import MM, NM, UM
 
 DIE = Substrate("die", 10 * MM, 0.5 * MM)
@@ -25,7 +23,6 @@ WAFER = Substrate("wafer", 100 * MM, 0.5 * MM)
 FLAT = Substrate("wafer", 100 * MM, 0.5 * MM, 32.5 * MM)
 CHROME = ChromeRing(2.195 * MM, 3.7 * MM)
 APERTURE = 4.4 * MM
-SIXTEEN = Levels(16, 75 * NM)
 # The kernel integrates planes and cylinders in closed form; what is left is float64 of millimetres in text.
 CLOSE = 1e-12
 
@@ -56,8 +53,10 @@ def test_a_plate_reads_back_with_the_volumes_of_closed_form(tmp_path, substrate,
 def test_volumes_of_closed_form_by_hand():
     # Two rings of 1 and 2 mm, 1 um and 0.5 um deep.
     rings = Rings(np.array([1 * MM, 2 * MM]), np.array([0.0, 0.5 * UM]), 1 * UM)
-    assert rings.removed_m3 == pytest.approx(math.pi * (1 * 1e-3 + 3 * 0.5e-3) * 1e-9, rel=1e-14)
-    assert substrate_volumes_m3(DIE, None, rings) == pytest.approx({"SUBSTRATE": 50e-9 - rings.removed_m3}, rel=1e-14)
+    assert rings.removed.volume_m3 == pytest.approx(math.pi * (1 * 1e-3 + 3 * 0.5e-3) * 1e-9, rel=1e-14)
+    assert substrate_volumes_m3(DIE, None, rings) == pytest.approx(
+        {"SUBSTRATE": 50e-9 - rings.removed.volume_m3}, rel=1e-14
+    )
     # The cut-off segment by its chord: half of the wafer if the flat is the diameter, almost.
     half = Substrate("wafer", 2 * MM, MM, 2 * MM * (1 - 1e-15))
     assert half.area_m2 == pytest.approx(math.pi / 2 * 1e-6, rel=1e-6)
@@ -68,7 +67,48 @@ def test_the_relief_is_measured_and_not_only_the_bulk(tmp_path):
     substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
     removed = bare - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
     # The relief is 2e-4 of the glass, so it comes out with four digits less.
-    assert removed == pytest.approx(rings.removed_m3, rel=1e-8)
+    assert removed == pytest.approx(rings.removed.volume_m3, rel=1e-8)
+
+
+@pytest.mark.parametrize("substrate", [DIE, WAFER, FLAT], ids=["die", "wafer", "wafer with a flat"])
+def test_every_part_has_its_centre_of_mass_where_closed_form_puts_it(tmp_path, substrate):
+    for rings in (None, some_rings()):
+        substrate_step(tmp_path / "p.step", substrate, APERTURE, CHROME, rings)
+        found, want = step_bodies(tmp_path / "p.step"), substrate_bodies(substrate, CHROME, rings)
+        for name, body in want.items():
+            # A hundredth of a nanometre: the kernel keeps 1e-12 of what is 50 mm large.
+            assert found[name].centre_m == pytest.approx(body.centre_m, abs=1e-11)
+    # A semidisc lies 4 R / 3 pi off its diameter.
+    half = Substrate("wafer", 2 * MM, MM, 2 * MM * (1 - 1e-15))
+    assert half.body.centre_m[1] == pytest.approx(4 * MM / (3 * math.pi), rel=1e-6)
+    # 100 um^2 of ring 1 um deep, taken from a cube of 1 mm: its middle sinks.
+    rings = Rings(np.array([0.1 * MM]), np.array([0.0]), 1 * UM)
+    cube, gone = Substrate("die", MM, MM), math.pi * 1e-8 * 1e-6
+    want = (-0.5e-3 * 1e-9 + 0.5e-6 * gone) / (1e-9 - gone)
+    assert substrate_bodies(cube, None, rings)["SUBSTRATE"].centre_m[2] == pytest.approx(want, rel=1e-15)
+
+
+@pytest.mark.parametrize("wafer", [WAFER, FLAT], ids=["round", "with a flat"])
+def test_a_wafer_carries_the_chrome_of_every_die(tmp_path, wafer):
+    places = [(-10 * MM, 5 * MM), (0.0, 0.0), (20 * MM, -30 * MM)]
+    wafer_step(tmp_path / "w.step", wafer, APERTURE, CHROME, places)
+    found, want = step_bodies(tmp_path / "w.step"), wafer_bodies(wafer, CHROME, places)
+    assert set(found) == set(want) == {"SUBSTRATE", "CHROME"}
+    for name, body in want.items():
+        assert found[name].volume_m3 == pytest.approx(body.volume_m3, rel=CLOSE)
+        assert found[name].centre_m == pytest.approx(body.centre_m, abs=1e-11)
+    shapes = shapes_of(tmp_path / "w.step")
+    rings = [solid.Center().toTuple()[:2] for solid in shapes["CHROME"].Solids()]
+    discs = [face.Center().toTuple()[:2] for face in shapes["DATUM_CLEAR_APERTURE"].Faces()]
+    for got in (rings, discs):
+        assert np.array(sorted(got)) == pytest.approx(np.array([(-10, 5), (0, 0), (20, -30)]), abs=1e-9)
+
+
+@pytest.mark.parametrize("place", [(0.0, 46.5 * MM), (0.0, -43.8 * MM)], ids=["rim", "flat"])
+def test_a_die_beyond_the_wafer_is_refused(tmp_path, place):
+    with pytest.raises(InputError, match="the dies must lie on it"):
+        wafer_step(tmp_path / "w.step", FLAT, APERTURE, CHROME, [place])
+    assert not list(tmp_path.iterdir())
 
 
 def test_parts_lie_at_the_datum(tmp_path):
@@ -125,7 +165,7 @@ def test_nanometre_rings_and_steps_survive(tmp_path):
     substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
     removed = substrate_volumes_m3(DIE)["SUBSTRATE"] - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
     # 2.5e-20 m3 of 5e-8 m3: less than the last digit of the volume of the glass.
-    assert removed == pytest.approx(rings.removed_m3, abs=5e-8 * 1e-14)
+    assert removed == pytest.approx(rings.removed.volume_m3, abs=5e-8 * 1e-14)
     planes = [f for f in shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces() if f.geomType() == "PLANE"]
     assert len(planes) == 6 + 199  # those of the die and one per ring
 
@@ -148,51 +188,6 @@ def test_writing_prints_nothing(tmp_path, capfd):
     substrate_step(tmp_path / "p.step", DIE, APERTURE)
     step_volumes_m3(tmp_path / "p.step")
     assert capfd.readouterr() == ("", "")
-
-
-PATCHES = {
-    "one pixel": [[5]],
-    "a row": [[0, 15, 15, 3]],
-    "kissing corners": [[15, 0], [0, 15]],
-    "empty plane": [[0] * 4] * 3,
-    "full plane": [[15] * 3] * 5,
-}
-
-
-@pytest.mark.parametrize("level_map", PATCHES.values(), ids=PATCHES.keys())
-def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
-    level_map = np.array(level_map, dtype=np.uint8)
-    grid = Grid(level_map.shape, 1.85 * UM)
-    window = Window(0, 0, *level_map.shape)
-    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window, UM)
-    want = (height_of(level_map, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
-    assert patch_volume_m3(level_map, SIXTEEN, grid, window, UM) == pytest.approx(want, rel=1e-14)
-    # Edges of 1e-3 mm are written with 15 digits.
-    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx({"PATCH": want}, rel=1e-11)
-
-
-def test_a_patch_lies_where_its_window_does(tmp_path):
-    level_map = np.random.default_rng(2).integers(0, 16, (20, 30)).astype(np.uint8)
-    level_map[5, 8] = 15
-    grid, window = Grid((20, 30), UM), Window(5, 8, 4, 6)
-    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window)
-    box = sizes(shapes_of(tmp_path / "p.step")["PATCH"])
-    # From the blank surface down to the deepest floor and 10 um more.
-    assert box == pytest.approx([-7e-3, -1e-3, -5e-3, -1e-3, -11.125e-3, 0], abs=1e-6)
-    want = patch_volume_m3(level_map, SIXTEEN, grid, window)
-    assert step_volumes_m3(tmp_path / "p.step")["PATCH"] == pytest.approx(want, rel=1e-11)
-
-
-def test_patches_too_large_for_step_are_refused_with_the_number_of_boxes(tmp_path):
-    level_map = (np.indices((50, 50)).sum(axis=0) % 2).astype(np.uint8)
-    grid = Grid((50, 50), UM)
-    with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2500 in 50 x 50 pixels.*mesh"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 50, 50))
-    with pytest.raises(InputError, match="1 to 20000 boxes"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 5, 5), most_boxes=20_001)
-    with pytest.raises(InputError, match="window"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 46, 5, 5))
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -132,3 +132,48 @@ def test_a_map_may_say_more_than_its_file(cli, tmp_path):
     assert cli("masks", tmp_path / "plate.exr", *levels, "--pitch-um", 3, "--aperture", "50 um").code == 0
     manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
     assert (manifest["pitch_um"], manifest["aperture_mm"]) == (3, 0.05)
+
+
+FILE = """
+[process]
+levels = 16
+level_step = "75 nm"
+minimum_line = "3 um"
+minimum_space = "3 um"
+
+[process.errors.common_cd_bias]
+mean = "-50 nm"
+
+[wafer]
+diameter = "150 mm"
+blank = "7 in"
+dies = [2, 2]
+compensate = true
+line_splits = ["-100 nm"]
+"""
+
+
+def test_a_bare_map_may_have_a_process_and_a_wafer_of_its_own(cli, tmp_path):
+    height = np.kron(np.random.default_rng(3).integers(0, LEVELS, (7, 8)), np.ones((2, 2))) * STEP_M
+    options = write_map(tmp_path / "a.npy", height, "npy")
+    (tmp_path / "lab.toml").write_text(FILE.replace('"7 in"', '"178 mm"'))
+    lab = ("--process", tmp_path / "lab.toml", "--wafer", tmp_path / "lab.toml")
+    done = cli("masks", tmp_path / "a.npy", *options, *lab, "--out", tmp_path / "order")
+    assert done.code == 0, done.err
+    manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
+    assert manifest["wafer"]["diameter_mm"] == 150
+    assert len(manifest["wafer"]["dies_mm"]) == 4
+    assert [mask["edge_move_nm"] for mask in manifest["masks"]] == [50] * 4
+    assert [layer["edge_move_nm"] for layer in manifest["splits"][0]["layers"]] == [-50] * 4
+    # The rim of the aperture cuts blocks of 4 um down to single pixels.
+    assert "narrower than the 3 um that the process prints" in done.err
+    refused = cli("masks", tmp_path / "a.npy", "--levels", 8, "--step", "150 nm", "--pitch-um", 2, *lab)
+    assert refused.code == 2
+    assert "lab.toml: must be for 8 levels" in refused.err
+
+
+def test_a_wafer_is_no_part_of_what_was_built(cli, tmp_path):
+    (tmp_path / "lab.toml").write_text(FILE)
+    done = cli("masks", tmp_path, "--as-built", tmp_path / "a.json", "--wafer", tmp_path / "lab.toml")
+    assert done.code == 2
+    assert "does not go with --as-built" in done.err

@@ -1,0 +1,140 @@
+"""What the camera looks at and what it records: the tables [scene], [sensor] and [obstruction].
+
+What only `simulate` and `train` need may be left out; a spec without it stays what it was. The occlusion model has no
+default, so that nobody uses one unawares: those two commands ask for it.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from doedesign.spec.table import Table, unsaid
+from doedesign.spec.values import (
+    Count,
+    Defocus,
+    FarDepth,
+    NearDepth,
+    Options,
+    OptionsTable,
+    Pitch,
+    Positive,
+    broken,
+    nearest,
+)
+
+__all__ = ["BAYER_PATTERNS", "NOISE_MODELS", "OBSTRUCTION_KINDS", "OCCLUSION_MODELS", "ObstructionSpec"]
+__all__ += ["SceneSpec", "SensorSpec"]
+
+# The same names as in `sim`, which would bring jax along.
+Occlusion = Literal["radiometric", "paper", "paper_release"]
+Noise = Literal["physical", "tseng", "release", "none"]
+Bayer = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+OCCLUSION_MODELS = ("radiometric", "paper", "paper_release")
+NOISE_MODELS = ("physical", "tseng", "release", "none")
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+OBSTRUCTION_KINDS = (
+    "fence",
+    "raindrop",
+    "dirt",
+    "dirt_raindrop",
+    "release_fence",
+    "release_raindrop",
+    "release_dirt",
+    "folder",
+)
+
+Electrons = Annotated[float, Field(strict=True, ge=0)]
+
+
+def _as_list(value: Any) -> Any:
+    # One number stands for every colour. A mapping is refused by the list's own rule.
+    return value if isinstance(value, list | tuple | Mapping) else (value,)
+
+
+Efficiency = Annotated[float, Field(strict=True, gt=0, le=1)]
+Efficiencies = Annotated[tuple[Efficiency, ...], BeforeValidator(_as_list)]
+
+
+def _kind(name: str) -> str:
+    if name not in OBSTRUCTION_KINDS:
+        raise broken("must be a known kind of obstruction", nearest(name, OBSTRUCTION_KINDS))
+    return name
+
+
+class SceneSpec(Table, frozen=True):
+    """Where light comes from, measured from the plate.
+
+    Attributes:
+        near_m: depths of the obstruction; may be empty where no objective looks at it.
+        far_m: depths of the scene behind it; "inf" in TOML for a star.
+        occlusion: how an obstruction takes light from what lies behind it (`sim.formation`): "radiometric" follows the
+            light, "paper" is eq. 10, "paper_release" what the paper's public code does.
+    """
+
+    near_m: tuple[NearDepth, ...] = ()
+    far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
+    occlusion: Occlusion | None = unsaid()
+
+
+class ObstructionSpec(Table, frozen=True):
+    """What stands before the scene.
+
+    Attributes:
+        kind: one of `OBSTRUCTION_KINDS`.
+        options: physical parameters of the kind where they are not its usual ones (`sim.obstruction`): lengths and
+            angles as text with a unit, ranges as lists of two. Its distance is `depth`; unless given, it lies between
+            the nearest and the farthest of `scene.near`.
+    """
+
+    kind: Annotated[str, AfterValidator(_kind)] = Field(examples=['"dirt"'])
+    options: OptionsTable = unsaid(Options())
+
+
+class SensorSpec(Table, frozen=True):
+    """The sensor behind the lens. What is said of light is in `sim.sensor`, whose usual values hold where nothing is.
+
+    Attributes:
+        pitch_m: distance of neighbouring photosites.
+        resolution: photosites along x and along y (as in "4000 x 3000").
+        binning: photosites per pixel and axis.
+        window: pixels per side of the square, centred on the chief ray, over which PSFs are computed; binned.
+        fill_factor: side of a pixel's light-sensitive square over its pitch; a length ratio, so 0.9 collects
+            81 % of the light.
+        defocus_m: distance of the sensor beyond the focal plane.
+        full_well_e: electrons that a pixel holds, after binning.
+        exposure: share of the full well that a white of the scene fills through a lossless lens.
+        quantum_efficiency: electrons per photon, one number or one per colour.
+        read_noise_e: standard deviation of a reading, electrons.
+        dark_e: mean number of electrons of dark current.
+        black_level: raw number of a pixel without electrons.
+        bits: bits of a raw number.
+        bayer: the four upper left photosites of a mosaic, row by row; every pixel sees every colour if left out.
+        noise: noise model.
+    """
+
+    pitch_m: Pitch = Field(examples=['"1.85 um"'])
+    resolution: tuple[Count, Count] = Field(examples=["[4000, 3000]"])
+    binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
+    fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
+    defocus_m: Defocus = 0.0
+    full_well_e: Positive | None = unsaid()
+    exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = unsaid()
+    quantum_efficiency: Efficiencies = unsaid(())
+    read_noise_e: Electrons | None = unsaid()
+    dark_e: Electrons | None = unsaid()
+    black_level: Electrons | None = unsaid()
+    bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = unsaid()
+    bayer: Bayer | None = unsaid()
+    noise: Noise | None = unsaid()
+
+    @property
+    def pixel_m(self) -> float:
+        """Distance of neighbouring pixels after binning."""
+        return self.pitch_m * self.binning
+
+    @property
+    def window_m(self) -> float:
+        """Side of the window."""
+        return self.pixel_m * self.window

@@ -1,0 +1,123 @@
+"""Dies that draw the DOE differently on purpose: line-width splits, and the control of the etch order."""
+
+import shutil
+from dataclasses import replace
+
+import klayout.db as kdb
+import numpy as np
+import pytest
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.layout import Layer, Shapes
+from fab.levels import Levels
+from fab.manifest import read_manifest
+from fab.order import write_order
+from fab.process import Process, Spread
+from fab.split import splits_of
+from fab.stream import write_gds
+from fab.verify import verify_order
+from fab.wafer import Wafer
+from fab.walker import read_gds
+
+LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory):
+    """Blocks of 3 x 3 pixels, two line-width splits and the control, with a known bias made up for."""
+    level_map = np.kron(np.random.default_rng(8).integers(0, 16, (12, 10)), np.ones((3, 3), int)).astype(np.uint8)
+    process = Process(LEVELS, spreads={"common_cd_bias_m": Spread(0.1e-6, 0.0)})
+    wafer = Wafer(compensate=True, line_splits_m=(-0.25e-6, 0.25e-6), order_control=True)
+    folder = tmp_path_factory.mktemp("split") / "order"
+    report = write_order(folder, level_map, LEVELS, GRID, GRID.extent_m[1], "s", {}, process=process, wafer=wafer)
+    assert report.passed
+    return folder
+
+
+def etched(folder, file, cell, layer):
+    """The area that a cell of a file draws on a layer, read by KLayout."""
+    layout = kdb.Layout()
+    layout.read(str(folder / file))
+    return kdb.Region(layout.cell(cell).shapes(layout.layer(layer, 0))).merged()
+
+
+def test_one_of_the_splits_prints_the_design_where_the_line_width_strays_by_as_much(split):
+    manifest = read_manifest(split)
+    assert [one.words for one in manifest.splits][:2] == [
+        "edges of etched areas drawn 250 nm further in on every etch mask",
+        "edges of etched areas drawn 250 nm further out on every etch mask",
+    ]
+    for mask in manifest.masks:
+        # What the plate as ordered prints with the bias that it was drawn for ...
+        wanted = etched(split, mask.file, manifest.doe_cell, mask.layer).sized(100, 2)
+        for one, more in zip(manifest.splits[:2], (-250, 250), strict=True):
+            # ... the split prints with that bias less its own move.
+            drawn = etched(split, mask.file, one.cell, mask.layer)
+            assert one.layers[mask.bit].edge_move_nm == more - 100
+            assert (drawn.sized(100 - more, 2) ^ wanted).is_empty()
+
+
+def test_the_control_is_the_design_if_the_depths_were_etched_in_the_opposite_order(split):
+    manifest = read_manifest(split)
+    control = manifest.splits[2]
+    depths = [mask.depth_nm for mask in manifest.masks]
+    planes = [
+        [etched(split, manifest.combined_gds, cell, mask.layer) for mask in manifest.masks]
+        for cell in (manifest.doe_cell, control.cell)
+    ]
+    # Mask k with the depth of mask 3 - k: every area of the control goes as deep as the design's.
+    for mask, depth in enumerate(reversed(depths)):
+        bit = depths.index(depth)
+        assert bit == 3 - mask
+        assert (planes[1][mask] ^ planes[0][bit]).is_empty()
+
+
+def test_every_split_is_placed_once_and_bears_its_name(split):
+    manifest = read_manifest(split)
+    layout = kdb.Layout()
+    layout.read(str(split / manifest.combined_gds))
+    wafer = layout.cell(f"{layout.top_cell().name}_WAFER")
+    counts = {}
+    for instance in wafer.each_inst():
+        counts[instance.cell.name] = counts.get(instance.cell.name, 0) + max(instance.na * instance.nb, 1)
+        x, y = instance.trans.disp.x / 1e6, instance.trans.disp.y / 1e6
+        for one in manifest.splits:
+            if instance.cell.name == f"{one.cell}_DIE":
+                assert manifest.wafer.dies_mm[one.die - 1] == [x, y]
+                plain = layout.cell(f"{layout.top_cell().name}_DIE").bbox(layout.layer(1, 3))
+                # The name stands above the DOE, where the plate as ordered has nothing.
+                assert instance.cell.bbox(layout.layer(1, 3)).top > 0 > plain.top
+    assert sum(n for name, n in counts.items() if name.endswith("_DIE")) == 9
+    assert all(counts[f"{one.cell}_DIE"] == 1 for one in manifest.splits)
+
+
+def test_a_split_that_is_not_what_it_should_be_is_told_by_both_readers(split, tmp_path):
+    folder = tmp_path / "order"
+    shutil.copytree(split, folder)
+    manifest = read_manifest(folder)
+    file, cell = manifest.masks[2].file, manifest.splits[2].cell
+    layout = read_gds(folder / file)
+    cells = {one.name: one for one in layout.cells}
+    shapes = cells[cell].shapes
+    cells[cell] = replace(cells[cell], shapes={**shapes, Layer(3): Shapes(shapes[Layer(3)].rectangles[1:])})
+    write_gds(folder / file, replace(layout, cells=tuple(cells.values())))
+    told = [line for line in verify_order(folder).differences if f"cell {cell}: layer 3/0" in line]
+    assert any("own reader" in line and "polygons more or less" in line for line in told)
+    assert any("gdstk" in line and "from the level map" in line for line in told)
+
+
+def test_splits_leave_a_die_as_ordered():
+    with pytest.raises(InputError, match="one die or more as ordered"):
+        Wafer(dies=(1, 2), line_splits_m=(1e-7,), order_control=True)
+    with pytest.raises(InputError, match="out or in"):
+        Wafer(line_splits_m=(0.0,))
+    assert [one.code for one in splits_of(Wafer(), LEVELS, (0,) * 4, 1e-9)] == ["DOE"]
+
+
+def test_a_split_that_closes_a_gap_is_refused(tmp_path):
+    level_map = np.random.default_rng(1).integers(0, 16, GRID.shape).astype(np.uint8)
+    wafer = Wafer(line_splits_m=(1e-6,))
+    with pytest.raises(InputError, match="narrowest space"):
+        write_order(tmp_path / "o", level_map, LEVELS, GRID, GRID.extent_m[1], "s", {}, wafer=wafer)
+    assert not (tmp_path / "o").exists()
