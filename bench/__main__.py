@@ -3,7 +3,16 @@
 import subprocess
 import sys
 
-TABLES = ("bench.psf", "bench.step", "bench.masks", "bench.rules", "bench.solids", "bench.order", "bench.plate")
+TABLES = (
+    "bench.psf",
+    "bench.step",
+    "bench.masks",
+    "bench.rules",
+    "bench.solids",
+    "bench.order",
+    "bench.plate",
+    "bench.capture",
+)
 
 
 def main() -> int:

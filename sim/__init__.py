@@ -16,6 +16,12 @@ Reading order, from the substance to the picture:
     leakage     0th order, Strehl ratio, leaked and diffracted light of a plate
     frames      a camera's image files, whatever their format
     measured    measured PSFs from camera files
+    light       sRGB and linear light, lens shading
+    scene       what a camera looks at: a background and obstructions before it
+    disc        the aperture's shadow disc on pixels
+    convolve    linear convolution by real transforms, in one piece or in tiles
+    formation   from a scene to the light on the sensor, by three models
+    field       the same for full frames, with PSFs that vary over the field
     metrics     numbers read off a PSF: far-spot energy, ring:disc, 0th order, energy budget
     store       PSF banks and height maps as OpenEXR files
 

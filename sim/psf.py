@@ -56,9 +56,15 @@ def plan_propagation(
     return plan_direct(camera, wavelength_m, propagation)
 
 
-@eqx.filter_jit
 def pixel_energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
     """`plan.energy`, compiled once per shape."""
+    # The error that a plan predicts changes with depth; kept, it would have every depth compiled anew.
+    timeless = replace(plan, expected_error=0.0) if isinstance(plan, FarField) else plan
+    return _compiled_energy(timeless, pupil, rows, shared)
+
+
+@eqx.filter_jit
+def _compiled_energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
     return plan.energy(pupil, rows, shared)
 
 

@@ -1,4 +1,4 @@
-"""Height maps and PSF banks as OpenEXR files; the only importer of OpenEXR.
+"""Height maps, PSF banks and pictures as OpenEXR files; the only importer of OpenEXR.
 
 * The first scan line is the highest y, so a viewer shows +y up. Arrays here have row 0 at the lowest y; rows are
   turned over on the way out and on the way in, and the round trip is exact.
@@ -188,6 +188,34 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         )
     energy = np.stack([np.stack([picture.channels[name] for name in row]) for row in names])
     return PsfBank(energy, colours, depths, stored, field)
+
+
+def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[str, str] | None = None) -> None:
+    """Write a picture in linear light, or any other maps of one shape.
+
+    Args:
+        path: the file; its folder is made if missing.
+        channels: `[y, x]` maps by name, such as R, G and B; rounded to float32, infinity allowed.
+        extra: text attributes.
+
+    Raises:
+        InputError: the system refuses the path.
+        ValueError: maps of different shapes, or an extra attribute with a name that is taken.
+    """
+    shapes = {np.shape(values) for values in channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise ValueError(f"`channels` must be maps [y, x] of one shape, but got {sorted(shapes)}")
+    _write(Path(path), channels, {}, extra)
+
+
+def read_picture(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "y x"]], dict[str, str]]:
+    """Read the channels `[y, x]` of a picture by name, and its text attributes.
+
+    Raises:
+        InputError: the file is missing, no whole EXR file, or changed since it was written.
+    """
+    picture = _read(Path(path))
+    return picture.channels, picture.texts
 
 
 def _channel_name(depth_m: float, colour: str) -> str:

@@ -1,0 +1,53 @@
+"""Things close to the camera that cover part of its view, each drawn at random from physical parameters.
+
+    view        the frame: eq. 11 of the paper, sizes of near things in pixels
+    parameters  ranges to draw from, their checks, and what a kind of obstruction is
+    noise       gradient noise
+    fence       chain-link, bars and grids of round wire
+    raindrop    drops of water that refract the scene
+    dirt        clumps of soil
+    mixed       dirt or raindrops by the toss of a coin
+    release     the three with the numbers of the paper's public code
+    folder      masks out of a user's folder
+
+A kind is a frozen dataclass of SI parameters; `kind.draw(rng, view, background)` gives an `Obstruction` as a pinhole
+would see it: sharp, in linear light, at a depth. Blur is left to the PSF. Lengths are those of the thing itself, so a
+kind looks larger the nearer it is drawn. The same state of the generator gives the same bytes.
+
+    view = View((512, 512), pixel_m=3.7e-6, focal_m=8e-3)
+    Dirt().draw(np.random.default_rng(0), view, background)
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from sim.obstruction.dirt import Dirt
+from sim.obstruction.fence import Fence
+from sim.obstruction.folder import MaskFolder
+from sim.obstruction.mixed import DirtRaindrop
+from sim.obstruction.parameters import Kind
+from sim.obstruction.raindrop import Raindrop
+from sim.obstruction.release import ReleaseDirt, ReleaseFence, ReleaseRaindrop
+from sim.obstruction.view import View
+
+__all__ = [
+    "OBSTRUCTIONS",
+    "Dirt",
+    "DirtRaindrop",
+    "Fence",
+    "Kind",
+    "MaskFolder",
+    "Raindrop",
+    "ReleaseDirt",
+    "ReleaseFence",
+    "ReleaseRaindrop",
+    "View",
+]
+
+# By the name that a spec or the command line calls them; all but the folder can be made without arguments.
+OBSTRUCTIONS: Mapping[str, type[Kind]] = MappingProxyType(
+    {
+        kind.name: kind
+        for kind in (Fence, Raindrop, Dirt, DirtRaindrop, ReleaseFence, ReleaseRaindrop, ReleaseDirt, MaskFolder)
+    }
+)

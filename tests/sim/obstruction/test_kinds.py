@@ -1,0 +1,101 @@
+"""What holds for every kind of obstruction."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, Kind, MaskFolder, Raindrop, View
+
+# Frames as wide as those of the paper's two tasks, with four times fewer pixels each way.
+AUTOMOTIVE = View((128, 128), 14.8e-6, 8e-3)
+DSLR = View((128, 128), 51.6e-6, 50e-3)
+
+# Depth, and mean share of the frame that 16 draws cover: what the defaults give, and as much again either way.
+EXPECTED = {
+    "fence": (DSLR, (0.4, 0.8), (0.1, 0.32)),
+    "raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.03, 0.16)),
+    "dirt": (AUTOMOTIVE, (0.05, 0.12), (0.15, 0.28)),
+    "dirt_raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.06, 0.25)),
+    "release_fence": (DSLR, (0.4, 0.8), (0.1, 0.35)),
+    "release_raindrop": (AUTOMOTIVE, (0.05, 0.12), (0.01, 0.06)),
+    "release_dirt": (AUTOMOTIVE, (0.05, 0.12), (0.2, 0.4)),
+    "folder": (AUTOMOTIVE, (0.05, 0.12), (0.05, 0.5)),
+}
+
+
+def made(name: str, folder: Path) -> Kind:
+    if name != "folder":
+        return OBSTRUCTIONS[name]()
+    Image.fromarray(np.pad(np.full((40, 60), 255, np.uint8), 10)).save(folder / "patch.png")
+    return MaskFolder(folder, width_m=0.01)
+
+
+@pytest.fixture
+def background(rng: np.random.Generator) -> np.ndarray:
+    coarse = rng.uniform(0, 1, (3, 16, 16)).astype(np.float32)
+    return np.kron(coarse, np.ones((8, 8), np.float32))
+
+
+def test_every_name_is_known():
+    assert set(OBSTRUCTIONS) == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_draws_are_physical_repeatable_and_cover_a_usual_share(name: str, background: np.ndarray, tmp_path: Path):
+    view, depths_m, band = EXPECTED[name]
+    kind = made(name, tmp_path)
+    before = background.copy()
+    shares, seen = [], set()
+    for seed in range(16):
+        drawn = kind.draw(np.random.default_rng(seed), view, background)
+        mask, radiance = np.asarray(drawn.mask), np.asarray(drawn.radiance)
+        assert mask.dtype == radiance.dtype == np.float32
+        assert mask.shape == view.shape
+        assert radiance.shape == background.shape
+        assert 0 <= mask.min() <= mask.max() <= 1
+        assert 0 <= radiance.min() <= radiance.max() <= 1
+        assert isinstance(drawn.depth_m, float)
+        assert depths_m[0] <= drawn.depth_m <= depths_m[1]
+        assert mask.max() > 0
+        shares.append(mask.mean())
+        again = kind.draw(np.random.default_rng(seed), view, background)
+        assert (mask.tobytes(), radiance.tobytes()) == (np.asarray(again.mask).tobytes(), again.radiance.tobytes())
+        assert drawn.depth_m == again.depth_m
+        seen.add((mask.tobytes(), radiance.tobytes()))
+    assert len(seen) == 16
+    assert band[0] < np.mean(shares) < band[1]
+    np.testing.assert_array_equal(background, before)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_background_of_another_size_is_refused(name: str, tmp_path: Path):
+    with pytest.raises(ValueError, match="`background` must have the shape"):
+        made(name, tmp_path).draw(np.random.default_rng(0), AUTOMOTIVE, np.zeros((3, 64, 128), np.float32))
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_frames_need_not_be_square(name: str, tmp_path: Path):
+    view = View((60, 90), 30e-6, 8e-3)
+    drawn = made(name, tmp_path).draw(np.random.default_rng(0), view, np.full((3, 60, 90), 0.3, np.float32))
+    assert drawn.mask.shape == (60, 90)
+
+
+def test_the_coin_falls_on_either_side(background: np.ndarray):
+    def first(kind: Kind, seed: int) -> bytes:
+        return np.asarray(kind.draw(np.random.default_rng(seed), AUTOMOTIVE, background).mask).tobytes()
+
+    both = DirtRaindrop()
+    dirty = [both.draw(np.random.default_rng(s), AUTOMOTIVE, background).radiance.max() < 0.5 for s in range(20)]
+    assert 4 <= sum(dirty) <= 16
+    never, always = DirtRaindrop(dirt_share=0.0), DirtRaindrop(dirt_share=1.0)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        rng.uniform()
+        state = rng.bit_generator.state
+        expected = Dirt().draw(rng, AUTOMOTIVE, background)
+        assert first(always, seed) == np.asarray(expected.mask).tobytes()
+        rng.bit_generator.state = state
+        expected = Raindrop().draw(rng, AUTOMOTIVE, background)
+        assert first(never, seed) == np.asarray(expected.mask).tobytes()
