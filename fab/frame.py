@@ -36,6 +36,8 @@ _RIM_M = 4 * MM
 _GAP_M = 200 * UM
 _LETTERS_M = 0.5 * MM
 _TITLE_STROKE_UM = 16
+# Rows and columns of dies, if nobody says how many.
+_USUAL_DIES = (3, 2, 1)
 # A circle of so many corners has no more vertices than every reader knows.
 _CORNERS = 180
 
@@ -46,6 +48,7 @@ class Frame(NamedTuple):
     Attributes:
         cells: die, sites, test structures, wafer and plate, each after those that it places.
         places: where on the wafer people measure, ``(x_m, y_m)`` by name.
+        raster: rows and columns of dies.
         dies: middles of the dies, ``(x_m, y_m)``, row by row from the lowest y.
         splits: how each of them is drawn, by number; 0 is the plate as ordered.
         die_m: edge of a die, metres.
@@ -53,6 +56,7 @@ class Frame(NamedTuple):
 
     cells: tuple[Cell, ...]
     places: Mapping[str, tuple[float, float]]
+    raster: tuple[int, int]
     dies: tuple[tuple[float, float], ...]
     splits: tuple[int, ...]
     die_m: float
@@ -101,8 +105,9 @@ def draw_frame(
     if pitch < side_m - dbu_m:
         rule = f"must be {format_length(side_m)} or more, what a die with its marks needs"
         raise InputError("wafer.pitch", rule, format_length(pitch), "Leave it out, or choose a larger one.")
-    dies = _raster(wafer.dies, pitch)
-    site_m, monitor_m = _beside(wafer, dies, pitch, site, monitor)
+    raster, site_m, monitor_m = _room(wafer, pitch, site, monitor)
+    wafer.require_room(raster)
+    dies = _raster(raster, pitch)
     unit = _Unit(dbu_m)
     names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
     die_cells = [
@@ -118,7 +123,7 @@ def draw_frame(
         names["WAFER"],
         {WAFER: unit.circle(wafer.diameter_m)},
         (
-            *_die_references(wafer, dies, drawn, die_cells, unit, pitch),
+            *_die_references(raster, dies, drawn, die_cells, unit, pitch),
             Reference(names["SITE"], -unit(site_m), 0),
             Reference(names["SITE"], unit(site_m), 0),
             Reference(names["TEST"], 0, unit(monitor_m)),
@@ -132,7 +137,7 @@ def draw_frame(
     beside = prefixed(moved(marks, *middle), "middle die: ")
     places = joined([*sites, beside, moved(monitor, 0, monitor_m), labels]).places
     small = (Cell(names["SITE"], site.shapes), Cell(names["TEST"], monitor.shapes))
-    return Frame((*die_cells, *small, wafer_cell, top), places, dies, drawn, pitch)
+    return Frame((*die_cells, *small, wafer_cell, top), places, raster, dies, drawn, pitch)
 
 
 def _titled(marks: Part, split: Split, plate: Plate) -> Part:
@@ -145,7 +150,7 @@ def _titled(marks: Part, split: Split, plate: Plate) -> Part:
 
 
 def _die_references(
-    wafer: Wafer,
+    raster: tuple[int, int],
     dies: Sequence[tuple[float, float]],
     drawn: Sequence[int],
     cells: Sequence[Cell],
@@ -155,7 +160,7 @@ def _die_references(
     """Place the dies: as one raster where all are alike, else one by one."""
     if any(drawn):
         return tuple(Reference(cells[n].name, unit(x), unit(y)) for n, (x, y) in zip(drawn, dies, strict=True))
-    (rows, columns), step = wafer.dies, unit(pitch_m)
+    (rows, columns), step = raster, unit(pitch_m)
     first = (unit(dies[0][0]), unit(dies[0][1]))
     return (Reference(cells[0].name, *first, columns, rows, step * (columns > 1), step * (rows > 1)),)
 
@@ -200,14 +205,28 @@ def _raster(dies: tuple[int, int], pitch_m: float) -> tuple[tuple[float, float],
     )
 
 
-def _beside(
-    wafer: Wafer, dies: Sequence[tuple[float, float]], pitch_m: float, site: Part, monitor: Part
-) -> tuple[float, float]:
-    """Find room for the sites on the x axis and for the test structures below the dies.
+def _room(wafer: Wafer, pitch_m: float, site: Part, monitor: Part) -> tuple[tuple[int, int], float, float]:
+    """Find room for the dies, the sites on the x axis, and the test structures below the dies.
 
     Returns:
-        x of the right site and y of the test structures, metres.
+        Rows and columns of dies, x of the right site, y of the test structures, metres.
     """
+    rasters = [(n, n) for n in _USUAL_DIES] if wafer.dies is None else [wafer.dies]
+    for raster in rasters:
+        found = _beside(wafer, _raster(raster, pitch_m), pitch_m, site, monitor)
+        if found is not None:
+            return raster, *found
+    rows, columns = rasters[-1]
+    rule = f"must hold the dies of {format_length(pitch_m)}, two alignment sites and the test structures"
+    got = f"{rows} x {columns} dies on a wafer of {format_length(wafer.diameter_m)}"
+    cure = "Take fewer dies, or a larger wafer." if rows * columns > 1 else "Take a larger wafer."
+    raise InputError("wafer", rule, got, cure)
+
+
+def _beside(
+    wafer: Wafer, dies: Sequence[tuple[float, float]], pitch_m: float, site: Part, monitor: Part
+) -> tuple[float, float] | None:
+    """Return x of the right site and y of the test structures, metres; None if the wafer is too small."""
     usable = wafer.diameter_m / 2 - _RIM_M
     (site_w, site_h), (test_w, test_h) = _size_m(site), _size_m(monitor)
     farthest = max(math.hypot(abs(x) + pitch_m / 2, abs(y) + pitch_m / 2) for x, y in dies)
@@ -217,9 +236,7 @@ def _beside(
     monitor_m = -(most_y + _GAP_M + test_h / 2)
     corner = math.hypot(test_w / 2, monitor_m - test_h / 2)
     if farthest > usable or site_m - site_w / 2 < most_x + _GAP_M or corner > usable:
-        rule = f"must hold the dies of {format_length(pitch_m)}, two alignment sites and the test structures"
-        got = f"{wafer.dies[0]} x {wafer.dies[1]} dies on a wafer of {format_length(wafer.diameter_m)}"
-        raise InputError("wafer", rule, got, "Take fewer dies, or a larger wafer.")
+        return None
     return round(site_m / MM, 1) * MM, monitor_m
 
 

@@ -21,7 +21,7 @@ class Wafer:
         diameter_m: diameter of the wafer, metres.
         thickness_m: its thickness, metres.
         blank_m: edge of the square mask blanks, metres; 5 inches for a wafer of 100 mm.
-        dies: rows and columns of dies.
+        dies: rows and columns of dies; the most that fit, up to 3 x 3, if None.
         pitch_m: distance of the dies, metres; the next whole millimetre that a die needs if None.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: how the aperture's chrome is made.
@@ -34,7 +34,7 @@ class Wafer:
     diameter_m: float = 100 * MM
     thickness_m: float = 0.5 * MM
     blank_m: float = 127 * MM
-    dies: tuple[int, int] = (3, 3)
+    dies: tuple[int, int] | None = None
     pitch_m: float | None = None
     zero_layer: bool = False
     chrome: Literal["liftoff", "etch"] = "liftoff"
@@ -55,12 +55,24 @@ class Wafer:
         if self.blank_m < self.diameter_m:
             rule = f"must hold the wafer of {format_length(self.diameter_m)}"
             raise InputError("wafer.blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
-        if min(self.dies) < 1:
+        if self.dies is not None and min(self.dies) < 1:
             raise InputError("wafer.dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
         if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
             got = ", ".join(format_length(move) for move in self.line_splits_m)
             raise InputError("wafer.line_splits", "must lie from 1 nm to 100 um, out or in", got, "Mend them.")
-        rows, columns = self.dies
+        if self.dies is not None:
+            self.require_room(self.dies)
+
+    def require_room(self, dies: tuple[int, int]) -> None:
+        """Check that splits leave a die as ordered.
+
+        Args:
+            dies: rows and columns.
+
+        Raises:
+            InputError: they do not.
+        """
+        rows, columns = dies
         split = len(self.line_splits_m) + self.order_control
         if split >= rows * columns:
             rule = "must leave one die or more as ordered"

@@ -55,7 +55,7 @@ def draw_wafer(path: Path, wafer: Wafer, frame: Frame, aperture_m: float, dbu_m:
         axes.set(xlim=(-half - 1, half + 1), ylim=(-half - 1, half + 1), aspect="equal")
         axes.set_xlabel("x (mm)", labelpad=2)
         axes.set_ylabel("y (mm)", labelpad=0)
-        rows, columns = wafer.dies
+        rows, columns = frame.raster
         told = (
             f"Blank of {format_length(wafer.blank_m)}, wafer of {format_length(wafer.diameter_m)} and "
             f"{format_length(wafer.thickness_m)}, {rows} x {columns} dies {format_length(frame.die_m)} apart.\n"

@@ -26,7 +26,7 @@ class WaferSpec(Table, frozen=True):
         diameter_m: diameter of the wafer.
         thickness_m: its thickness.
         blank_m: edge of the square mask blanks.
-        dies: rows and columns of dies.
+        dies: rows and columns of dies; the most that fit, up to 3 x 3, if none are given.
         pitch_m: distance of the dies; the next whole millimetre that a die needs if none is given.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: "liftoff" or "etch".
@@ -38,7 +38,7 @@ class WaferSpec(Table, frozen=True):
     diameter_m: Size = unsaid(_USUAL.diameter_m)
     thickness_m: Thickness = unsaid(_USUAL.thickness_m)
     blank_m: Size = unsaid(_USUAL.blank_m)
-    dies: tuple[Dies, Dies] = unsaid(_USUAL.dies)
+    dies: tuple[Dies, Dies] | None = unsaid()
     pitch_m: Size | None = unsaid()
     zero_layer: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.zero_layer)
     chrome: Literal["liftoff", "etch"] = unsaid(_USUAL.chrome)

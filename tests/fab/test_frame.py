@@ -115,3 +115,12 @@ def test_measurement_places_lie_where_the_marks_are(tmp_path):
 def test_what_does_not_fit_is_refused(wafer, words):
     with pytest.raises(InputError, match=words):
         framed(Wafer(**wafer))
+
+
+def test_a_large_die_gets_as_many_places_as_there_are():
+    """Dies of 10 mm lie in threes on 100 mm, larger ones in twos; of very large ones there is one, or none."""
+    assert [framed(chrome_m=size).raster for size in (7.4e-3, 21e-3, 37e-3)] == [(3, 3), (2, 2), (1, 1)]
+    with pytest.raises(InputError, match=r"1 x 1 dies.*Take a larger wafer"):
+        framed(chrome_m=80e-3)
+    with pytest.raises(InputError, match="1 of 1 dies"):
+        framed(Wafer(order_control=True), chrome_m=37e-3)
