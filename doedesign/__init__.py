@@ -15,6 +15,10 @@ Reading order, from the user's words to the result:
     predict         what a drawn design will do once it is made
     tolerance       what a process that strays makes of a design, and how far it may stray
     calibrate       the process errors that explain measured PSFs
+    images          pictures of a folder as scenes
+    capture         a spec's obstruction, sensor and colours
+    simulated       one scene through a plate onto a sensor; capturefiles writes it
+    recon           the reconstruction: its training scenes
     runs            run folders: manifest, checkpoint, resume
     report          pictures
     commands        the work behind each command

@@ -10,7 +10,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.evaluate`
         *.png                   pictures
-        psf/, fabricated/, tolerance/, calibrate/   what later commands found
+        psf/, fabricated/, simulated/, tolerance/, calibrate/   what later commands found
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one

@@ -22,8 +22,10 @@ Reading order, from the substance to the picture:
     convolve    linear convolution by real transforms, in one piece or in tiles
     formation   from a scene to the light on the sensor, by three models
     field       the same for full frames, with PSFs that vary over the field
+    noise       fast Poisson counts, and noise that gradients pass through
+    sensor      from light to raw numbers, and back to an image
     metrics     numbers read off a PSF: far-spot energy, ring:disc, 0th order, energy budget
-    store       PSF banks and height maps as OpenEXR files
+    store       PSF banks, height maps and pictures as OpenEXR files
 
 Conventions (pinned by tests/sim/test_conventions.py):
 

@@ -56,7 +56,7 @@ def fabricated(
     run = open_run(run_folder)
     drawn = drawn_of(run, masks)
     made_by = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
-    plate, source = _plate(drawn, made_by, variation, seed, draw)
+    plate, source = errors_of_plate(drawn, made_by, variation, seed, draw)
     say(f"plate: {source}")
     folder = run.path("fabricated")
     require_own(folder)
@@ -65,7 +65,24 @@ def fabricated(
     return folder
 
 
-def _plate(drawn: Drawn, process: Process, file: Path | None, seed: int | None, draw: str) -> tuple[Variation, str]:
+def errors_of_plate(
+    drawn: Drawn, process: Process, file: Path | None, seed: int | None, draw: str
+) -> tuple[Variation, str]:
+    """Errors of one plate, and a few words on where they come from.
+
+    Args:
+        drawn: the design.
+        process: what makes it.
+        file: TOML file with the errors.
+        seed: take them from this seed of the process instead.
+        draw: which draw of the seed.
+
+    Returns:
+        with neither a file nor a seed, every error at the process's mean.
+
+    Raises:
+        InputError: both a file and a seed, or a file that cannot be read.
+    """
     if file is not None and seed is not None:
         raise InputError("--seed", "a plate has one source of errors", "also --variation", "Leave one of them out.")
     if file is not None:

@@ -7,6 +7,7 @@ draw_histograms("histograms.png", camera, plates.table, nominal.table, limits)
 """
 
 from doedesign.report.calibration import draw_check, draw_estimates, draw_fitted_psfs
+from doedesign.report.contact import draw_contact
 from doedesign.report.curves import draw_encircled, draw_history, draw_mtf
 from doedesign.report.family import draw_family
 from doedesign.report.height import draw_height
@@ -19,6 +20,7 @@ __all__ = [
     "draw_budget",
     "draw_changes",
     "draw_check",
+    "draw_contact",
     "draw_encircled",
     "draw_estimates",
     "draw_family",

@@ -34,7 +34,6 @@ __all__ = ["RESPONSE_KEYS", "Response", "lines_of", "read_responses", "with_resp
 RESPONSE_KEYS = ("spectral_response", "lines_per_colour")
 
 _LINES, _MOST_LINES = 5, 16
-_SUBDIVISIONS = 16  # of every step of the file, by the midpoint rule
 _CURE = "Give wavelengths in nm and one column per colour, as in `550,0.1,0.9,0.2`."
 
 
@@ -99,10 +98,12 @@ def lines_of(response: Response, count: int) -> tuple[NDArray[np.float64], NDArr
     Returns:
         wavelengths, metres, from the longest to the shortest, and weights that sum to 1.
     """
-    ends, steps = response.wavelengths_m, np.diff(response.wavelengths_m)
-    offsets = (np.arange(_SUBDIVISIONS) + 0.5) / _SUBDIVISIONS
-    nodes = (ends[:-1, None] + steps[:, None] * offsets).ravel()
-    density = np.interp(nodes, ends, response.values) * np.repeat(steps, _SUBDIVISIONS)
+    ends = response.wavelengths_m
+    # Enough points per step of the file for a straight piece times the polynomials below to be summed exactly.
+    places, shares = np.polynomial.legendre.leggauss(count + 1)
+    middles, halves = (ends[1:] + ends[:-1]) / 2, np.diff(ends) / 2
+    nodes = (middles[:, None] + halves[:, None] * places).ravel()
+    density = np.interp(nodes, ends, response.values) * (halves[:, None] * shares).ravel()
     nodes, density = nodes[density > 0], density[density > 0]
     density /= density.sum()
     # Stieltjes' procedure: the recurrence of the polynomials orthogonal under the response, on [-1, 1].

@@ -1,7 +1,7 @@
 """What all kinds of obstruction share: ranges that a value is drawn from, their checks, and the way to draw."""
 
 import math
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ Range = tuple[float, float]
 _FARTHEST_M = 100.0
 
 
+@runtime_checkable
 class Kind(Protocol):
     """A kind of obstruction: its parameters, and a way to draw one."""
 

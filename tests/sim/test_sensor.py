@@ -1,6 +1,7 @@
 """The sensor: counts against photons, saturation, bits, colours behind a mosaic, and the way back to light."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -145,7 +146,7 @@ def test_what_the_mosaic_saw_is_kept():
 
 
 def test_what_cannot_be_a_sensor():
-    for wrong in (
+    mistakes: tuple[dict[str, Any], ...] = (
         {"full_well_e": 0.0},
         {"exposure": -1.0},
         {"read_noise_e": float("nan")},
@@ -154,7 +155,8 @@ def test_what_cannot_be_a_sensor():
         {"black_level": 4095.0},
         {"noise": "loud"},
         {"pattern": "RGBG"},
-    ):
+    )
+    for wrong in mistakes:
         (name,) = wrong
         # In tests the annotations are checked first, which refuses the two unknown names.
         with pytest.raises((ValueError, TypeError), match=name):

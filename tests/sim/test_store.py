@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fab.errors import InputError
 from sim.psf import PsfBank
-from sim.store import read_bank, read_height, write_bank, write_height
+from sim.store import read_bank, read_height, read_picture, write_bank, write_height, write_picture
 
 ROOT = Path(__file__).parents[2]
 MEASURED = ROOT.parent / "shared" / "data" / "optics_reference" / "measured_psf" / "diffusercam_psf_sample.tif"
@@ -238,3 +238,13 @@ def test_an_unusable_place_is_named_and_nothing_is_left(tmp_path: Path):
 def test_reading_heights_needs_no_jax():
     code = "import sys, sim.store; assert 'jax' not in sys.modules and 'OpenEXR' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_pictures_keep_their_maps_and_words(tmp_path: Path, rng: np.random.Generator):
+    maps = {"R": rng.normal(size=(4, 6)).astype(np.float32), "Z": np.full((4, 6), np.inf, np.float32)}
+    write_picture(tmp_path / "a.exr", maps, {"what": "light"})
+    channels, texts = read_picture(tmp_path / "a.exr")
+    assert {name: values.tobytes() for name, values in channels.items()} == {k: v.tobytes() for k, v in maps.items()}
+    assert texts == {"what": "light"}
+    with pytest.raises(ValueError, match="one shape"):
+        write_picture(tmp_path / "b.exr", {**maps, "G": np.zeros((4, 5))})

@@ -1,0 +1,131 @@
+"""Files of a simulated capture: OpenEXR, or 16-bit PNG with what a count means in the JSON beside it.
+
+EXR holds the numbers as they are. PNG holds `count / 65535 * full_scale`, rounded and cut to what fits: light below 0
+(noise below black) becomes 0. A depth is stored there as its inverse, so that infinity is 0.
+"""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fab.errors import InputError
+from fab.files import explain_os_error, write_atomic
+from sim.store import read_picture, write_picture
+
+_COUNTS = 65535
+
+
+class Stored(NamedTuple):
+    """One image of an item, as its JSON describes it.
+
+    Attributes:
+        file: its name.
+        what: a few words on it.
+        channels: names of its channels, in order.
+        full_scale: value of 65535 counts in a PNG; None in an EXR, which holds the values.
+        inverse: whether a PNG holds the inverse of the values.
+    """
+
+    file: str
+    what: str
+    channels: tuple[str, ...]
+    full_scale: float | None = None
+    inverse: bool = False
+
+    def described(self) -> dict[str, Any]:
+        """The same for JSON, without what is not said."""
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in self._asdict().items()
+            if value not in (None, False)
+        }
+
+
+def write_image(
+    folder: Path,
+    name: str,
+    image: Float[np.ndarray, "c y x"],
+    channels: tuple[str, ...],
+    what: str,
+    *,
+    png: bool = False,
+    full_scale: float = 1.0,
+    inverse: bool = False,
+) -> Stored:
+    """Write one image of an item.
+
+    Args:
+        folder: where to.
+        name: its name without ending.
+        image: `[c, y, x]` values, row 0 at the lowest y.
+        channels: a name for each, such as R, G and B.
+        what: a few words on it.
+        png: write 16-bit PNG, which holds one channel or three, instead of EXR.
+        full_scale: in a PNG, the value (or with `inverse`, its inverse) of the highest count.
+        inverse: in a PNG, store inverses.
+
+    Raises:
+        InputError: the system refuses the path.
+    """
+    if not png:
+        write_picture(folder / f"{name}.exr", dict(zip(channels, image, strict=True)), {"what": what})
+        return Stored(f"{name}.exr", what, channels)
+    values = 1 / image if inverse else image
+    counts = np.rint(np.clip(values / full_scale, 0, 1) * _COUNTS).astype(">u2")
+    write_atomic(folder / f"{name}.png", _png_bytes(counts[:, ::-1]))
+    return Stored(f"{name}.png", what, channels, full_scale, inverse)
+
+
+def read_image(folder: Path, stored: Mapping[str, Any]) -> Float[np.ndarray, "c y x"]:
+    """Read an image that `write_image` wrote.
+
+    Args:
+        folder: where it lies.
+        stored: its description, as `Stored.described` gives it.
+
+    Raises:
+        InputError: the file is missing, broken, or changed.
+    """
+    path = folder / stored["file"]
+    if path.suffix == ".exr":
+        channels, _ = read_picture(path)
+        return np.stack([channels[name] for name in stored["channels"]])
+    values = _png_counts(path).astype(np.float32) * np.float32(stored["full_scale"] / _COUNTS)
+    if stored.get("inverse"):
+        with np.errstate(divide="ignore"):
+            values = 1 / values
+    return values
+
+
+def _png_bytes(counts: np.ndarray) -> bytes:
+    """A PNG of `[c, y, x]` counts, the first row on top."""
+    import png
+
+    planes, height, width = counts.shape
+    rows = np.ascontiguousarray(counts.transpose(1, 2, 0)).reshape(height, width * planes)
+    stream = io.BytesIO()
+    writer = png.Writer(width, height, greyscale=planes == 1, bitdepth=16)
+    writer.write_packed(stream, (row.tobytes() for row in rows))
+    return stream.getvalue()
+
+
+def _png_counts(path: Path) -> np.ndarray:
+    """Counts `[c, y, x]` of a 16-bit PNG, row 0 at the lowest y."""
+    import png
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        width, height, rows, info = png.Reader(bytes=data).read()
+        counts = np.stack([np.frombuffer(row, np.uint16) for row in rows])
+        return counts.reshape(height, width, info["planes"]).transpose(2, 0, 1)[:, ::-1]
+    # What the reader raises on a damaged file depends on where the damage is.
+    except Exception as error:
+        rule = "must be the 16-bit PNG that was written"
+        raise InputError(str(path), rule, f'"{error}"', "Remove the folder and simulate again.") from error

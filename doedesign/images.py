@@ -1,0 +1,255 @@
+"""Pictures from a folder, as scenes: found, decoded, kept in memory where they fit, and turned into linear light.
+
+Any folder of JPEG, PNG, TIFF, WebP or BMP files will do, folders within it included. A file that cannot be decoded is
+skipped: by name, counted, told once, never fatal while another one is left. Without a folder the photographs that
+scikit-image brings along are taken; nothing is ever downloaded.
+
+A picture is `[y, x, colour]` of 8-bit display values (sRGB) with row 0 at the lowest y, as a camera would store it
+turned the right way up. One that is larger than needed is shrunk once, on reading, so that its shorter side has
+`most_px` pixels; shrinking averages display values, as picture editors do. Sixteen bits are rounded to eight, colour
+profiles are not looked at, transparent pixels count as they are painted.
+"""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from fab.errors import InputError
+from fab.files import canonical_json, explain_os_error, sha256_bytes
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as PillowImage
+
+PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+SAMPLES = ("motorcycle_left.png", "rocket.jpg", "coffee.png", "astronaut.png", "chelsea.png", "camera.png")
+BUDGET_BYTES = 1 << 30
+
+_MOST_PIXELS = 1 << 28
+_SHOWN = 5  # names of skipped files in one message
+
+Picture = UInt8[np.ndarray, "y x 3"]
+
+
+def sample_files() -> tuple[Path, ...]:
+    """The photographs inside the installed scikit-image, in a fixed order.
+
+    Raises:
+        InputError: scikit-image came without them.
+    """
+    spec = find_spec("skimage")
+    folder = Path(spec.origin).parent / "data" if spec and spec.origin else Path("skimage/data")
+    found = tuple(folder / name for name in SAMPLES if (folder / name).is_file())
+    if not found:
+        cure = "Give a folder of your own pictures with --images."
+        raise InputError(str(folder), "scikit-image must bring its sample pictures", "none of them", cure)
+    return found
+
+
+def picture_files(folder: Path | None) -> tuple[Path, ...]:
+    """Every picture file below a folder, in the order of names; scikit-image's samples where no folder is given.
+
+    Raises:
+        InputError: the folder is missing or holds no picture file.
+    """
+    if folder is None:
+        return sample_files()
+    if not folder.is_dir():
+        got = "a file" if folder.exists() else "no folder"
+        raise InputError(str(folder), "must be a folder of pictures", got, "Check the path.")
+    try:
+        found = tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_FILES and p.is_file()))
+    except OSError as error:
+        raise explain_os_error(error, folder) from error
+    if not found:
+        rule = f"must hold pictures ({', '.join(PICTURE_FILES)})"
+        raise InputError(str(folder), rule, "none", "Put pictures there, or leave --images out for a first look.")
+    return found
+
+
+def decoded(path: Path, most_px: int | None = None) -> Picture:
+    """Decode one picture.
+
+    Args:
+        path: the file.
+        most_px: pixels that its shorter side may keep.
+
+    Returns:
+        `[y, x, colour]` display values, row 0 at the lowest y.
+
+    Raises:
+        InputError: no whole picture, or one too large or of a kind that has no display values.
+    """
+    from PIL import Image, ImageOps
+
+    try:
+        with Image.open(path) as image:
+            _require_display_values(image)
+            if most_px is not None:
+                # JPEG can be decoded at an eighth of its size and up in much less time.
+                shrink = most_px / min(image.size)
+                image.draft("RGB", (round(image.width * shrink), round(image.height * shrink)))
+            upright = ImageOps.exif_transpose(_eight_bits(image))
+            shorter = min(upright.size)
+            if most_px is not None and shorter > most_px:
+                size = tuple(max(1, round(n * most_px / shorter)) for n in upright.size)
+                upright = upright.resize((size[0], size[1]), Image.Resampling.BOX)
+            return np.ascontiguousarray(np.asarray(upright, np.uint8)[::-1])
+    except OSError as error:
+        if error.errno is not None:
+            raise explain_os_error(error, path) from error
+        raise _broken(path, error) from error
+    # What the decoders raise on a damaged file depends on where the damage is.
+    except Exception as error:
+        raise _broken(path, error) from error
+
+
+def _require_display_values(image: "PillowImage") -> None:
+    if not 0 < image.width * image.height <= _MOST_PIXELS:
+        raise ValueError(f"{image.width} x {image.height} pixels, more than {_MOST_PIXELS}")
+    if image.mode in ("F", "LAB", "HSV"):
+        raise ValueError(f"pixels of the kind {image.mode}, which are no display values")
+
+
+def _eight_bits(image: "PillowImage") -> "PillowImage":
+    from PIL import Image
+
+    if image.mode.startswith("I"):  # sixteen bits of grey
+        values = np.asarray(image).astype(np.int64)
+        return Image.fromarray(((values * 255 + 32767) // 65535).clip(0, 255).astype(np.uint8)).convert("RGB")
+    return image.convert("RGB")
+
+
+def _broken(path: Path, error: Exception) -> InputError:
+    got = " ".join(str(error).replace(f"'{path}'", "it").split()) or type(error).__name__
+    return InputError(str(path), "must be a whole picture", f'"{got}"', "Replace or remove the file.")
+
+
+@dataclass
+class Pictures:
+    """Pictures of a folder, decoded when they are needed and kept while they fit. Safe to use from many threads.
+
+    What is decoded first is kept until `budget_bytes` are full, and nothing is given up for another picture: training
+    goes round the folder, and whatever was thrown away would be needed again. A folder that fits is decoded once.
+
+    Attributes:
+        files: the picture files.
+        most_px: pixels that the shorter side of a picture may keep.
+        budget_bytes: memory that decoded pictures may take.
+        say: told once of every file that is skipped.
+        skipped: why each file that cannot be used was skipped.
+        decodings: how often a file was decoded.
+    """
+
+    files: tuple[Path, ...]
+    most_px: int | None = None
+    budget_bytes: int = BUDGET_BYTES
+    say: Callable[[str], None] = lambda _: None
+    skipped: dict[Path, str] = field(default_factory=dict)
+    decodings: int = 0
+    _kept: dict[Path, Picture] = field(default_factory=dict, repr=False)
+    _bytes: int = field(default=0, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _busy: dict[Path, threading.Lock] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def get(self, index: int) -> Picture | None:
+        """One picture, or None if its file has to be skipped.
+
+        Raises:
+            InputError: every file was skipped.
+        """
+        path = self.files[index]
+        with self._lock:
+            alone = self._busy.setdefault(path, threading.Lock())
+        with alone:  # two threads that want the same picture decode it once
+            if path in self.skipped:
+                return None
+            if path in self._kept:
+                return self._kept[path]
+            try:
+                picture = decoded(path, self.most_px)
+            except InputError as error:
+                self._skip(path, error)
+                return None
+            with self._lock:
+                self.decodings += 1
+                if self._bytes + picture.nbytes <= self.budget_bytes:
+                    self._kept[path] = picture
+                    self._bytes += picture.nbytes
+            return picture
+
+    def _skip(self, path: Path, error: InputError) -> None:
+        with self._lock:
+            self.skipped[path] = f"{error.rule}, but got {error.got}"
+            none_left = len(self.skipped) == len(self.files)
+        self.say(f"skipped {path}: {self.skipped[path]}")
+        if none_left:
+            names = ", ".join(p.name for p in self.files[:_SHOWN])
+            more = f" and {len(self.files) - _SHOWN} more" if len(self.files) > _SHOWN else ""
+            rule = "at least one picture must be whole"
+            raise InputError(str(path.parent), rule, f"only broken ones: {names}{more}", "Give other pictures.")
+
+    def digest(self) -> str:
+        """What the files are, by name and size: equal for equal folders, whatever was decoded yet.
+
+        Raises:
+            InputError: a file is gone.
+        """
+        try:
+            return sha256_bytes(canonical_json([[path.name, path.stat().st_size] for path in self.files]))
+        except OSError as error:
+            raise explain_os_error(error, str(error.filename)) from error
+
+
+def crop(
+    picture: Picture, shape: tuple[int, int], place: tuple[float, float], mirror: bool = False
+) -> UInt8[np.ndarray, "v u 3"]:
+    """Cut a window out of a picture, which is enlarged first if the window does not fit.
+
+    Args:
+        picture: `[y, x, colour]`.
+        shape: rows and columns of the window.
+        place: where the window lies between the lowest and highest row, and the first and last column, 0 to 1 each.
+        mirror: exchange left and right.
+    """
+    scale = max(n / m for n, m in zip(shape, picture.shape[:2], strict=True))
+    if scale > 1:
+        from PIL import Image
+
+        size = tuple(max(n, round(m * scale)) for n, m in zip(shape, picture.shape[:2], strict=True))
+        large = Image.fromarray(picture).resize((size[1], size[0]), Image.Resampling.BICUBIC)
+        picture = np.asarray(large, np.uint8)
+    y, x = (round(at * (m - n)) for at, n, m in zip(place, shape, picture.shape[:2], strict=True))
+    window = picture[y : y + shape[0], x : x + shape[1]]
+    return np.ascontiguousarray(window[:, ::-1] if mirror else window)
+
+
+def linear_light(picture: Picture) -> Float[np.ndarray, "3 y x"]:
+    """Linear light of a picture, 1 for its white, float32."""
+    return np.ascontiguousarray(_linear_table()[picture.transpose(2, 0, 1)])
+
+
+@cache
+def _linear_table() -> Float[np.ndarray, "256"]:
+    from sim.light import linear_from_srgb
+
+    return linear_from_srgb(np.arange(256) / 255).astype(np.float32)
+
+
+def told_skips(pictures: Pictures) -> str:
+    """One sentence on the files that were skipped; empty if none was."""
+    if not pictures.skipped:
+        return ""
+    paths: Sequence[Path] = sorted(pictures.skipped)
+    names = ", ".join(path.name for path in paths[:_SHOWN])
+    more = f" and {len(paths) - _SHOWN} more" if len(paths) > _SHOWN else ""
+    return f"{len(paths)} of {len(pictures)} pictures skipped: {names}{more}"

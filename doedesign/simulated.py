@@ -1,0 +1,153 @@
+"""One simulated capture: a scene through the plate of a run, and through a flat one, onto the same sensor.
+
+PSFs are computed at the very depths of the scene; nothing is interpolated between depths.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from doedesign.capture import seen_in
+from doedesign.predict import Drawn
+from doedesign.recon.data import Item
+from fab.process import Process, Variation
+from sim.camera import Camera
+from sim.convolve import convolve, plan_otf
+from sim.disc import disc_window
+from sim.formation import Model, Optics, Outside, capture, shadow_discs
+from sim.obstruction import Kind
+from sim.psf import psf_bank, surface_bank
+from sim.scene import Obstruction, Scene
+from sim.sensor import Sensor, demosaiced, developed, expose
+from sim.surface import as_fabricated
+
+Psfs = Callable[[float], Float[np.ndarray, "c y x"]]
+
+_RELEASE_GAIN = 1.5  # of alpha, in the public code; see `sim.formation`
+
+
+class Bench(NamedTuple):
+    """Both cameras.
+
+    Attributes:
+        camera: optics, with an odd window, so that a capture lies on its scene.
+        with_plate: PSFs by depth.
+        without: PSFs by depth of the conventional camera.
+        model: occlusion model.
+        outside: see `sim.formation.capture`.
+        sensor: the sensor.
+        shadow_px: window of the shadow discs.
+    """
+
+    camera: Camera
+    with_plate: Psfs
+    without: Psfs
+    model: Model
+    outside: Outside
+    sensor: Sensor
+    shadow_px: int
+
+
+class Captured(NamedTuple):
+    """What one item shows, colours as the camera has them.
+
+    Attributes:
+        clean: `[c, y, x]` scene alone, sharp, white 1.
+        conventional: developed capture with a flat plate.
+        doe: developed capture with the plate.
+        mask: `[y, x]` share of each direction that is blocked.
+        alpha: `[1, y, x]` or `[c, y, x]` share of the background's light that the model takes away, with the plate.
+        depth_m: `[y, x]` distance of what is seen: the obstruction where it blocks at least half.
+    """
+
+    clean: Float[np.ndarray, "c y x"]
+    conventional: Float[np.ndarray, "c y x"]
+    doe: Float[np.ndarray, "c y x"]
+    mask: Float[np.ndarray, "y x"]
+    alpha: Float[np.ndarray, "a y x"]
+    depth_m: Float[np.ndarray, "y x"]
+
+
+def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
+    """Photograph one scene with both cameras.
+
+    Args:
+        item: the scene.
+        bench: the cameras.
+        key: key of the noise, which differs from camera to camera.
+    """
+    camera = bench.camera
+    near = Obstruction(item.mask, seen_in(item.radiance, camera), item.depth_m)
+    scene = Scene(seen_in(item.background, camera), item.background_depth_m, (near,))
+    with_plate, without = (_optics(psfs, bench, item) for psfs in (bench.with_plate, bench.without))
+    conventional, doe = (
+        _recorded(scene, optics, bench, jax.random.fold_in(key, k)) for k, optics in enumerate((without, with_plate))
+    )
+    depth = np.where(item.mask >= 0.5, np.float32(item.depth_m), np.float32(item.background_depth_m))
+    return Captured(np.asarray(scene.background), conventional, doe, item.mask, _alpha(scene, with_plate, bench), depth)
+
+
+def plate_psfs(drawn: Drawn, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
+    """PSFs of the plate by depth; exactly at the depth asked for, and kept while a simulation lasts."""
+    made_by, variation = (process or Process(drawn.levels)), (errors or Variation())
+
+    @lru_cache(maxsize=1)
+    def surface() -> Any:
+        return as_fabricated(drawn.level, camera, made_by, variation)
+
+    @lru_cache(maxsize=8)
+    def at(depth_m: float) -> Float[np.ndarray, "c y x"]:
+        return surface_bank(camera, surface(), (depth_m,)).energy[:, 0]
+
+    return at
+
+
+def flat_psfs(camera: Camera) -> Psfs:
+    """PSFs of a flat plate of the same glass, which stands for the conventional camera."""
+    flat = np.zeros(camera.grid.shape, np.float32)
+
+    @lru_cache(maxsize=8)
+    def at(depth_m: float) -> Float[np.ndarray, "c y x"]:
+        return psf_bank(camera, flat, (depth_m,)).energy[:, 0]
+
+    return at
+
+
+def _nearest_m(kind: Any) -> float:
+    """The nearest that a kind, or one it is mixed of, is drawn at."""
+    depth = getattr(kind, "depth_m", None)
+    return depth[0] if depth else min(_nearest_m(getattr(kind, name)) for name in ("dirt", "raindrop"))
+
+
+def shadow_window(kind: Kind, camera: Camera) -> int:
+    """Window that holds the shadow disc at every depth, so that all items share one compiled capture."""
+    return disc_window(camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * _nearest_m(kind)))
+
+
+def _optics(psfs: Psfs, bench: Bench, item: Item) -> Optics:
+    camera, psf = bench.camera, np.stack([psfs(item.background_depth_m), psfs(item.depth_m)])
+    return Optics(psf, camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, bench.shadow_px)
+
+
+def _recorded(scene: Scene, optics: Optics, bench: Bench, key: Array) -> Float[np.ndarray, "c y x"]:
+    """The developed capture."""
+    light = capture(scene, optics, bench.model, outside=bench.outside)
+    raw = np.asarray(expose(light, bench.sensor, key))
+    return np.asarray(developed(demosaiced(raw, bench.sensor) if bench.sensor.pattern else raw, bench.sensor))
+
+
+def _alpha(scene: Scene, optics: Optics, bench: Bench) -> Float[np.ndarray, "c y x"]:
+    """Share of the background's light that the model takes away: d * M of one channel, or p_obs * M of every colour."""
+    mask = np.asarray(scene.obstructions[0].mask)
+    shape = (mask.shape[0], mask.shape[1])
+    if bench.model == "radiometric":
+        (disc,) = shadow_discs(scene, optics, bench.shadow_px)
+        return np.clip(np.asarray(convolve(mask[None], plan_otf(disc, shape, "reflect"))), 0, 1)
+    near = np.asarray(optics.psf[1])
+    near = near / near.sum(axis=(-2, -1), keepdims=True)
+    gain = _RELEASE_GAIN if bench.model == "paper_release" else 1.0
+    return np.clip(gain * np.asarray(convolve(mask[None], plan_otf(near, shape, "reflect"))), 0, 1)

@@ -1,0 +1,170 @@
+"""Pictures as scenes: what is found, decoded, skipped and kept, and which way up it comes."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from doedesign.images import (
+    SAMPLES,
+    Pictures,
+    crop,
+    decoded,
+    linear_light,
+    picture_files,
+    sample_files,
+    told_skips,
+)
+from fab.errors import InputError
+
+
+def save(path: Path, values: np.ndarray, **options) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).save(path, **options)
+    return path
+
+
+def noise(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three good pictures, three files that are none, and one that is no picture file."""
+    for k, name in enumerate(("a.png", "b.jpg", "inner/c.webp")):
+        save(tmp_path / name, noise((20, 30, 3), k))
+    (tmp_path / "d.png").write_bytes((tmp_path / "a.png").read_bytes()[:300])
+    (tmp_path / "e.jpg").write_bytes(b"no picture at all")
+    (tmp_path / "f.tif").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("see b.jpg")
+    return tmp_path
+
+
+def test_the_samples_are_there_without_a_download():
+    files = picture_files(None)
+    assert [path.name for path in files] == list(SAMPLES)
+    picture = decoded(sample_files()[0], 64)
+    assert min(picture.shape[:2]) == 64
+    assert picture.std() > 20  # a photograph, not a blank
+
+
+@pytest.mark.parametrize(("suffix", "exact"), [("png", True), ("tif", True), ("bmp", True), ("webp", False)])
+def test_the_lowest_row_comes_first(tmp_path: Path, suffix: str, exact: bool):
+    values = np.repeat(np.arange(0, 240, 10).astype(np.uint8)[:, None, None], 3, 2) * np.ones((1, 20, 1), np.uint8)
+    picture = decoded(save(tmp_path / f"ramp.{suffix}", values))
+    assert picture.shape == values.shape
+    assert np.abs(picture[::-1].astype(int) - values).max() <= (0 if exact else 8)  # WebP loses a little
+
+
+def test_a_turned_camera(tmp_path: Path):
+    values = noise((6, 4, 3))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned a quarter clockwise
+    picture = decoded(save(tmp_path / "turned.png", values, exif=exif))
+    assert np.array_equal(picture[::-1], np.rot90(values, -1))
+
+
+def test_sixteen_bits_grey_palette_and_transparency(tmp_path: Path):
+    deep = np.array([[0, 128, 65535], [257 * 7, 257 * 200, 40000]], np.uint16)
+    assert decoded(save(tmp_path / "deep.png", deep))[::-1, :, 1].tolist() == [[0, 0, 255], [7, 200, 156]]
+    grey = noise((5, 7))
+    assert np.array_equal(decoded(save(tmp_path / "grey.png", grey))[::-1, :, 2], grey)
+    clear = noise((5, 7, 4))
+    assert np.array_equal(decoded(save(tmp_path / "clear.png", clear))[::-1], clear[..., :3])
+    Image.fromarray(grey).convert("P").save(tmp_path / "palette.gif")
+    assert decoded(tmp_path / "palette.gif").shape == (5, 7, 3)
+    Image.fromarray(noise((5, 7)).astype(np.float32)).save(tmp_path / "float.tif")
+    with pytest.raises(InputError, match="no display values"):
+        decoded(tmp_path / "float.tif")
+
+
+def test_large_pictures_are_shrunk_by_averaging(tmp_path: Path):
+    values = np.zeros((64, 96, 3), np.uint8)
+    values[:, ::2] = 200  # columns that picking every other one would lose
+    small = decoded(save(tmp_path / "stripes.png", values), 32)
+    assert small.shape == (32, 48, 3)
+    assert np.all(small == 100)
+    assert decoded(tmp_path / "stripes.png", 200).shape == (64, 96, 3)
+
+
+def test_display_values_become_linear_light():
+    picture = np.array([[[0, 255, 128]]], np.uint8)
+    light = linear_light(picture)
+    assert light.dtype == np.float32
+    # ((128/255 + 0.055) / 1.055)^2.4, IEC 61966-2-1
+    assert light.ravel() == pytest.approx([0, 1, 0.21586], abs=1e-5)
+
+
+def test_windows_of_a_picture():
+    picture = noise((10, 8, 3))
+    assert np.array_equal(crop(picture, (4, 4), (0.0, 0.0)), picture[:4, :4])
+    assert np.array_equal(crop(picture, (4, 4), (1.0, 1.0)), picture[6:, 4:])
+    assert np.array_equal(crop(picture, (4, 4), (1.0, 0.0), mirror=True), picture[6:, :4][:, ::-1])
+    large = crop(np.full((4, 8, 3), 50, np.uint8), (12, 12), (0.5, 0.5))
+    assert large.shape == (12, 12, 3)
+    assert np.all(large == 50)
+
+
+def test_files_that_are_no_pictures_are_skipped_by_name(folder: Path):
+    said: list[str] = []
+    pictures = Pictures(picture_files(folder), say=said.append)
+    for _ in range(2):
+        got = [pictures.get(k) for k in range(len(pictures))]
+        assert [picture is not None for picture in got] == [True, True, False, False, False, True]
+    assert [path.name for path in pictures.skipped] == ["d.png", "e.jpg", "f.tif"]
+    assert len(said) == 3  # once each
+    assert all(name in text for name, text in zip(("d.png", "e.jpg", "f.tif"), said, strict=True))
+    assert told_skips(pictures) == "3 of 6 pictures skipped: d.png, e.jpg, f.tif"
+    assert told_skips(Pictures(())) == ""
+
+
+def test_only_broken_files_are_an_error(tmp_path: Path):
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(b"broken")
+    pictures = Pictures(picture_files(tmp_path))
+    assert pictures.get(0) is None
+    with pytest.raises(InputError, match=r"at least one picture must be whole.*a\.png, b\.png"):
+        pictures.get(1)
+
+
+def test_folders_without_pictures(tmp_path: Path):
+    for path, words in ((tmp_path / "none", "no folder"), (tmp_path, "must hold pictures"), (Path(__file__), "a file")):
+        with pytest.raises(InputError, match=words) as caught:
+            picture_files(path)
+        assert str(path) in str(caught.value)
+
+
+def test_what_fits_is_decoded_once(folder: Path):
+    files = tuple(path for path in picture_files(folder) if path.name[0] in "abc")
+    pictures = Pictures(files)
+    for _ in range(3):
+        assert all(pictures.get(k) is not None for k in range(3))
+    assert pictures.decodings == 3
+    one = 20 * 30 * 3
+    tight = Pictures(files, budget_bytes=2 * one)
+    for _ in range(3):
+        assert all(tight.get(k) is not None for k in range(3))
+    assert tight.decodings == 2 + 3  # two are kept, the third is decoded every time
+
+
+def test_threads_share_one_decoding(folder: Path):
+    pictures, gate = Pictures(picture_files(folder)[:1]), threading.Barrier(4)
+
+    def ask(_: int) -> int:
+        gate.wait()
+        picture = pictures.get(0)
+        return 0 if picture is None else int(picture.sum())
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(ask, range(4)))) == 1
+    assert pictures.decodings == 1
+
+
+def test_the_digest_is_that_of_the_folder(folder: Path):
+    digest = Pictures(picture_files(folder)).digest()
+    assert Pictures(picture_files(folder)).digest() == digest
+    (folder / "a.png").unlink()
+    assert Pictures(picture_files(folder)).digest() != digest
