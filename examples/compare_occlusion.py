@@ -59,27 +59,27 @@ def pixel_at(camera: Camera, depth_m: float) -> float:
     return camera.pixel_m * depth_m / camera.focal_length_m
 
 
-def compare(run: Path, colour: int = 1, line_px: int = 8) -> list[dict[str, Any]]:
+def compare(
+    camera: Camera, height_m: np.ndarray, depth_m: float, background_m: float, line_px: int, middle_px: int = MIDDLE_PX
+) -> list[dict[str, Any]]:
     """Compare the models with the reference at every width of the bar.
 
     Args:
-        run: a finished run.
-        colour: which of its colours; the reference takes most of the time.
-        line_px: distance of the bright lines, pixels.
+        camera: a camera of one colour with an odd window.
+        height_m: `[y, x]` height of the plate, metres.
+        depth_m: distance of the bar.
+        background_m: distance of the lines.
+        line_px: distance of neighbouring lines, pixels.
+        middle_px: width of the middle of the picture, which is judged, pixels.
 
     Returns:
         for every width: the share of light that passes on the axis, by the reference, the geometric shadow and eq. 10,
         and the error of every model.
     """
-    made = open_run(run)
-    spec, height = made.spec, read_height(made.path("height.exr")).height_m
-    whole = camera_of(spec)
-    window = whole.window - 1 + whole.window % 2
-    camera = replace(whole, window=window, colours=(whole.colours[min(colour, len(whole.colours) - 1)],))
-    depth_m, background_m, half = min(spec.scene.near_m), max(spec.scene.far_m), window // 2
-    optics = Optics.of(psf_bank(camera, height, [depth_m, background_m]), camera, [background_m, depth_m])
-    pixels = MIDDLE_PX + 2 * half + 1
-    middle = slice(half, half + MIDDLE_PX + 1)
+    half = camera.window // 2
+    optics = Optics.of(psf_bank(camera, height_m, [depth_m, background_m]), camera, [background_m, depth_m])
+    pixels = middle_px + 2 * half + 1
+    middle = slice(half, half + middle_px + 1)
     lines = range(pixels // 2 % line_px, pixels, line_px)
     light = np.zeros((1, 1, pixels), np.float32)
     light[..., list(lines)] = 1
@@ -92,7 +92,7 @@ def compare(run: Path, colour: int = 1, line_px: int = 8) -> list[dict[str, Any]
             width_m = int(mask.sum()) * pixel_at(camera, depth_m)
             profiles = []
             for k, line in enumerate(lines):
-                psf = shadowed_psf(camera, height, mask, depth_m, background_m, (0, line))[0]
+                psf = shadowed_psf(camera, height_m, mask, depth_m, background_m, (0, line))[0]
                 profiles.append(psf.sum(axis=0))
                 progress.advance(n * len(lines) + k + 1)
             reference = _on_lines(profiles, lines, pixels)[middle]
@@ -179,10 +179,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--colour", type=int, default=1, help="number of the colour, 0 first (default 1)")
     parser.add_argument("--line-px", type=int, default=8, help="distance of the bright lines in pixels (default 8)")
     asked = parser.parse_args(arguments)
-    rows = compare(asked.run, asked.colour, asked.line_px)
+    run = open_run(asked.run)
+    spec, whole = run.spec, camera_of(run.spec)
+    colour = whole.colours[min(asked.colour, len(whole.colours) - 1)]
+    # An odd window has the chief ray in the middle of a pixel, so the picture lies on its scene.
+    camera = replace(whole, window=whole.window - 1 + whole.window % 2, colours=(colour,))
+    height_m = read_height(run.path("height.exr")).height_m
+    rows = compare(camera, height_m, min(spec.scene.near_m), max(spec.scene.far_m), asked.line_px)
     folder = asked.run / "occlusion"
     write_atomic(folder / "occlusion.json", canonical_json({"rows": rows}))
-    draw(folder / "occlusion.png", rows, open_run(asked.run).spec.name)
+    draw(folder / "occlusion.png", rows, spec.name)
     print("width     passes  geometry  eq. 10   error for even light, for fine lines")
     print(" " * 36 + "".join(f"{model:>20}" for model, _ in MODELS))
     for row in rows:

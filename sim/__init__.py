@@ -18,8 +18,10 @@ Reading order, from the substance to the picture:
     measured    measured PSFs from camera files
     light       sRGB and linear light, lens shading
     scene       what a camera looks at: a background and obstructions before it
+    obstruction fences, raindrops, dirt and masks of a user, drawn from physical parameters
     disc        the aperture's shadow disc on pixels
     convolve    linear convolution by real transforms, in one piece or in tiles
+    shadow      the reference of obstructed light: one point's wave past an obstruction, through the plate
     formation   from a scene to the light on the sensor, by three models
     field       the same for full frames, with PSFs that vary over the field
     noise       fast Poisson counts, and noise that gradients pass through

@@ -10,7 +10,7 @@ whatever the DOE does; what is left lands by the far PSF, and the obstruction's 
 With several obstructions every layer loses to each nearer one by that one's own disc, and the passed shares are
 multiplied. That takes shadows in one bundle as independent: exact where they do not meet, and on average otherwise. The
 second approximation is that a partly blocked pupil has the PSF of the open one, only weaker. So a uniform world stays
-uniform where p_near = p_far ∗ d, as for a lens alone; with a plate its *energy* does.
+uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with another plate its *energy* does.
 
 `paper` is eq. 10 as printed, with α = p_obs ∗ M for every colour:
 
@@ -18,7 +18,9 @@ uniform where p_near = p_far ∗ d, as for a lens alone; with a plate its *energ
 
 α is a share, and the paper's PSFs have unit sum, so it is divided by the energy of p_obs in its window (a cover over
 everything must not let the background through); the light itself keeps the PSFs' energies. Eq. 10 passes light that
-never reaches the aperture: with the paper's plate half the light of points that are completely hidden.
+never reaches the aperture: with the paper's plate half the light of points that are completely hidden. In even light
+it is nevertheless exact, by reciprocity: what a dark bar takes is what a bright one would send. `sim.shadow` judges
+both, and examples/compare_occlusion.py shows by how much each is off for a plate.
 
 `paper_release` is what the public code does: every PSF scaled to unit sum, α = clamp(1.5 · p_obs ∗ M, 0, 1).
 

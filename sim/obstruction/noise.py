@@ -43,7 +43,8 @@ def _factors(
     x: tuple[Float[np.ndarray, "m i"], Float[np.ndarray, "m i"]],
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "m k"]]:
     """The thin matrices whose product is the noise, from the weights of rows and columns."""
-    return np.hstack(y), np.hstack([x[1] @ lattice[1].T, x[0] @ lattice[0].T])
+    # A place knows few corners. Sparse products also stay on one core: a picture is too small to share out.
+    return np.hstack(y), np.hstack([csr_array(x[1]) @ lattice[1].T, csr_array(x[0]) @ lattice[0].T])
 
 
 def perlin(
@@ -63,7 +64,6 @@ def perlin(
 
 
 def _product(left: Float[np.ndarray, "n k"], right: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "n m"]:
-    # A column knows few corners. The sparse product also stays on one core: a picture is too small to share out.
     return np.ascontiguousarray(csr_array(left) @ np.ascontiguousarray(right.T))
 
 
