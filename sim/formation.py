@@ -10,7 +10,7 @@ whatever the DOE does; what is left lands by the far PSF, and the obstruction's 
 With several obstructions every layer loses to each nearer one by that one's own disc, and the passed shares are
 multiplied. That takes shadows in one bundle as independent: exact where they do not meet, and on average otherwise. The
 second approximation is that a partly blocked pupil has the PSF of the open one, only weaker. So a uniform world stays
-uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with another plate its *energy* does.
+uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with others its *energy* does.
 
 `paper` is eq. 10 as printed, with α = p_obs ∗ M for every colour:
 
