@@ -29,15 +29,16 @@ import numpy as np
 
 from bench.psf import time_rounds
 from sim.convolve import fast_length
-from sim.formation import Model, Optics, Prepared, capture, shadow_px
+from sim.formation import Optics, Prepared, capture, shadow_px
 from sim.noise import photon_noise
+from sim.occlusion import Model
 from sim.scene import Obstruction, Scene
 
 TARGET_RATIO, TARGET_S, TARGET_GB = 1.5, 60.0, 8.0
 PIXELS, WINDOW, COLOURS, ROUNDS = 512, 512, 3, 31
 FULL_WELL_E, READ_NOISE_E = 10_000.0, 2.5
 FRAME, NODES = (3000, 4000), 5
-MODELS: tuple[Model, ...] = ("radiometric", "paper", "paper_release")
+MODELS: tuple[Model, ...] = ("radiometric", "reciprocal", "paper", "paper_release")
 
 
 def make_psf(seed: int, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """From a spec to what `simulate` and `train` put before the camera and behind it: obstruction, sensor, colours.
 
 A spec may leave all of it out but the occlusion model, which has no default: the models differ most where it matters
-(`sim.formation`), and a result has to say which one it was made with.
+(`sim.occlusion`), and a result has to say which one it was made with.
 """
 
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from doedesign.spec.values import nearest
 from fab.errors import InputError
 from fab.units import parse_angle, parse_length
 from sim.camera import Camera
-from sim.formation import Model, Outside
 from sim.metrics import mean_wavelength_m
 from sim.obstruction import OBSTRUCTIONS, Kind
+from sim.occlusion import Model, Outside
 from sim.sensor import Sensor
 
 # Luminance of linear sRGB (IEC 61966-2-1).

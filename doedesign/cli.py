@@ -331,7 +331,7 @@ def simulate(
         run: Run folder.
         images: Folder of pictures; sample pictures of scikit-image by default.
         obstruction: Kind, such as dirt, raindrop or fence, or a folder of masks; the spec's by default.
-        occlusion: radiometric, paper or paper_release; the spec's by default, and there is no other default.
+        occlusion: radiometric, reciprocal, paper or paper_release; the spec's by default, which has no default.
         out: Folder; RUN/simulated by default. The same command resumes a stopped simulation.
         count: Number of items; one per picture and at most six by default.
         seed: Seed of everything.

@@ -18,16 +18,15 @@ from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.convolve import convolve, plan_otf
 from sim.disc import disc_window
-from sim.formation import Model, Optics, Outside, capture, shadow_discs
+from sim.formation import Optics, capture, shadow_discs
 from sim.obstruction import Kind
+from sim.occlusion import RELEASE_GAIN, Model, Outside, follows_light
 from sim.psf import psf_bank, surface_bank
 from sim.scene import Obstruction, Scene
 from sim.sensor import Sensor, demosaiced, developed, expose
 from sim.surface import as_fabricated
 
 Psfs = Callable[[float], Float[np.ndarray, "c y x"]]
-
-_RELEASE_GAIN = 1.5  # of alpha, in the public code; see `sim.formation`
 
 
 class Bench(NamedTuple):
@@ -144,10 +143,10 @@ def _alpha(scene: Scene, optics: Optics, bench: Bench) -> Float[np.ndarray, "c y
     """Share of the background's light that the model takes away: d * M of one channel, or p_obs * M of every colour."""
     mask = np.asarray(scene.obstructions[0].mask)
     shape = (mask.shape[0], mask.shape[1])
-    if bench.model == "radiometric":
+    if follows_light(bench.model):
         (disc,) = shadow_discs(scene, optics, bench.shadow_px)
         return np.clip(np.asarray(convolve(mask[None], plan_otf(disc, shape, "reflect"))), 0, 1)
     near = np.asarray(optics.psf[1])
     near = near / near.sum(axis=(-2, -1), keepdims=True)
-    gain = _RELEASE_GAIN if bench.model == "paper_release" else 1.0
+    gain = RELEASE_GAIN if bench.model == "paper_release" else 1.0
     return np.clip(gain * np.asarray(convolve(mask[None], plan_otf(near, shape, "reflect"))), 0, 1)

@@ -5,7 +5,7 @@
 A dark bar stands upright before the middle of the lens, at the nearest depth of the spec; it is a quarter to twice as
 wide as the aperture (1 to 10 mm for the automotive plate). Behind it, bright lines at equal distances fill the view.
 The reference (`sim.shadow`) sends the light of every line past the bar to the aperture, wave by wave, and through the
-partly shaded plate; the models of `sim.formation` mix the PSFs of the open plate. Written beside the
+partly shaded plate; the models of `sim.occlusion` mix the PSFs of the open plate. Written beside the
 run, in `occlusion/`:
 
     occlusion.json    for every width: the light that passes on the axis, and the error of every model
@@ -33,7 +33,8 @@ from doedesign.runs import open_run
 from fab.files import canonical_json, write_atomic
 from fab.units import MM, format_length
 from sim.camera import Camera
-from sim.formation import Model, Optics, Outside, capture
+from sim.formation import Optics, capture
+from sim.occlusion import Model, Outside
 from sim.psf import psf_bank
 from sim.scene import Obstruction, Scene
 from sim.shadow import shadowed_psf
@@ -42,7 +43,12 @@ from sim.store import read_height
 # Widths of the bar over the diameter of the aperture: 1, 2, 3, 4, 6, 8 and 10 mm for 4.44 mm.
 SHARES = (0.225, 0.45, 0.675, 0.9, 1.35, 1.8, 2.25)
 # What I_obs holds beside the obstruction is open in eq. 10: nothing as printed, the scene in the public code for bars.
-MODELS: tuple[tuple[Model, Outside], ...] = (("radiometric", "scene"), ("paper", "nothing"), ("paper_release", "scene"))
+MODELS: tuple[tuple[Model, Outside], ...] = (
+    ("radiometric", "scene"),
+    ("reciprocal", "scene"),
+    ("paper", "nothing"),
+    ("paper_release", "scene"),
+)
 MIDDLE_PX = 120
 
 

@@ -22,7 +22,8 @@ Reading order, from the substance to the picture:
     disc        the aperture's shadow disc on pixels
     convolve    linear convolution by real transforms, in one piece or in tiles
     shadow      the reference of obstructed light: one point's wave past an obstruction, through the plate
-    formation   from a scene to the light on the sensor, by three models
+    occlusion   how an obstruction takes light from what is behind it, by four models
+    formation   from a scene to the light on the sensor
     field       the same for full frames, with PSFs that vary over the field
     noise       fast Poisson counts, and noise that gradients pass through
     sensor      from light to raw numbers, and back to an image

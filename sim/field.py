@@ -21,19 +21,8 @@ from jaxtyping import Array, Float
 from fab.grid import Grid
 from sim.camera import Camera
 from sim.convolve import Border, Otf, Tile, Window, convolve_tiled, landed, plan_otf, spectrum, tile_length, tiles
-from sim.formation import (
-    Layers,
-    Light,
-    Model,
-    Optics,
-    Outside,
-    check_layers,
-    check_names,
-    compose,
-    psf_at,
-    shadow_discs,
-    shadow_px,
-)
+from sim.formation import Optics, check_layers, psf_at, shadow_discs, shadow_px
+from sim.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light, with_spot
 from sim.psf import PsfBank
 from sim.scene import Scene
 
@@ -115,16 +104,20 @@ def capture_frame(
         raise ValueError("`border` must be 'reflect' or 'edge' for a frame, but got 'own'")
     shape = (scene.background.shape[1], scene.background.shape[2])
     masks = tuple(np.asarray(near.mask) for near in scene.obstructions)
-    kept = []
-    if model == "radiometric":
-        for mask, disc in zip(masks, shadow_discs(scene, optics.axis, shadow_px(scene, optics.axis)), strict=True):
-            kept.append(1 - convolve_tiled(mask, np.asarray(disc), border))
+    discs: tuple[np.ndarray, ...] = ()
+    if follows_light(model):
+        discs = tuple(np.asarray(d) for d in shadow_discs(scene, optics.axis, shadow_px(scene, optics.axis)))
+    kept = [1 - convolve_tiled(mask, disc, border) for mask, disc in zip(masks, discs, strict=bool(discs))]
+
+    def shaded(number: int, light: Light) -> np.ndarray:
+        return convolve_tiled(np.asarray(light), discs[number][0], border)
+
     frame = np.empty(scene.background.shape, np.float32)
     for colour in range(len(frame)):
-        imaging = _FramePlan.of(optics, colour, shape, border, length)
+        imaging = _FramePlan.of(optics, colour, shape, border, length, spot=model == "reciprocal")
         radiances = tuple(np.asarray(near.radiance[colour]) for near in scene.obstructions)
         layers = Layers(np.asarray(scene.background[colour]), masks, radiances)
-        frame[colour] = compose(layers, kept, imaging, model, outside)
+        frame[colour] = compose(layers, kept, shaded, imaging, model, outside)
     return frame
 
 
@@ -146,8 +139,11 @@ class _FramePlan(NamedTuple):
     shape: Window
 
     @classmethod
-    def of(cls, optics: FieldOptics, colour: int, shape: Window, border: Border, length: Window | None) -> "_FramePlan":
-        psf = optics.psf[:, :, :, colour]
+    def of(
+        cls, optics: FieldOptics, colour: int, shape: Window, border: Border, length: Window | None, spot: bool
+    ) -> "_FramePlan":
+        """Transform the PSFs of one colour, with the layers of `with_spot` where they are wanted."""
+        psf = np.asarray(with_spot(optics.psf[:, :, :, colour]) if spot else optics.psf[:, :, :, colour])
         window = (psf.shape[-2], psf.shape[-1])
         pieces = tuple(tiles(shape, window, border, length or tile_length(shape, window, border)))
         needed = (len(pieces[0].rows), len(pieces[0].columns))

@@ -1,36 +1,9 @@
-"""From a scene in layers to the light on the sensor: three models, all differentiable in PSFs and images.
+"""From a scene in layers to the light on the sensor, differentiable in PSFs and images.
 
-`radiometric` follows the light (design.md §6). The bundle from a point of the background through the aperture cuts an
-obstruction's plane in a disc of diameter D · (1 - z_o / z_b), which is D · (1 - z_o / z_b) · f / (z_o · pixel) pixels
-wide (eq. 11). The share of the disc that the obstruction covers is the share of the point's light that is lost,
-whatever the DOE does; what is left lands by the far PSF, and the obstruction's own light by the near one:
-
-    I = p_near ∗ (M · I_obs) + p_far ∗ ((1 - d ∗ M) · I_far)
-
-With several obstructions every layer loses to each nearer one by that one's own disc, and the passed shares are
-multiplied. That takes shadows in one bundle as independent: exact where they do not meet, and on average otherwise. The
-second approximation is that a partly blocked pupil has the PSF of the open one, only weaker. So a uniform world stays
-uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with others its *energy* does.
-
-`paper` is eq. 10 as printed, with α = p_obs ∗ M for every colour:
-
-    I = α ⊙ (p_obs ∗ I_obs) + (1 - α) ⊙ (p_far ∗ I_far)
-
-α is a share, and the paper's PSFs have unit sum, so it is divided by the energy of p_obs in its window (a cover over
-everything must not let the background through); the light itself keeps the PSFs' energies. Eq. 10 passes light that
-never reaches the aperture: with the paper's plate half the light of points that are completely hidden. In even light
-it is nevertheless exact, by reciprocity: what a dark bar takes is what a bright one would send. `sim.shadow` judges
-both, and examples/compare_occlusion.py shows by how much each is off for a plate.
-
-`paper_release` is what the public code does: every PSF scaled to unit sum, α = clamp(1.5 · p_obs ∗ M, 0, 1).
-
-Under both, `outside` says what I_obs holds where there is no obstruction, which eq. 10 leaves open: the scene behind
-(the public code for dirt and fences) or nothing (for raindrops). Several obstructions are laid over each other from the
-farthest to the nearest. Say which model was used wherever a result is shown; none is a default.
+How an obstruction takes light from what is behind it is the choice of a model by name (`sim.occlusion`).
 """
 
 from collections.abc import Sequence
-from typing import Literal, Protocol, get_args, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -42,14 +15,9 @@ from fab.errors import InputError
 from sim.camera import Camera
 from sim.convolve import Border, Otf, Window, convolve, plan_otf, superpose
 from sim.disc import disc_window, shadow_disc
+from sim.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light, with_spot
 from sim.psf import PsfBank
 from sim.scene import Depth, Scene
-
-Model = Literal["paper", "paper_release", "radiometric"]
-Outside = Literal["scene", "nothing"]
-Light = Array | np.ndarray
-
-_RELEASE_GAIN = 1.5  # of alpha, in the public code
 
 
 class Optics(eqx.Module):
@@ -106,11 +74,11 @@ class Optics(eqx.Module):
         """The same optics with the PSFs' transforms, for many scenes of one shape.
 
         Args:
-            shape: pixels (y, x) of the scenes; with their own margin and the radiometric model, less the margin that
-                the shadow discs take.
+            shape: pixels (y, x) of the scenes; with their own margin and a model that follows the light, less the
+                margin that the shadow discs take.
             border: what lies beyond a scene.
         """
-        return Prepared(self, plan_otf(self.psf.swapaxes(0, 1), shape, border))
+        return Prepared(self, plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
 
 
 def _known(depth_m: Depth) -> float | None:
@@ -126,7 +94,7 @@ class Prepared(eqx.Module):
 
     Attributes:
         optics: what they were made from.
-        otf: `[c, layer, fx, fy]` transforms.
+        otf: `[c, layer, fx, fy]` transforms; its layers are those of `with_spot`.
     """
 
     optics: Optics
@@ -154,71 +122,6 @@ def psf_at(bank: PsfBank, depth_m: float) -> Float[np.ndarray, "c y x"]:
     return lower if share == 0 else (1 - share) * lower + share * bank.energy[:, order[low + 1]]
 
 
-class Layers(eqx.Module):
-    """A scene in one colour.
-
-    Attributes:
-        background: `[y, x]` light.
-        masks: `[y, x]` of every obstruction, from the farthest to the nearest.
-        radiances: `[y, x]` likewise.
-    """
-
-    background: Light
-    masks: tuple[Light, ...]
-    radiances: tuple[Light, ...]
-
-
-@runtime_checkable
-class Imaging(Protocol):
-    """How light of one colour gets onto the sensor; the models need no more of a camera."""
-
-    def one(self, layer: int, light: Light, unit: bool) -> Light:
-        """Light `[y, x]` of one layer through its PSF; `unit` scales that to unit sum."""
-        ...
-
-    def total(self, lights: Sequence[Light]) -> Light:
-        """Light `[y, x]` of every layer through its PSF, added up."""
-        ...
-
-
-def radiometric(layers: Layers, kept: Sequence[Light], imaging: Imaging) -> Light:
-    """Light on the sensor by the model `radiometric`.
-
-    Args:
-        layers: the scene in one colour.
-        kept: for every obstruction, the share `[behind, y, x]` of its light that each layer behind it keeps, perhaps
-            without a margin of the scene.
-        imaging: the camera.
-    """
-    lights = [layers.background, *(m * light for m, light in zip(layers.masks, layers.radiances, strict=True))]
-    lights = [_cut(light, kept[0].shape) if kept else light for light in lights]
-    for shares in kept:
-        for behind, share in enumerate(shares):
-            lights[behind] = share * lights[behind]
-    return imaging.total(lights)
-
-
-def eq_10(layers: Layers, imaging: Imaging, release: bool, outside: Outside) -> Light:
-    """Light on the sensor by the model `paper`, or `paper_release`."""
-    image, sharp = imaging.one(0, layers.background, unit=release), layers.background
-    for layer, (mask, radiance) in enumerate(zip(layers.masks, layers.radiances, strict=True), start=1):
-        alpha = imaging.one(layer, mask, unit=True)
-        if release:
-            alpha = (_RELEASE_GAIN * alpha).clip(0.0, 1.0)
-        covered = mask * radiance
-        sharp = covered + (1 - mask) * sharp
-        landed = imaging.one(layer, sharp if outside == "scene" else covered, unit=release)
-        image = alpha * landed + (1 - alpha) * image
-    return image
-
-
-def compose(layers: Layers, kept: Sequence[Light], imaging: Imaging, model: Model, outside: Outside) -> Light:
-    """Light on the sensor by the model of that name; see `radiometric` and `eq_10`."""
-    if model == "radiometric":
-        return radiometric(layers, kept, imaging)
-    return eq_10(layers, imaging, model == "paper_release", outside)
-
-
 def capture(
     scene: Scene,
     optics: Optics | Prepared,
@@ -236,8 +139,9 @@ def capture(
         optics: PSFs of every layer of the scene.
         model: how layers are put together; see above.
         border: what lies beyond the scene (`sim.convolve`). With `own` the capture is smaller than the scene, by the
-            PSF's window and, for `radiometric`, that of the shadow discs (`shadow_px`).
-        outside: what I_obs holds where there is no obstruction; without influence on `radiometric`.
+            PSF's window and, where the model follows the light, that of the shadow discs (`shadow_px`), which
+            `reciprocal` needs twice.
+        outside: what I_obs holds where there is no obstruction; for the paper's models.
 
     Returns:
         `[c, y, x]`, differentiable in PSFs and images. Where nothing lands, rounding of the transforms may leave
@@ -250,14 +154,17 @@ def capture(
     check_names(model, outside)
     plain = optics.optics if isinstance(optics, Prepared) else optics
     check_layers(scene, *plain.psf.shape[:2])
-    window = shadow_px(scene, plain) if model == "radiometric" else 1
+    window = shadow_px(scene, plain) if follows_light(model) else 1
     y, x = scene.background.shape[1:]
-    lit = (y - window + 1, x - window + 1) if border == "own" else (y, x)
+    margin = (window - 1) * (2 if model == "reciprocal" else 1) if border == "own" else 0
+    lit = (y - margin, x - margin)
     if isinstance(optics, Prepared) and (optics.otf.shape, optics.otf.border) != (lit, border):
         wanted, got = f"{lit} and {border!r}", f"{optics.otf.shape} and {optics.otf.border!r}"
         raise ValueError(f"`optics` must be prepared for the shape and border {wanted}, but got {got}")
-    discs = shadow_discs(scene, plain, window) if model == "radiometric" else ()
+    discs = shadow_discs(scene, plain, window) if follows_light(model) else ()
     kernels = optics.otf if isinstance(optics, Prepared) else jnp.swapaxes(jnp.asarray(plain.psf), 0, 1)
+    if model == "reciprocal" and not isinstance(kernels, Otf):
+        kernels = jnp.asarray(with_spot(kernels))
     layers = Layers(
         scene.background, tuple(o.mask for o in scene.obstructions), tuple(o.radiance for o in scene.obstructions)
     )
@@ -280,10 +187,13 @@ def _formed(
     takes fresh memory from the system at every call, which costs as much as the transforms.
     """
     shape = (layers.background.shape[1], layers.background.shape[2])
-    kept = [
-        1 - convolve(mask[None], plan_otf(disc, shape, border))
-        for mask, disc in zip(layers.masks, discs, strict=bool(discs))
-    ]
+    shadows = [plan_otf(disc, shape, border) for disc in discs]
+    kept = [1 - convolve(mask[None], otf) for mask, otf in zip(layers.masks, shadows, strict=bool(shadows))]
+
+    def shaded(number: int, light: Light) -> Array:
+        planned = light.shape == shape
+        otf = shadows[number] if planned else plan_otf(discs[number], (light.shape[0], light.shape[1]), border)
+        return convolve(light, _layer(otf, 0))
 
     def colour(given: tuple[Array, tuple[Array, ...], Array]) -> Array:
         background, radiances, kernel = given
@@ -292,21 +202,11 @@ def _formed(
             if isinstance(kernels, Otf)
             else plan_otf(kernel, lit, border)
         )
-        return jnp.asarray(compose(Layers(background, layers.masks, radiances), kept, _Patch(otf), model, outside))
+        one = Layers(background, layers.masks, radiances)
+        return jnp.asarray(compose(one, kept, shaded, _Patch(otf), model, outside))
 
     light = jax.tree.map(jnp.asarray, (layers.background, layers.radiances))
     return jax.lax.map(colour, (*light, kernels.transfer if isinstance(kernels, Otf) else kernels))
-
-
-def check_names(model: str, outside: str) -> None:
-    """Check the names of a model and of a filling.
-
-    Raises:
-        ValueError: an unknown one.
-    """
-    for name, value, known in (("model", model, get_args(Model)), ("outside", outside, get_args(Outside))):
-        if value not in known:
-            raise ValueError(f"`{name}` must be one of {', '.join(known)}, but got {value!r}")
 
 
 def check_layers(scene: Scene, layers: int, colours: int) -> None:
@@ -350,10 +250,9 @@ def shadow_discs(scene: Scene, optics: Optics, window: int) -> tuple[Array, ...]
     )
 
 
-def _cut(light: Light, shape: tuple[int, ...]) -> Light:
-    """The middle of a layer in the shape (y, x) that ends `shape`."""
-    y, x = ((n - m) // 2 for n, m in zip(light.shape, shape[-2:], strict=True))
-    return light[y : y + shape[-2], x : x + shape[-1]]
+def _layer(otf: Otf, which: int | slice) -> Otf:
+    """The transforms of one layer, or of some."""
+    return eqx.tree_at(lambda o: o.transfer, otf, otf.transfer[which])
 
 
 class _Patch(eqx.Module):
@@ -366,9 +265,9 @@ class _Patch(eqx.Module):
     otf: Otf
 
     def one(self, layer: int, light: Light, unit: bool) -> Array:
-        otf = eqx.tree_at(lambda o: o.transfer, self.otf, self.otf.transfer[layer])
+        otf = _layer(self.otf, layer)
         landed = convolve(light, otf)
         return landed / otf.energy if unit else landed
 
     def total(self, lights: Sequence[Light]) -> Array:
-        return superpose(lights, self.otf)
+        return superpose(lights, _layer(self.otf, slice(len(lights))))

@@ -2,7 +2,7 @@
 
 The light of a point passes the plane of the obstruction, is cut there, spreads by Fresnel diffraction to the aperture,
 and makes the PSF of a pupil that is partly in shadow. Nothing is assumed of how PSFs and masks go together, so this
-judges the fast models of `sim.formation`. It takes one PSF per scene point: seconds for a point, hours for a picture.
+judges the fast models of `sim.occlusion`. It takes one PSF per scene point: seconds for a point, hours for a picture.
 
 For a point at distance b and an obstruction at distance z the ray to the aperture's point x crosses the obstruction at
 x (1 - z / b) from the chief ray. About that crossing the path differences are quadratic with the effective distance

@@ -43,6 +43,7 @@ from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, s
 from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.obstruction import Kind, View
+from sim.occlusion import follows_light
 
 FORMAT = "doedesign simulation 1"
 
@@ -371,7 +372,7 @@ def _words(bench: Bench, settings: dict[str, Any]) -> str:
         if sensor.noise == "physical"
         else f"noise model {sensor.noise}"
     )
-    caution = "" if bench.model == "radiometric" else " (passes light that never reaches the aperture: see README)"
+    caution = "" if follows_light(bench.model) else " (passes light that never reaches the aperture: see README)"
     return (
         f"occlusion model {bench.model}{caution}; {settings['plate']}; {noise}; the conventional camera has a flat "
         "plate of the same glass; captures are developed and shown as sRGB, without gain"

@@ -27,10 +27,10 @@ __all__ = ["BAYER_PATTERNS", "NOISE_MODELS", "OBSTRUCTION_KINDS", "OCCLUSION_MOD
 __all__ += ["SceneSpec", "SensorSpec"]
 
 # The same names as in `sim`, which would bring jax along.
-Occlusion = Literal["radiometric", "paper", "paper_release"]
+Occlusion = Literal["radiometric", "reciprocal", "paper", "paper_release"]
 Noise = Literal["physical", "tseng", "release", "none"]
 Bayer = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
-OCCLUSION_MODELS = ("radiometric", "paper", "paper_release")
+OCCLUSION_MODELS = ("radiometric", "reciprocal", "paper", "paper_release")
 NOISE_MODELS = ("physical", "tseng", "release", "none")
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 OBSTRUCTION_KINDS = (
@@ -68,8 +68,9 @@ class SceneSpec(Table, frozen=True):
     Attributes:
         near_m: depths of the obstruction; may be empty where no objective looks at it.
         far_m: depths of the scene behind it; "inf" in TOML for a star.
-        occlusion: how an obstruction takes light from what lies behind it (`sim.formation`): "radiometric" follows the
-            light, "paper" is eq. 10, "paper_release" what the paper's public code does.
+        occlusion: how an obstruction takes light from what lies behind it (`sim.occlusion`): "radiometric" follows the
+            light, "reciprocal" the light of the halo too, "paper" is eq. 10, "paper_release" what the paper's public
+            code does.
     """
 
     near_m: tuple[NearDepth, ...] = ()

@@ -11,8 +11,8 @@ from doedesign.capturefiles import read_image, write_image
 from doedesign.spec import load_spec, scene, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import canonical_json
-from sim.formation import Model
 from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, Fence, MaskFolder
+from sim.occlusion import Model
 from sim.sensor import NoiseModel, Pattern, Sensor
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -70,7 +70,7 @@ def test_the_sensor():
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("scene.occlusion=eq10", ["scene.occlusion", "radiometric, paper"]),
+        ("scene.occlusion=eq10", ["scene.occlusion", "radiometric, reciprocal"]),
         ("sensor.noise=loud", ["sensor.noise", "physical"]),
         ("sensor.bits=17", ["sensor.bits", "at most 16"]),
         ("sensor.full_well=0", ["sensor.full_well", "greater than 0"]),

@@ -54,6 +54,8 @@ def test_even_light_past_rings_is_what_eq_10_says():
         # Found: 0.9 and 0.4 % against 1.7 and 3.0 %.
         assert row["even"]["paper"] < 0.012 < row["even"]["radiometric"]
         assert row["lines"]["radiometric"] < row["lines"]["paper"]
+        assert row["even"]["reciprocal"] < row["even"]["radiometric"]
+        assert row["lines"]["reciprocal"] < 1.02 * row["lines"]["radiometric"]
 
 
 def _rows_of_half_and_nine_tenths(rows):

@@ -3,11 +3,12 @@ import pytest
 
 from bench.reference import make_camera
 from sim.field import FieldOptics, capture_frame, node_weights
-from sim.formation import Model, Optics, capture
+from sim.formation import Optics, capture
+from sim.occlusion import Model
 from sim.psf import PsfBank, psf_bank
 from sim.scene import Obstruction, Scene
 
-MODELS: tuple[Model, ...] = ("paper", "paper_release", "radiometric")
+MODELS: tuple[Model, ...] = ("paper", "paper_release", "radiometric", "reciprocal")
 SHAPE, PIXEL_M, DEPTH_M = (70, 90), 2e-5, 0.1
 AXES_M = tuple(PIXEL_M * np.array(half) for half in ((-40.0, 0.0, 40.0), (-50.0, 50.0)))
 TILE = (40, 45)
