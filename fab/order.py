@@ -16,6 +16,7 @@ level map.
 import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -431,8 +432,12 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
         frame.dies,
         order.patch,
     )
-    models = write_models(folder, order.stem, shown)
-    others = [*(model.file for model in models), *add(folder, order, frame), levels_file, preview]
+    # What is added takes long where it follows light; the solids are drawn meanwhile.
+    with ThreadPoolExecutor(1) as pool:
+        solids = pool.submit(write_models, folder, order.stem, shown)
+        added = add(folder, order, frame)
+        models = solids.result()
+    others = [*(model.file for model in models), *added, levels_file, preview]
     contents += [Content(name, Path(name).suffix[1:].upper()) for name in others]
     return Manifest(
         format=FORMAT,

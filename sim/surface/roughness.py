@@ -31,6 +31,8 @@ def _positive(length: Array) -> Array:
     return jnp.maximum(length, 1e-4)
 
 
+# Compiled as a whole: one by one its operations take seconds to compile.
+@jax.jit
 def cell_share(length: Float[Array, ""]) -> Float[Array, ""]:
     """Share of the variance that means over square cells keep; `length` is the correlation length in cells."""
     return _covariance(_positive(length), jnp.zeros(1))[0] ** 2
