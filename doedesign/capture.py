@@ -44,8 +44,8 @@ def occlusion_of(spec: Spec, source: str, given: str | None = None) -> Model:
     model = given or spec.scene.occlusion
     if model is None:
         cure = (
-            'Add occlusion = "radiometric" to [scene], which follows the light, or "paper" for eq. 10; '
-            "or give --occlusion."
+            'Add occlusion = "reciprocal" to [scene], which is nearest to wave optics, "radiometric", or "paper" for '
+            "eq. 10; or give --occlusion."
         )
         raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
     return cast("Model", model)
