@@ -25,10 +25,10 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from fab.doe import mask_layout
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
-from fab.order import write_order
 from fab.polygons import rectangles
 from fab.stream import write_gds, write_oasis
 from fab.units import NM, UM

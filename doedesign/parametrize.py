@@ -72,7 +72,7 @@ class Staircase(eqx.Module):
         """
         height = self.continuous_m(radians)
         if depths_m is None and self.levels.is_binary:
-            stepped = _pass_through(height, self.level(height) * self.levels.step_m)
+            stepped = _add_tangent(jax.lax.stop_gradient(self.level(height) * self.levels.step_m), height)
             blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
             return jnp.where(softness > 0, blended, stepped)
         depths = jnp.asarray(self.levels.depths_m, jnp.float32) if depths_m is None else depths_m
@@ -102,18 +102,6 @@ class Staircase(eqx.Module):
     def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Parameters that make a given height, float32."""
         return (np.asarray(height_m) / self.metres_per_radian).astype(np.float32)
-
-
-@jax.custom_jvp
-def _pass_through(height_m: Array, stepped_m: Array) -> Array:
-    """`stepped_m`, exactly, with the gradient of `height_m`."""
-    del height_m
-    return stepped_m
-
-
-@_pass_through.defjvp
-def _pass_through_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    return primals[1], tangents[0]
 
 
 @jax.custom_jvp

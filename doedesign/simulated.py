@@ -16,11 +16,10 @@ from doedesign.predict import Drawn
 from doedesign.recon.data import Item
 from fab.process import Process, Variation
 from sim.camera import Camera
-from sim.convolve import convolve, plan_otf
 from sim.disc import disc_window
-from sim.formation import Optics, capture, shadow_discs
+from sim.formation import Optics, capture, lost_share
 from sim.obstruction import Kind
-from sim.occlusion import RELEASE_GAIN, Model, Outside, follows_light
+from sim.occlusion import Model, Outside
 from sim.psf import psf_bank, surface_bank
 from sim.scene import Obstruction, Scene
 from sim.sensor import Sensor, demosaiced, developed, expose
@@ -86,8 +85,9 @@ def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
     conventional, doe = (
         _recorded(scene, optics, bench, jax.random.fold_in(key, k)) for k, optics in enumerate((without, with_plate))
     )
+    alpha = np.asarray(lost_share(scene, with_plate, bench.model))
     depth = np.where(item.mask >= 0.5, np.float32(item.depth_m), np.float32(item.background_depth_m))
-    return Captured(np.asarray(scene.background), conventional, doe, item.mask, _alpha(scene, with_plate, bench), depth)
+    return Captured(np.asarray(scene.background), conventional, doe, item.mask, alpha, depth)
 
 
 def plate_psfs(drawn: Drawn, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
@@ -137,16 +137,3 @@ def _recorded(scene: Scene, optics: Optics, bench: Bench, key: Array) -> Float[n
     light = capture(scene, optics, bench.model, outside=bench.outside)
     raw = np.asarray(expose(light, bench.sensor, key))
     return np.asarray(developed(demosaiced(raw, bench.sensor) if bench.sensor.pattern else raw, bench.sensor))
-
-
-def _alpha(scene: Scene, optics: Optics, bench: Bench) -> Float[np.ndarray, "c y x"]:
-    """Share of the background's light that the model takes away: d * M of one channel, or p_obs * M of every colour."""
-    mask = np.asarray(scene.obstructions[0].mask)
-    shape = (mask.shape[0], mask.shape[1])
-    if follows_light(bench.model):
-        (disc,) = shadow_discs(scene, optics, bench.shadow_px)
-        return np.clip(np.asarray(convolve(mask[None], plan_otf(disc, shape, "reflect"))), 0, 1)
-    near = np.asarray(optics.psf[1])
-    near = near / near.sum(axis=(-2, -1), keepdims=True)
-    gain = RELEASE_GAIN if bench.model == "paper_release" else 1.0
-    return np.clip(gain * np.asarray(convolve(mask[None], plan_otf(near, shape, "reflect"))), 0, 1)

@@ -171,9 +171,9 @@ def draw(path: Path, rows: list[dict[str, Any]], name: str) -> None:
         for (model, _), hue in zip(MODELS, SERIES, strict=False):
             right.plot(widths, [100 * row["even"][model] for row in rows], "o-", color=hue, label=model, ms=5)
             right.plot(widths, [100 * row["lines"][model] for row in rows], ":", color=hue)
-        right.set_title("Error against wave optics (%): even light; dotted: fine lines")
-        for axes in (left, right):
-            axes.set_xlabel("width of the bar (mm)", labelpad=2)
+        right.set_title("Error against wave optics (%)")
+        for axes, words in ((left, ""), (right, ". Lines: even light; dots: fine bright lines")):
+            axes.set_xlabel(f"width of the bar (mm){words}", labelpad=2)
             axes.set_ylim(bottom=0)
             axes.legend()
 

@@ -43,8 +43,10 @@ Map of the package, in the order the work flows:
     asbuilt   the same JSON with measured numbers filled in
     manifest  what every file of a mask order is
     inventory what the manifest says of a cell
+    entries   what the manifest says of an order
     preview   the picture of a mask set
-    order     the folder that goes to the lab, with its manifest
+    order     a mask order in numbers, before it becomes files
+    job       the folder that goes to the lab, with its manifest
     readback  the same files read by a library that had no part in the writing
     compare   what was read against what should be there
     receipt   what a mask shop looks at whatever is drawn

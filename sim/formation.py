@@ -15,7 +15,17 @@ from fab.errors import InputError
 from sim.camera import Camera
 from sim.convolve import Border, Otf, Window, convolve, plan_otf, superpose
 from sim.disc import disc_window, shadow_disc
-from sim.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light, with_spot
+from sim.occlusion import (
+    Layers,
+    Light,
+    Model,
+    Outside,
+    check_names,
+    compose,
+    eq_10_alpha,
+    follows_light,
+    with_spot,
+)
 from sim.psf import PsfBank
 from sim.scene import Depth, Scene
 
@@ -75,7 +85,7 @@ class Optics(eqx.Module):
 
         Args:
             shape: pixels (y, x) of the scenes; with their own margin and a model that follows the light, less the
-                margin that the shadow discs take.
+                margin that the shadow discs take (`capture`).
             border: what lies beyond a scene.
         """
         return Prepared(self, plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
@@ -171,6 +181,35 @@ def capture(
     return _formed(layers, discs, kernels, model, outside, lit, border)
 
 
+def lost_share(scene: Scene, optics: Optics, model: Model) -> Float[Array, "c v u"]:
+    """Share of the background's light that a model takes away; the view is mirrored at its edges.
+
+    Args:
+        scene: one obstruction before a background.
+        optics: PSFs of both.
+        model: how layers are put together.
+
+    Returns:
+        `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10 otherwise, 0 to 1.
+
+    Raises:
+        ValueError: a scene of another number of obstructions, or an unknown name.
+    """
+    check_names(model, "scene")
+    if len(scene.obstructions) != 1:
+        raise ValueError(f"`scene` must have one obstruction, but got {len(scene.obstructions)}")
+    mask, shape = scene.obstructions[0].mask, (scene.background.shape[1], scene.background.shape[2])
+    if follows_light(model):
+        (disc,) = shadow_discs(scene, optics, shadow_px(scene, optics))
+        share = convolve(mask[None], plan_otf(disc, shape, "reflect"))
+    else:
+        otf = plan_otf(jnp.swapaxes(jnp.asarray(optics.psf), 0, 1), shape, "reflect")
+        colours = (_Patch(_layer(otf, colour)) for colour in range(scene.background.shape[0]))
+        release = model == "paper_release"
+        share = jnp.stack([jnp.asarray(eq_10_alpha(mask, 1, imaging, release)) for imaging in colours])
+    return jnp.clip(share, 0.0, 1.0)
+
+
 @eqx.filter_jit
 def _formed(
     layers: Layers,
@@ -251,7 +290,7 @@ def shadow_discs(scene: Scene, optics: Optics, window: int) -> tuple[Array, ...]
 
 
 def _layer(otf: Otf, which: int | slice) -> Otf:
-    """The transforms of one layer, or of some."""
+    """The transforms of one entry of the first axis, a layer or colour, or of some."""
     return eqx.tree_at(lambda o: o.transfer, otf, otf.transfer[which])
 
 

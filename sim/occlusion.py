@@ -53,7 +53,7 @@ Model = Literal["paper", "paper_release", "radiometric", "reciprocal"]
 Outside = Literal["scene", "nothing"]
 Light = Array | np.ndarray
 
-RELEASE_GAIN = 1.5  # of alpha, in the public code
+_RELEASE_GAIN = 1.5  # of alpha, in the public code
 # What counts as the sharp spot of a far PSF: wide enough for an Airy disc of a slow lens, narrow against any halo.
 _SPOT_PX = 6
 
@@ -140,14 +140,18 @@ def eq_10(layers: Layers, imaging: Imaging, release: bool, outside: Outside) -> 
     """Light on the sensor by the model `paper`, or `paper_release`."""
     image, sharp = imaging.one(0, layers.background, unit=release), layers.background
     for layer, (mask, radiance) in enumerate(zip(layers.masks, layers.radiances, strict=True), start=1):
-        alpha = imaging.one(layer, mask, unit=True)
-        if release:
-            alpha = (RELEASE_GAIN * alpha).clip(0.0, 1.0)
+        alpha = eq_10_alpha(mask, layer, imaging, release)
         covered = mask * radiance
         sharp = covered + (1 - mask) * sharp
         landed = imaging.one(layer, sharp if outside == "scene" else covered, unit=release)
         image = alpha * landed + (1 - alpha) * image
     return image
+
+
+def eq_10_alpha(mask: Light, layer: int, imaging: Imaging, release: bool) -> Light:
+    """Share of the light behind an obstruction that eq. 10 takes away, `[y, x]`; that of the public code is clamped."""
+    alpha = imaging.one(layer, mask, unit=True)
+    return (_RELEASE_GAIN * alpha).clip(0.0, 1.0) if release else alpha
 
 
 def compose(

@@ -19,12 +19,13 @@ from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.frame import Frame
+from fab.job import write_order
 from fab.layout import Chrome, pixel_edges
 from fab.levels import Levels
 from fab.manifest import map_digest
 from fab.marks import alignment_site
 from fab.masks import unetched_outside
-from fab.order import Order, write_order
+from fab.order import Order
 from fab.patch import Patch
 from fab.process import Process, Variation
 from fab.repair import repaired
@@ -79,17 +80,9 @@ def write_masks(
         "name": drawing.file.name if spec is None else spec.name,
         "height_sha256": sha256_file(drawing.file),
     }
-    level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    rules = Rules.of(process)
-    report = check(level, drawing.levels, drawing.grid, drawing.aperture_m, rules)
-    for headline in report.headlines():
-        say(f"warning: {headline}")
-    if on_violation == "fail" and not report.printable:
-        cure = "Design with a coarser pitch or fewer levels, choose another process, or take --on-violation fix."
-        raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    if on_violation == "fix" and not report.clean:
-        level, cost = _fixed(spec, drawing, level, rules, say)
-        origin["repair"] = cost
+    level, repair = _printable(spec, drawing, process, on_violation, say)
+    if repair is not None:
+        origin["repair"] = repair
 
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
         plate, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
@@ -122,6 +115,27 @@ def write_masks(
         say=say,
     )
     return folder, proof
+
+
+def _printable(
+    spec: Spec | None, drawing: LevelMap, process: Process, on_violation: Literal["warn", "fail", "fix"], say: Say
+) -> tuple[NDArray[np.uint8], dict[str, Any] | None]:
+    """Check what a process prints of a drawing; return the level map to draw, and what its repair cost if it had one.
+
+    Raises:
+        InputError: the process cannot print it and `on_violation` is "fail".
+    """
+    level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
+    rules = Rules.of(process)
+    report = check(level, drawing.levels, drawing.grid, drawing.aperture_m, rules)
+    for headline in report.headlines():
+        say(f"warning: {headline}")
+    if on_violation == "fail" and not report.printable:
+        cure = "Design with a coarser pitch or fewer levels, choose another process, or take --on-violation fix."
+        raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
+    if on_violation != "fix" or report.clean:
+        return level, None
+    return _fixed(spec, drawing, level, rules, say)
 
 
 def _run_sheet(

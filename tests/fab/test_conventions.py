@@ -9,10 +9,10 @@ import pytest
 
 from fab.doe import mask_layout
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Chrome
 from fab.levels import Levels, height_of, quantise
 from fab.masks import planes
-from fab.order import write_order
 from fab.stream import write_gds
 
 LEVELS = Levels(16, 75e-9)

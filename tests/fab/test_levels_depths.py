@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.job import write_order
 from fab.levels import Levels, height_of, quantise, quantise_wrapped, wrapped_cells
 from fab.manifest import read_manifest
 from fab.masks import levels_of, planes
-from fab.order import write_order
 from fab.preview import preview_png
 from fab.process import Process
 from fab.recipe import depths_m

@@ -8,11 +8,11 @@ import pytest
 from fab.cells import Window
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Chrome
 from fab.levels import Levels
 from fab.manifest import read_manifest
 from fab.models import Relief, write_models
-from fab.order import write_order
 from fab.patch import Patch
 from fab.step import step_bodies
 from fab.units import MM, NM, UM

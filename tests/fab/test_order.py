@@ -6,11 +6,12 @@ import pytest
 from fab.errors import CheckFailed, InputError
 from fab.files import sha256_file
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Chrome, Layer, pixel_edges
 from fab.levels import Levels
 from fab.manifest import map_digest, read_manifest
 from fab.masks import unetched_outside
-from fab.order import order_id, write_order
+from fab.order import order_id
 from fab.verify import read_level_map
 from fab.walker import read_gds
 

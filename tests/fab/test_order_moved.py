@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Layer, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.manifest import read_manifest
-from fab.order import write_order
 from fab.process import Process, Spread
 from fab.stream import write_gds
 from fab.verify import read_level_map, verify_order

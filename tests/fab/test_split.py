@@ -9,10 +9,10 @@ import pytest
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.job import write_order
 from fab.layout import Layer, Shapes
 from fab.levels import Levels
 from fab.manifest import read_manifest
-from fab.order import write_order
 from fab.process import Process, Spread
 from fab.split import splits_of
 from fab.stream import write_gds

@@ -145,8 +145,8 @@ def test_a_lens_alone_is_the_same_to_both_models_that_follow_light(rng: np.rando
     np.testing.assert_allclose(one, other, atol=3e-6)
 
 
-def test_the_sharp_spot_dims_point_by_point_and_the_halo_as_a_whole():
-    """A point in full shadow keeps no spot, and gets its share of the halo of even light around it."""
+def test_a_hidden_point_leaves_no_spot_and_no_light_in_all():
+    """A point in full shadow keeps no spot, and as much is taken from the halo as the point would have sent."""
     far = 0.5 * spot(1.0) + 0.5 * ring(1.0)
     near = 0.5 * fftconvolve(spot(1.0), shadow_disc(25.6, 27), mode="same") + 0.5 * ring(1.0)
     mask = np.zeros((96, 100), np.float32)
@@ -155,7 +155,7 @@ def test_the_sharp_spot_dims_point_by_point_and_the_halo_as_a_whole():
     point[:, 48, 50] = 1.0
     scene = Scene(point, np.inf, (Obstruction(mask, even(0.0), DEPTH_M),))
     image = np.asarray(capture(scene, optics_of(far, near), "reciprocal"))
-    # Nothing comes from a hidden point, though the models know its halo only as a whole.
+    # Where the point was there is nothing; its halo is known only as a whole, so there the sum alone is nothing.
     np.testing.assert_allclose(image[0, 48, 50], 0.0, atol=1e-3)
     np.testing.assert_allclose(image.sum(axis=(1, 2)), 0.0, atol=1e-3)
 

@@ -7,8 +7,8 @@ import pytest
 
 from doedesign.drawing import levels_of_run
 from doedesign.runs import open_run
+from fab.job import write_order
 from fab.manifest import read_manifest
-from fab.order import write_order
 from fab.process import Process, Spread
 from fab.wafer import Wafer
 from sim.store import read_bank
