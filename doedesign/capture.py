@@ -5,7 +5,7 @@ A spec may leave all of it out but the occlusion model, which has no default: th
 """
 
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -161,6 +161,15 @@ def _parameter_item(field: Field[Any], value: Any, where: str) -> Any:
                 rule, _, got = str(error).partition(", but got ")
                 raise InputError(where, rule, got, "Write the unit inside the quotes.") from error
     return value
+
+
+def plain_parameters(kind: Any) -> dict[str, Any]:
+    """Parameters of a kind for JSON."""
+    return {
+        key: str(value) if isinstance(value, Path) else [str(v) for v in value] if key == "files" else value
+        for key, value in asdict(kind).items()
+        if not callable(value)
+    }
 
 
 def seen_in(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarray, "c y x"]:

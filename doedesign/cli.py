@@ -358,6 +358,44 @@ def simulate(
 
 
 @app.command
+def train(
+    run: Path,
+    *,
+    images: Path | None = None,
+    occlusion: str | None = None,
+    obstruction: str | None = None,
+    out: Path | None = None,
+    validation: Path | None = None,
+    lpips_weights: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    licence: str | None = None,
+    tensorboard: Annotated[bool, Parameter(negative="")] = False,
+    devices: int | None = None,
+    set_: Overrides = (),
+    json_: AsJson = False,
+) -> None:
+    """Train the reconstruction network, jointly with the optics unless those are frozen.
+
+    Args:
+        run: Run folder; its design is where the optics begin.
+        images: Folder of pictures; sample pictures of scikit-image by default.
+        occlusion: radiometric, reciprocal, paper or paper_release; the spec's by default.
+        obstruction: Kind, such as dirt, raindrop or fence, or a folder of masks; the spec's by default.
+        out: Folder; RUN/trained by default. The same command resumes a stopped training.
+        validation: Folder to hold pictures out from; the same folder by default.
+        lpips_weights: Files with the weights of LPIPS; multi-scale SSIM stands in without them.
+        licence: Licence of the pictures, for the record.
+        tensorboard: Write for TensorBoard, too.
+        devices: Number of devices; all by default.
+    """
+    from doedesign.commands.train import Request
+    from doedesign.commands.train import train as work
+
+    request = Request(images, validation, set_, lpips_weights, licence, tensorboard, devices, occlusion, obstruction)
+    folder = work(run, out, request, _say)
+    _print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
+
+
+@app.command
 def calibrate(
     run: Path,
     measurement: Path | None = None,

@@ -10,7 +10,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.evaluate`
         *.png                   pictures
-        psf/, fabricated/, simulated/, tolerance/, calibrate/   what later commands found
+        psf/, fabricated/, simulated/, trained/, tolerance/, calibrate/     what later commands found
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
@@ -39,6 +39,8 @@ from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json
 FORMAT = "doedesign run 1"
 CHECKPOINT = "checkpoint.npz"
 _DEPTHS = "etch_depths_m"
+# Of the sensor, what a plate is designed for.
+_FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
@@ -229,6 +231,32 @@ def open_run(folder: Path) -> Run:
                 f"Restore it, or remove {folder} and optimise again.",
             )
     return Run(folder, _with_depths(spec, manifest, folder / MANIFEST_NAME), done=True)
+
+
+def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:
+    """The spec of a finished run with overrides of what its plate does not depend on.
+
+    Args:
+        run: a finished run.
+        overrides: changes, "table.key=value".
+        free: tables that may be changed; of the sensor, only what it does with light.
+
+    Raises:
+        InputError: an override that breaks a rule, or of something else.
+    """
+    if not overrides:
+        return run.spec
+    path = run.path("spec.toml")
+    spec = load_spec(path, overrides)
+    before, after = spec_to_json(load_spec(path)), spec_to_json(spec)
+    changed = [key for key in sorted({*before, *after} - {*free}) if before.get(key) != after.get(key)]
+    changed += [f"sensor.{key}" for key in _FIXED_SENSOR if before["sensor"].get(key) != after["sensor"].get(key)]
+    if changed:
+        tables = ", ".join(f"[{table}]" for table in free if table != "sensor")
+        rule = f"only {tables} and what the sensor does with light can be changed for a finished plate"
+        raise InputError("--set", rule, f"another {changed[0]}", "Optimise the changed spec into a run of its own.")
+    # The other tables stay those of the run, which knows the depths that it chose.
+    return run.spec.model_copy(update={table: getattr(spec, table) for table in free})
 
 
 def _with_depths(spec: Spec, manifest: Mapping[str, Any], path: Path) -> Spec:

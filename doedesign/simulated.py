@@ -116,15 +116,18 @@ def flat_psfs(camera: Camera) -> Psfs:
     return at
 
 
-def _nearest_m(kind: Any) -> float:
-    """The nearest that a kind, or one it is mixed of, is drawn at."""
+def depth_range_m(kind: Any) -> tuple[float, float]:
+    """Least and greatest distance that a kind, or any it is mixed of, is drawn at."""
     depth = getattr(kind, "depth_m", None)
-    return depth[0] if depth else min(_nearest_m(getattr(kind, name)) for name in ("dirt", "raindrop"))
+    if depth:
+        return float(depth[0]), float(depth[1])
+    inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop")]
+    return min(low for low, _ in inner), max(high for _, high in inner)
 
 
 def shadow_window(kind: Kind, camera: Camera) -> int:
     """Window that holds the shadow disc at every depth, so that all items share one compiled capture."""
-    return disc_window(camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * _nearest_m(kind)))
+    return disc_window(camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * depth_range_m(kind)[0]))
 
 
 def _optics(psfs: Psfs, bench: Bench, item: Item) -> Optics:

@@ -15,7 +15,11 @@ DESIGN = Path(__file__).parent.parent / "doedesign"
 # Before any test imports them: from here on the annotations of all modules with arrays are checked at every call,
 # shapes included. (The specs are left to pydantic.) As everywhere in Python, an int may stand for a float.
 install_import_hook(
-    ["sim", *(f"doedesign.{path.stem}" for path in DESIGN.glob("*.py") if "jaxtyping" in path.read_text("utf-8"))],
+    [
+        "sim",
+        "doedesign.recon",
+        *(f"doedesign.{path.stem}" for path in DESIGN.glob("*.py") if "jaxtyping" in path.read_text("utf-8")),
+    ],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from doedesign.build import process_for
-from doedesign.capture import obstruction_of, occlusion_of, outside_of, sensor_of, shown_as
+from doedesign.capture import obstruction_of, occlusion_of, outside_of, plain_parameters, sensor_of, shown_as
 from doedesign.capturefiles import Stored, read_image, write_image
 from doedesign.commands.fabricated import errors_of_plate
 from doedesign.commands.psf import Say
@@ -35,9 +35,9 @@ from doedesign.progress import meter
 from doedesign.recon.data import Item, SceneData
 from doedesign.report.contact import ContactRow
 from doedesign.report.pictures import draw_contact
-from doedesign.runs import Run, alone_in, open_run
+from doedesign.runs import Run, alone_in, open_run, spec_with
 from doedesign.simulated import Bench, Captured, captured, flat_psfs, plate_psfs, shadow_window
-from doedesign.spec import Spec, load_spec, spec_digest, spec_to_json, variation_to_toml
+from doedesign.spec import Spec, spec_digest, variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process, Variation
@@ -49,9 +49,8 @@ FORMAT = "doedesign simulation 1"
 
 _USUAL_COUNT = 6
 _USUAL_SIDE = 512
-# What may be changed after the plate was designed: it is nothing that the plate depends on.
+# What may be changed after the plate was designed.
 _FREE = ("scene", "sensor", "obstruction")
-_FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ def simulate(
     request = request or Request()
     run = open_run(run_folder)
     source = str(run.path("spec.toml"))
-    spec = _spec_of(run, request.overrides)
+    spec = spec_with(run, request.overrides, _FREE)
     model = occlusion_of(spec, source, request.occlusion)
     kind = obstruction_of(spec, source, request.obstruction)
     drawn = drawn_of(run, masks)
@@ -161,24 +160,6 @@ def simulate(
     if told := told_skips(pictures):
         say(told)
     return Done(folder, names, {str(path): why for path, why in sorted(pictures.skipped.items())})
-
-
-def _spec_of(run: Run, overrides: Sequence[str]) -> Spec:
-    """The run's spec with overrides that the plate does not depend on.
-
-    Raises:
-        InputError: an override of something else.
-    """
-    if not overrides:
-        return run.spec
-    spec = load_spec(run.path("spec.toml"), overrides)
-    before, after = spec_to_json(load_spec(run.path("spec.toml"))), spec_to_json(spec)
-    changed = [key for key in {*before, *after} - {*_FREE} if before.get(key) != after.get(key)]
-    changed += [f"sensor.{key}" for key in _FIXED_SENSOR if before["sensor"].get(key) != after["sensor"].get(key)]
-    if changed:
-        rule = "only [scene], [obstruction] and what the sensor does with light can be changed for a finished plate"
-        raise InputError("--set", rule, f"another {changed[0]}", "Optimise the changed spec into a run of its own.")
-    return spec
 
 
 def _view(spec: Spec, camera: Camera, size: int | None) -> View:
@@ -219,7 +200,7 @@ def _settings(
         "level_map_sha256": drawn.digest(),
         "plate": plate,
         "obstruction": getattr(kind, "name", type(kind).__name__),
-        "parameters": _plain(kind),
+        "parameters": plain_parameters(kind),
         "occlusion": bench.model,
         "outside": bench.outside,
         "sensor": asdict(bench.sensor),
@@ -231,15 +212,6 @@ def _settings(
         "window": bench.camera.window,
         "image_files": "16-bit PNG" if request.png else "OpenEXR",
         "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y; files have the top row first",
-    }
-
-
-def _plain(kind: Any) -> dict[str, Any]:
-    """Parameters of a kind for JSON."""
-    return {
-        key: str(value) if isinstance(value, Path) else [str(v) for v in value] if key == "files" else value
-        for key, value in asdict(kind).items()
-        if not callable(value)
     }
 
 

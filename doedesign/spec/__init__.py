@@ -14,6 +14,7 @@ are told together. `spec_warnings` returns what is allowed but probably not mean
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good plate
     wafer       the table of the wafer: dies, mask blanks, chrome
+    training    the tables of the network and its training
     variation   files of their own: a process, the errors of one plate
     checks      rules that join several tables, and warnings; process_checks those of the process
     errors      what was wrong, in words a user can act on
@@ -46,6 +47,7 @@ from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
 from doedesign.spec.table import Table, toml_key
 from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
+from doedesign.spec.training import NetworkSpec, TrainSpec, training_problems
 from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
@@ -63,6 +65,7 @@ __all__ = [
     "ErrorsSpec",
     "EtchSpec",
     "LimitSpec",
+    "NetworkSpec",
     "ObjectiveSpec",
     "ObstructionSpec",
     "OpticsSpec",
@@ -74,6 +77,7 @@ __all__ = [
     "Spec",
     "SpecError",
     "SpreadSpec",
+    "TrainSpec",
     "WaferSpec",
     "explain",
     "input_files",
@@ -243,7 +247,9 @@ def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
 
 
 def _checked(spec: Spec, raw: Mapping[str, Any], source: str, overridden: Sequence[str]) -> Spec:
-    problems = [problem._replace(key=key_as_written(problem.key, raw)) for problem in find_problems(spec)]
+    of_training = training_problems(spec.network, spec.train, len(spec.optics.colours))
+    found = [*find_problems(spec), *(Problem(*told) for told in of_training)]
+    problems = [problem._replace(key=key_as_written(problem.key, raw)) for problem in found]
     if problems:
         raise spec_error(source, problems, overridden)
     return spec

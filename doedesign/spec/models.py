@@ -3,7 +3,7 @@
 An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
 (`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
 Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both. The tables of the process are in
-`process`, those of scene and sensor in `scene`.
+`process`, those of scene and sensor in `scene`, those of the network and its training in `training`.
 """
 
 from typing import Annotated, Any, Literal
@@ -13,6 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import Table, unsaid
+from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
     Aperture,
@@ -186,6 +187,8 @@ class Spec(Table, frozen=True):
         objectives: what it is judged by; `[[objective]]` in TOML.
         limits: when a plate is good; `[[limit]]` in TOML.
         wafer: what the masks are filled with.
+        network: what reconstructs pictures from captures.
+        train: how that network is trained, and the optics with it.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -199,3 +202,5 @@ class Spec(Table, frozen=True):
     objectives: tuple[ObjectiveSpec, ...] = ()
     limits: tuple[LimitSpec, ...] = unsaid(())
     wafer: WaferSpec = unsaid(WaferSpec())
+    network: NetworkSpec = unsaid(NetworkSpec())
+    train: TrainSpec = unsaid(TrainSpec())

@@ -1,0 +1,148 @@
+"""Deconvolution without training: the rows of Table 1 that need no network.
+
+Both take linear light and one PSF for each colour, undo its blur as if everything seen lay at its depth, and know
+nothing of obstructions. The picture is mirrored beyond its edges, as in `simulate`.
+
+How hard they try follows from the noise of the capture. A Wiener filter weighs the power of the noise against that of
+the picture; taking the picture's for white, it is the ratio of their variances. Richardson-Lucy has noise to fit once
+its blurred estimate is as near to the capture as the noise is; there it stops (the discrepancy principle).
+
+References:
+    N. Wiener, *Extrapolation, Interpolation, and Smoothing of Stationary Time Series*, 1949. W. H. Richardson,
+    "Bayesian-based iterative method of image restoration", JOSA 62 (1972). L. B. Lucy, "An iterative technique for the
+    rectification of observed distributions", Astron. J. 79 (1974). V. A. Morozov, *Methods for Solving Incorrectly
+    Posed Problems*, 1984, for the discrepancy.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim.convolve import convolve, landed, plan_otf, spectrum
+from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
+from sim.sensor import Sensor
+
+__all__ = ["ITERATIONS", "noise_to_signal", "noise_variance", "richardson_lucy", "wiener"]
+
+ITERATIONS = 100
+# Light below which a blurred estimate counts as dark: far below what any sensor tells from black.
+_DARK = 1e-6
+
+
+def noise_variance(capture: Float[np.ndarray, "c y x"], sensor: Sensor) -> Float[np.ndarray, " c"]:
+    """Mean variance of a capture's noise by the model of its sensor, rounding included.
+
+    Args:
+        capture: `[c, y, x]` developed capture, white 1.
+        sensor: the sensor that took it.
+
+    Returns:
+        variance for each colour, in units of white squared.
+    """
+    light = np.maximum(capture, 0).mean(axis=(1, 2), dtype=np.float64)
+    white_e = sensor.white_e(len(light))[:, 0, 0].astype(np.float64)
+    by_model = {
+        "physical": (light * white_e + sensor.dark_e + sensor.read_noise_e**2) / white_e**2,
+        "tseng": TSENG_SCALE * light + TSENG_SIGMA**2,
+        "release": np.full(len(light), RELEASE_WIDTH**2 / 3),  # of an even distribution of +-width
+        "none": np.zeros(len(light)),
+    }[sensor.noise]
+    rounding = 0.0 if sensor.bits is None else 1 / 12
+    return by_model + rounding / sensor.white_raw(len(light))[:, 0, 0].astype(np.float64) ** 2
+
+
+def noise_to_signal(capture: Float[np.ndarray, "c y x"], variance: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
+    """Ratio of the noise's variance to that of the picture under it, for `wiener`.
+
+    Args:
+        capture: `[c, y, x]` developed capture.
+        variance: of its noise, for each colour (`noise_variance`).
+
+    Returns:
+        the ratio for each colour, at most 1: a capture that is all noise is halved, not more.
+    """
+    seen = capture.var(axis=(1, 2), dtype=np.float64)
+    return variance / np.maximum(seen - variance, np.maximum(variance, np.finfo(np.float32).tiny))
+
+
+@jax.jit
+def wiener(
+    capture: Float[Array, "c y x"] | Float[np.ndarray, "c y x"],
+    psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
+    noise_to_signal: Float[Array, " c"] | Float[np.ndarray, " c"] | float,
+) -> Float[Array, "c y x"]:
+    """Wiener filter conj(H) / (|H|² + N/S).
+
+    Args:
+        capture: `[c, y, x]` linear light.
+        psf: `[c, y, x]` PSFs in energy per pixel, odd windows with the chief ray in the middle. Light that they lose is
+            given back.
+        noise_to_signal: power of noise over that of the picture, for each colour or one for all.
+
+    Returns:
+        `[c, y, x]` linear light, noise below 0 included.
+
+    Raises:
+        ValueError: an even window.
+    """
+    _require_odd(psf)
+    # Turned round, a PSF has the conjugate transform, in the phase that `landed` undoes.
+    otf = plan_otf(jnp.asarray(psf)[:, ::-1, ::-1], (capture.shape[1], capture.shape[2]), "reflect")
+    power = otf.transfer.real**2 + otf.transfer.imag**2
+    ratio = jnp.broadcast_to(jnp.asarray(noise_to_signal, jnp.float32), (len(psf),))[:, None, None]
+    return landed(spectrum(capture, otf) * otf.transfer / (power + ratio), otf)
+
+
+@partial(jax.jit, static_argnames="iterations")
+def richardson_lucy(
+    capture: Float[Array, "c y x"] | Float[np.ndarray, "c y x"],
+    psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
+    iterations: int = ITERATIONS,
+    noise_variance: Float[Array, " c"] | Float[np.ndarray, " c"] | float = 0.0,
+) -> Float[Array, "c y x"]:
+    """Richardson-Lucy iteration u ← u · Aᵀ(capture / A u) / Aᵀ1 (Richardson 1972, Lucy 1974).
+
+    A is the blur of a picture that is mirrored beyond its edges, and Aᵀ exactly its transpose, so that every iteration
+    keeps u positive and the light of A u equal to that of the capture.
+
+    Args:
+        capture: `[c, y, x]` linear light; what is below 0 counts as 0.
+        psf: `[c, y, x]` PSFs in energy per pixel, odd windows with the chief ray in the middle.
+        iterations: the most iterations.
+        noise_variance: of the capture, for each colour or one for all; a colour stops where the mean square of
+            capture - A u falls below it.
+
+    Returns:
+        `[c, y, x]` linear light, at least 0.
+
+    Raises:
+        ValueError: an even window.
+    """
+    _require_odd(psf)
+    seen = jnp.maximum(jnp.asarray(capture, jnp.float32), 0.0)
+    otf = plan_otf(jnp.asarray(psf), (seen.shape[1], seen.shape[2]), "reflect")
+    enough = jnp.broadcast_to(jnp.asarray(noise_variance, jnp.float32), (len(seen),))[:, None, None]
+
+    def blur(light: Array) -> Array:
+        return convolve(light, otf)
+
+    transpose = jax.linear_transpose(blur, seen)
+    reached = jnp.maximum(transpose(jnp.ones_like(seen))[0], _DARK)
+
+    def step(_: int, light: Array) -> Array:
+        blurred = jnp.maximum(blur(light), _DARK)  # transforms round, and may leave the dark below 0
+        better = light * jnp.maximum(transpose(seen / blurred)[0], 0.0) / reached
+        off = jnp.mean((seen - blurred) ** 2, axis=(1, 2), keepdims=True)
+        return jnp.where(off > enough, better, light)
+
+    # Even light of the right amount: no structure that the capture has not asked for.
+    even = jnp.mean(seen, axis=(1, 2), keepdims=True) / jnp.mean(reached, axis=(1, 2), keepdims=True)
+    return jax.lax.fori_loop(0, iterations, step, jnp.broadcast_to(even, seen.shape))
+
+
+def _require_odd(psf: Array | np.ndarray) -> None:
+    if not (psf.shape[-2] % 2 and psf.shape[-1] % 2):
+        raise ValueError(f"`psf` must have odd windows, so that it has a middle, but got {psf.shape[-2:]}")

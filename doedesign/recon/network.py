@@ -1,0 +1,349 @@
+"""The reconstruction network: a U-Net whose features are deconvolved with the camera's own PSFs (paper §3.3).
+
+First stage: the capture and its Wiener estimate with the near PSF go down through `depth` halvings. At every scale the
+features are filtered with the inverse of the far PSF (`doedesign.recon.wiener`); the way up joins what it brings, the
+features and the filtered features. It ends in a correction that is added to the capture. Second stage: residual blocks
+that see the first stage's picture and the capture.
+
+PSFs are inputs: simulated, as fabricated or measured ones are handed in at run time, and the same weights serve all of
+them.
+
+Light is linear where blur is undone, and turns into display values (sRGB) where the picture is put together: a
+convolution by a PSF holds for light, an error of a picture is seen on a display.
+
+A block is a convolution, an instance normalisation without parameters, and a leaky ReLU. Normalised features no longer
+know how bright a place was, so the first scale goes without normalisation and so does the head; the public release's
+variant normalises there, too, and its second stage does not see the capture (`variant = "release"`).
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from doedesign.recon.conv import convolution, doubled
+from doedesign.recon.wiener import Blur, blur_at, deblurred
+from sim.light import srgb_from_linear
+
+Variant = Literal["paper", "release"]
+
+_LEAK = 0.01
+_WIDTHS = (1, 2, 4, 8, 12)  # features of every scale over those of the first
+_REFINEMENTS = 3
+_LOG_REGULARISER = float(np.log(1e-2))
+# Of the release, and not learnt there.
+_RELEASE_LOG_REGULARISER = float(np.log(1e-6))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Shape of a network; every part can be left out, for the ablations of Table 1.
+
+    Attributes:
+        colours: channels of a capture.
+        width: features at full scale, a multiple of `colours`.
+        depth: number of halvings, 1 to 4.
+        wiener: filter features with the inverse of the far PSF ("inverse filter").
+        features: learn what is filtered; otherwise the capture itself is, at every scale ("feature extraction").
+        near_estimate: hand in the Wiener estimate with the near PSF beside the capture.
+        refine: the second stage ("residual block").
+        variant: "paper", or "release" for the public code's layers.
+    """
+
+    colours: int = 3
+    width: int = 12
+    depth: int = 4
+    wiener: bool = True
+    features: bool = True
+    near_estimate: bool = True
+    refine: bool = True
+    variant: Variant = "paper"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ValueError: a width that colours do not divide, or a depth beyond 1 to 4.
+        """
+        if self.colours < 1 or self.width < self.colours or self.width % self.colours:
+            raise ValueError(f"`width` must be a multiple of the {self.colours} colours, but got {self.width}")
+        if not 1 <= self.depth < len(_WIDTHS):
+            raise ValueError(f"`depth` must be from 1 to {len(_WIDTHS) - 1}, but got {self.depth}")
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Features of every scale, the finest first."""
+        return tuple(self.width * factor for factor in _WIDTHS[: self.depth + 1])
+
+    @property
+    def multiple(self) -> int:
+        """What the sides of a capture must be multiples of."""
+        return int(2**self.depth)
+
+
+class Block(eqx.Module):
+    """Convolution, instance normalisation, leaky ReLU.
+
+    Attributes:
+        weights: `[y, x, input, output]`.
+        bias: `[output]`, where nothing is normalised; a normalisation would take it away.
+        stride: step of the convolution.
+        act: whether the leaky ReLU follows.
+    """
+
+    weights: Float[Array, "ky kx i o"]
+    bias: Float[Array, " o"] | None
+    stride: int = eqx.field(static=True, default=1)
+    act: bool = eqx.field(static=True, default=True)
+
+    @classmethod
+    def make(
+        cls,
+        rng: np.random.Generator,
+        inputs: int,
+        outputs: int,
+        size: int = 3,
+        stride: int = 1,
+        *,
+        normal: bool = True,
+        act: bool = True,
+        gain: float = 1.0,
+    ) -> "Block":
+        """Draw weights of the variance that keeps signals as large as they are (He et al. 2015), times `gain`²."""
+        scale = gain * np.sqrt(2 / (1 + _LEAK**2) / (inputs * size * size))
+        weights = jnp.asarray(scale * rng.standard_normal((size, size, inputs, outputs)), jnp.float32)
+        return cls(weights, None if normal else jnp.zeros(outputs), stride, act)
+
+    def __call__(self, image: Float[Array, "b y x i"], half: bool = False) -> Float[Array, "b v u o"]:
+        """Apply the block."""
+        found = convolution(image, self.weights, self.stride, half=half)
+        found = normalised(found) if self.bias is None else found + self.bias
+        return jax.nn.leaky_relu(found, _LEAK) if self.act else found
+
+
+def normalised(image: Float[Array, "b y x c"]) -> Float[Array, "b y x c"]:
+    """Every channel of every image with mean 0 and variance 1."""
+    mean = jnp.mean(image, axis=(1, 2), keepdims=True)
+    variance = jnp.mean((image - mean) ** 2, axis=(1, 2), keepdims=True)
+    return (image - mean) * jax.lax.rsqrt(variance + 1e-5)
+
+
+class Scale(eqx.Module):
+    """What one scale has on the way down.
+
+    Attributes:
+        blocks: blocks one after the other.
+        log_regulariser: of its Wiener filter; None without one.
+    """
+
+    blocks: tuple[Block, ...]
+    log_regulariser: Float[Array, " k"] | None
+
+    def __call__(self, image: Float[Array, "b y x i"], half: bool) -> Float[Array, "b v u o"]:
+        """Extract features."""
+        for block in self.blocks:
+            image = block(image, half)
+        return image
+
+
+class Rise(eqx.Module):
+    """From one scale to the next finer one.
+
+    Attributes:
+        weights: `[input, 2, 2, output]` of the transposed convolution.
+        join: the block that joins what comes from below with this scale's features.
+    """
+
+    weights: Float[Array, "i 2 2 o"]
+    join: Block
+
+    def __call__(
+        self, image: Float[Array, "b y x i"], beside: list[Float[Array, "b v u k"]], half: bool
+    ) -> Float[Array, "b v u o"]:
+        """Go up by one scale."""
+        risen = jax.nn.leaky_relu(normalised(doubled(image, self.weights)), _LEAK)
+        return self.join(jnp.concatenate([risen, *beside], axis=-1), half)
+
+
+class Network(eqx.Module):
+    """The network. `Network.make` draws one.
+
+    Attributes:
+        near_log_regulariser: of the Wiener estimate with the near PSF; None without one.
+        down: scales, the finest first.
+        bottom: blocks at the coarsest scale.
+        up: ways up, the coarsest first.
+        head: blocks that end in the correction.
+        residual: pairs of blocks of the second stage.
+        last: its last block.
+        layout: its shape.
+    """
+
+    near_log_regulariser: Float[Array, " c"] | None
+    down: tuple[Scale, ...]
+    bottom: tuple[Block, ...]
+    up: tuple[Rise, ...]
+    head: tuple[Block, ...]
+    residual: tuple[tuple[Block, Block], ...]
+    last: Block | None
+    layout: Layout = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, layout: Layout, seed: int) -> "Network":
+        """Draw a network that all but hands the capture through: its corrections begin near nothing.
+
+        Raises:
+            ValueError: neither learnt features nor a Wiener filter.
+        """
+        rng = np.random.default_rng(seed)
+        release, c, widths = layout.variant == "release", layout.colours, layout.widths
+        log_regulariser = _RELEASE_LOG_REGULARISER if release else _LOG_REGULARISER
+
+        def scale(level: int) -> Scale:
+            inputs = c * (2 if layout.near_estimate else 1) if level == 0 else widths[level - 1]
+            wide, normal = widths[level], level > 0 or release
+            first = Block.make(rng, inputs, wide, 3 if level else 7, 2 if level else 1, normal=normal)
+            more = [Block.make(rng, wide, wide, normal=normal) for _ in range(2 if level else 1)]
+            filtered = wide if layout.features else c
+            wiener = jnp.full(filtered, log_regulariser, jnp.float32) if layout.wiener else None
+            return Scale((first, *more), wiener)
+
+        def beside(level: int) -> int:
+            filtered = (widths[level] if layout.features else c) if layout.wiener else 0
+            return filtered + (widths[level] if layout.features else 0)
+
+        down = tuple(scale(level) for level in range(layout.depth + 1)) if layout.features else _bare(layout)
+        deepest = beside(layout.depth)
+        wide = 2 * widths[-1]
+        bottom = (Block.make(rng, deepest, wide), Block.make(rng, wide, widths[-1]))
+        up = tuple(
+            Rise(
+                _spread(rng, widths[level + 1], widths[level]),
+                Block.make(rng, widths[level] + beside(level), widths[level]),
+            )
+            for level in reversed(range(layout.depth))
+        )
+        middle = c if release else layout.width
+        head = (
+            Block.make(rng, layout.width, middle, normal=release),
+            Block.make(rng, middle, c, 5, normal=False, act=False, gain=1e-2),
+        )
+        seen = c if release else 2 * c
+        residual = tuple(
+            (
+                Block.make(rng, seen, seen, gain=1e-3 if release else 1.0),
+                Block.make(rng, seen, seen, act=False, gain=1e-3 if release else 1.0),
+            )
+            for _ in range(_REFINEMENTS if layout.refine else 0)
+        )
+        last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=1e-2) if layout.refine else None
+        near = jnp.full(c, log_regulariser, jnp.float32) if layout.near_estimate else None
+        return cls(near, down, bottom, up, head, residual, last, layout)
+
+    def __call__(
+        self,
+        capture: Float[Array, "b c y x"],
+        far: Float[Array, "b c ky kx"],
+        near: Float[Array, "b c ky kx"],
+        *,
+        half: bool = False,
+        checkpointed: bool = False,
+    ) -> Float[Array, "b c y x"]:
+        """Reconstruct the scene behind the obstruction.
+
+        Args:
+            capture: `[b, c, y, x]` linear light, white 1; sides are multiples of `layout.multiple`.
+            far: `[b, c, y, x]` PSFs of the scene, energy per pixel, odd windows with the chief ray in the middle.
+            near: the same of the obstruction.
+            half: multiply in bfloat16; transforms, normalisations and sums stay in float32.
+            checkpointed: for gradients, keep nothing within a scale and compute it again.
+
+        Returns:
+            `[b, c, y, x]` display values, 0 to 1 but for the network's errors.
+
+        Raises:
+            ValueError: another number of colours, or sides that cannot be halved often enough.
+        """
+        layout = self.layout
+        if capture.shape[1] != layout.colours:
+            raise ValueError(f"`capture` must have {layout.colours} colours, but got {capture.shape[1]}")
+        if any(side % layout.multiple for side in capture.shape[2:]):
+            raise ValueError(f"sides of `capture` must be multiples of {layout.multiple}, but got {capture.shape[2:]}")
+        keep = partial(jax.checkpoint, static_argnums=()) if checkpointed else lambda call: call
+        light = capture.transpose(0, 2, 3, 1)
+        display = srgb_from_linear(light)
+        inputs = [light]
+        if self.near_log_regulariser is not None:
+            whole = blur_at(near, (capture.shape[2], capture.shape[3]), unit=False)
+            inputs.append(deblurred(light, whole, self.near_log_regulariser))
+        features, skips = jnp.concatenate(inputs, axis=-1), []
+        for level, scale in enumerate(self.down):
+            shape = (capture.shape[2] >> level, capture.shape[3] >> level)
+            blur = blur_at(far, shape, 2**level) if scale.log_regulariser is not None else None
+            plain = shrunk(light, 2**level)
+            features, beside = keep(partial(_down, half=half, features=layout.features))(scale, features, plain, blur)
+            skips.append(beside)
+        image = jnp.concatenate(skips.pop(), axis=-1)
+        for block in self.bottom:
+            image = block(image, half)
+        for rise in self.up:
+            image = keep(lambda r, i, b: r(i, b, half))(rise, image, skips.pop())
+        for block in self.head:
+            image = block(image, half)
+        picture = display + jnp.tanh(image)
+        if self.last is not None:
+            picture = self._refined(picture, display, half)
+        return picture.transpose(0, 3, 1, 2)
+
+    def _refined(self, picture: Float[Array, "b y x c"], display: Float[Array, "b y x c"], half: bool) -> Array:
+        """The second stage."""
+        release = self.layout.variant == "release"
+        seen = picture if release else jnp.concatenate([picture, display], axis=-1)
+        for first, second in self.residual:
+            seen = jax.nn.leaky_relu(seen + second(first(seen, half), half), _LEAK)
+        assert self.last is not None  # only then is there a second stage
+        found = picture + self.last(seen, half)
+        return jax.nn.relu(found) if release else found
+
+
+def _bare(layout: Layout) -> tuple[Scale, ...]:
+    """Scales without features of their own: the capture is filtered."""
+    wiener = jnp.full(layout.colours, _LOG_REGULARISER, jnp.float32) if layout.wiener else None
+    if wiener is None:
+        raise ValueError("`features` or `wiener` must be kept, but both are off")
+    return tuple(Scale((), wiener) for _ in range(layout.depth + 1))
+
+
+def _spread(rng: np.random.Generator, inputs: int, outputs: int) -> Float[Array, "i 2 2 o"]:
+    """Weights of a transposed convolution."""
+    return jnp.asarray(rng.standard_normal((inputs, 2, 2, outputs)) / np.sqrt(inputs), jnp.float32)
+
+
+def _down(
+    scale: Scale, image: Array, plain: Array, blur: Blur | None, *, half: bool, features: bool
+) -> tuple[Array, list[Array]]:
+    """One scale on the way down: what goes on, and what stays for the way up."""
+    if not features:
+        assert blur is not None  # `_bare` refuses a network without both
+        assert scale.log_regulariser is not None
+        return image, [deblurred(plain, blur, scale.log_regulariser)]
+    found = scale(image, half)
+    if blur is None or scale.log_regulariser is None:
+        return found, [found]
+    return found, [found, deblurred(found, blur, scale.log_regulariser)]
+
+
+def shrunk(image: Float[Array, "b y x c"], factor: int) -> Float[Array, "b v u c"]:
+    """Means over squares of `factor` pixels."""
+    b, y, x, c = image.shape
+    return image.reshape(b, y // factor, factor, x // factor, factor, c).mean(axis=(2, 4))
+
+
+def count_parameters(tree: Any) -> int:
+    """Numbers that are learnt."""
+    return sum(int(leaf.size) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))

@@ -1,0 +1,133 @@
+"""How a design is trained with its network: the tables [network] and [train].
+
+Both may be left out, and so may any key; a spec without them stays what it was.
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from doedesign.spec.table import Table
+from doedesign.spec.values import Count, Positive
+
+__all__ = ["NetworkSpec", "TrainSpec", "training_problems"]
+
+Share = Annotated[float, Field(strict=True, ge=0)]
+Flag = Annotated[bool, Field(strict=True)]
+
+
+class NetworkSpec(Table, frozen=True):
+    """The reconstruction network (paper section 3.3); each block can be left out, as in the ablations of Table 1.
+
+    Attributes:
+        width: feature channels of the finest scale, a multiple of the camera's colours; coarser ones have 2, 4, 8 and
+            12 times as many.
+        depth: scales below the finest.
+        wiener: Wiener blocks, which undo the far PSF, at every scale ("inverse filter").
+        features: what they see is learnt; otherwise it is the capture itself ("feature extraction").
+        near_estimate: the near-PSF Wiener estimate stands beside the capture at the input.
+        refine: the second stage of three residual blocks ("residual block").
+        variant: "paper", or "release" for what the paper's public code does where the two differ.
+    """
+
+    width: Annotated[int, Field(strict=True, ge=1, le=256)] = 12
+    depth: Annotated[int, Field(strict=True, ge=1, le=4)] = 4
+    wiener: Flag = True
+    features: Flag = True
+    near_estimate: Flag = True
+    refine: Flag = True
+    variant: Literal["paper", "release"] = "paper"
+
+
+class TrainSpec(Table, frozen=True):
+    """How network and optics are trained.
+
+    Attributes:
+        steps: training steps.
+        batch: scenes per step.
+        size: pixels (binned) per side of a training picture.
+        learning_rate: Adam's step size for the network.
+        optics_learning_rate: Adam's step size for the height map, radians of phase at the design wavelength; 0 keeps
+            the map as it is.
+        schedule: "cosine" lets both step sizes fall to a tenth, "constant" keeps them.
+        mode: "simultaneous", or "alternating": the optics moves in one of `period` steps, the network in the others.
+        period: see `mode`.
+        freeze: what stays as it is: "none", "optics" or "network".
+        camera: "doe", or "conventional" for the same camera with a flat plate.
+        l1: weight of the mean absolute difference.
+        perceptual: weight of the perceptual distance.
+        masked: weight of the mean absolute difference where the obstruction is.
+        field: "random" sees every scene at a field angle of its own within the sensor, "off" on the axis.
+        fabricated: every step sees a plate with errors drawn from the process.
+        precision: "float32", or "mixed" for half the bits where that is safe.
+        checkpointing: compute features twice instead of keeping them, for less memory.
+        seed: seed of everything random.
+        checkpoint_every: steps between checkpoints.
+        validate_every: steps between looks at pictures that are never trained on.
+        validation: number of these pictures.
+    """
+
+    steps: Annotated[int, Field(strict=True, ge=0, le=10_000_000)] = 50_000
+    batch: Annotated[int, Field(strict=True, ge=1, le=4096)] = 1
+    size: Annotated[int, Field(strict=True, ge=16, le=8192)] = 512
+    learning_rate: Positive = 1e-4
+    optics_learning_rate: Share = 0.02
+    schedule: Literal["cosine", "constant"] = "cosine"
+    mode: Literal["simultaneous", "alternating"] = "simultaneous"
+    period: Annotated[int, Field(strict=True, ge=2, le=1000)] = 4
+    freeze: Literal["none", "optics", "network"] = "none"
+    camera: Literal["doe", "conventional"] = "doe"
+    l1: Share = 1.0
+    perceptual: Share = 1.0
+    masked: Share = 1.0
+    field: Literal["off", "random"] = "off"
+    fabricated: Flag = False
+    precision: Literal["float32", "mixed"] = "float32"
+    checkpointing: Flag = False
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
+    checkpoint_every: Count = 200
+    validate_every: Count = 500
+    validation: Annotated[int, Field(strict=True, ge=1, le=10_000)] = 8
+
+    @property
+    def moves_optics(self) -> bool:
+        """Whether training changes the height map."""
+        return self.camera == "doe" and self.freeze != "optics" and self.optics_learning_rate > 0
+
+    @property
+    def moves_network(self) -> bool:
+        """Whether training changes the network."""
+        return self.freeze != "network"
+
+
+def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> Iterator[tuple[str, str, str, str]]:
+    """Yield key, rule, value and cure of every broken rule that joins several values.
+
+    Args:
+        network: the network.
+        train: its training.
+        colours: colours of the camera.
+    """
+    # A design that says nothing of a network may have any number of colours.
+    if network != NetworkSpec() and network.width % colours:
+        nearest = max(1, round(network.width / colours)) * colours
+        rule = f"must be a multiple of the camera's {colours} colours"
+        yield "network.width", rule, str(network.width), f"Set width = {nearest}."
+    if not (network.features or network.wiener):
+        cure = "Keep one of the two blocks."
+        yield "network.features", "features or wiener must be kept", "neither", cure
+    # Two pixels at the coarsest scale: reflection at its border needs a neighbour.
+    coarsest = 2**network.depth
+    if train.size % coarsest or train.size < 2 * coarsest:
+        nearest = max(2, round(train.size / coarsest)) * coarsest
+        rule = f"must be a multiple of 2^network.depth = {coarsest}, and at least twice that"
+        yield "train.size", rule, str(train.size), f"Set size = {nearest}, or another depth of the network."
+    if not (train.moves_optics or train.moves_network):
+        got = 'freeze = "network" with ' + (
+            'camera = "conventional"' if train.camera == "conventional" else "optics_learning_rate = 0"
+        )
+        yield "train.freeze", "something must be left to train", got, "Let the network or the optics learn."
+    if train.l1 == train.perceptual == train.masked == 0:
+        rule = "one of l1, perceptual and masked must be above 0"
+        yield "train.l1", rule, "0 for all of them", "Give a weight, such as l1 = 1.0."

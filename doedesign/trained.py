@@ -1,0 +1,206 @@
+"""What a training makes: scores and pictures of scenes it never saw, the trained plate, its PSFs, and the network."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.capture import shown_as
+from doedesign.drawing import read_any_height
+from doedesign.recon.chain import RingPlate, StoredPlate
+from doedesign.recon.data import Batch, SceneData
+from doedesign.recon.heldout import Look, looks
+from doedesign.recon.perceptual import Lpips
+from doedesign.recon.scores import Scores, scores
+from doedesign.recon.train import State, Trainer
+from doedesign.recon.weights import NETWORK_NAME, camera_facts, write_network
+from doedesign.report.training import ValidationRow
+from doedesign.runs import Run
+from doedesign.simulated import depth_range_m
+from fab.files import canonical_json, write_atomic
+from fab.levels import height_of
+from sim.camera import Camera
+from sim.hankel import radial_profile, revolve, ring_count
+from sim.obstruction import Kind
+from sim.psf import psf_bank
+from sim.store import write_bank, write_height
+
+BANK_NAME = "psf.exr"
+
+
+class HeldOut(NamedTuple):
+    """Scenes that are never trained on.
+
+    Attributes:
+        data: where they come from, one to a batch.
+        scenes: how many.
+        lpips: weights of LPIPS, if at hand.
+    """
+
+    data: SceneData
+    scenes: int
+    lpips: Lpips | None
+
+
+class Found(NamedTuple):
+    """What a look at held-out scenes found.
+
+    Attributes:
+        means: scores by picture kind ("capture", "reconstruction"), region and name, averaged over the scenes.
+        scenes: the same of every scene, with its "name" and how much of it is "covered".
+        rows: the first scenes, for a picture.
+    """
+
+    means: dict[str, Any]
+    scenes: list[dict[str, Any]]
+    rows: list[ValidationRow]
+
+
+def validate(trainer: Trainer, state: State, held_out: HeldOut, most_rows: int = 4) -> Found:
+    """Look at held-out scenes with the network as it is now.
+
+    Args:
+        trainer: the training.
+        state: its state.
+        held_out: the scenes.
+        most_rows: scenes to keep for a picture.
+    """
+
+    def reconstruct(batch: Batch) -> tuple[Any, Any]:
+        shot, picture = trainer.reconstruct(state, batch)
+        return shot.capture, picture
+
+    camera, scenes, rows = trainer.bench.camera, [], []
+    for look in looks(held_out.data, held_out.scenes, camera, reconstruct):
+        judged = {
+            name: _told(scores(image[None], look.scene[None], look.mask[None], held_out.lpips))
+            for name, image in (("capture", look.capture), ("reconstruction", look.reconstruction))
+        }
+        scenes.append({"name": look.name, "covered": float(look.mask.mean(dtype=np.float64)), **judged})
+        if len(rows) < most_rows:
+            rows.append(_row(look, judged, camera))
+    means = {
+        kind: {
+            region: {name: _mean([scene[kind][region][name] for scene in scenes]) for name in found}
+            for region, found in scenes[0][kind].items()
+        }
+        for kind in ("capture", "reconstruction")
+    }
+    return Found(means, scenes, rows)
+
+
+def _told(found: Scores) -> dict[str, dict[str, float | None]]:
+    """Scores of one scene for JSON; None where there is none."""
+    return {
+        region: {
+            name: float(values[0]) if np.isfinite(values[0]) else None
+            for name, values in of_region._asdict().items()
+            if values is not None
+        }
+        for region, of_region in found._asdict().items()
+    }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _row(look: Look, judged: Mapping[str, Any], camera: Camera) -> ValidationRow:
+    def decibels(kind: str) -> str:
+        full, hidden = (judged[kind][region]["psnr"] for region in ("full", "occluded"))
+        text = "?" if full is None else f"{full:.1f} dB"
+        return text if hidden is None else f"{text} ({hidden:.1f})"
+
+    label = f"{look.name}: {decibels('capture')} to {decibels('reconstruction')}"
+    capture, reconstruction, scene = (
+        shown_as(image, camera) for image in (look.capture, look.reconstruction, look.scene)
+    )
+    return ValidationRow(label, capture, reconstruction, scene)
+
+
+class PlateMaps(NamedTuple):
+    """Height maps of a plate, metres, float32 `[y, x]`.
+
+    Attributes:
+        drawn_m: what is to be made.
+        continuous_m: the same before rounding; None for a plate that training left as it was.
+    """
+
+    drawn_m: Float[np.ndarray, "y x"]
+    continuous_m: Float[np.ndarray, "y x"] | None
+
+
+def plate_at_rest(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
+    """The plate that a run draws, or a flat one where the spec wants a conventional camera."""
+    if run.spec.train.camera == "conventional":
+        return np.zeros(camera.grid.shape, np.float32)
+    return read_any_height(run.path("height.exr")).height_m
+
+
+def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
+    """The heights that training begins with: those of the run before rounding; of rings, their profile."""
+    camera = trainer.bench.camera
+    if run.spec.train.camera == "conventional":
+        flat = np.zeros(camera.grid.shape, np.float32)
+        return flat[0, : ring_count(camera)] if isinstance(trainer.plate, RingPlate) else flat
+    heights = read_any_height(run.path("height_continuous.exr")).height_m
+    if not isinstance(trainer.plate, RingPlate):
+        return heights
+    profile = radial_profile(heights, camera.grid)
+    assert profile is not None  # that is what `optimize` writes for a radial design
+    return profile[: ring_count(camera)]
+
+
+def plate_after(run: Run, trainer: Trainer, state: State) -> PlateMaps:
+    """The plate of a state, as `doedesign.optimize.finished_design` makes it of parameters."""
+    spec, camera, plate = run.spec, trainer.bench.camera, trainer.plate
+    if not spec.train.moves_optics or isinstance(plate, StoredPlate):
+        return PlateMaps(plate_at_rest(run, camera), None)
+    # A finished run has chosen its depths, so only the map is free.
+    assert isinstance(state.free, jax.Array)
+    continuous = np.asarray(plate.staircase.continuous_m(state.free))
+    if isinstance(plate, RingPlate):
+        continuous = revolve(continuous, camera.grid)
+    if spec.optimize.quantisation == "none":
+        return PlateMaps(continuous, continuous)
+    level = np.asarray(plate.staircase.level(jnp.asarray(continuous))).astype(np.uint8)
+    return PlateMaps(height_of(level, plate.staircase.levels).astype(np.float32), continuous)
+
+
+def write_results(
+    folder: Path, run: Run, trainer: Trainer, state: State, held_out: HeldOut, kind: Kind, about: Mapping[str, Any]
+) -> list[str]:
+    """Write network, plate, PSFs and scores.
+
+    Args:
+        folder: where to.
+        run: the run, with the spec of the training.
+        trainer: the training.
+        state: its last state.
+        held_out: scenes to judge it by.
+        kind: obstruction.
+        about: what the network's file says beside the camera's facts.
+
+    Returns:
+        names of the files.
+    """
+    spec, camera = run.spec, trainer.bench.camera
+    maps, near = plate_after(run, trainer, state), spec.scene.near_m or depth_range_m(kind)
+    names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
+    if spec.train.camera == "doe":
+        for name, height in (("height", maps.drawn_m), ("height_continuous", maps.continuous_m)):
+            if height is not None:
+                write_height(folder / f"{name}.exr", height, camera.grid.pitch_m, spec.doe.aperture_m)
+                names.append(f"{name}.exr")
+    depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
+    bank = psf_bank(camera, maps.drawn_m, depths, propagation=spec.optics.propagation)
+    write_bank(folder / BANK_NAME, bank, {"design": spec.name})
+    found = validate(trainer, state, held_out)
+    write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
+    write_network(folder / NETWORK_NAME, state.network, {**camera_facts(camera, near), **about})
+    return names

@@ -1,0 +1,308 @@
+"""`doedesign reconstruct`: what it takes, what it leaves behind, and what it refuses."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from doedesign.commands.reconstruct import FORMAT, Request, open_model, psfs_of, reconstruct
+from doedesign.recon.network import Layout
+from doedesign.recon.photos import read_capture, write_reconstruction
+from doedesign.recon.weights import camera_facts, read_network, write_network
+from fab.errors import InputError
+from fab.files import canonical_json, read_json, sha256_file
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+from sim.light import srgb_from_linear
+from sim.psf import PsfBank
+from sim.store import read_picture, write_bank, write_picture
+from tests.recon.drawn_networks import drawn
+
+# Blue comes first, so that files in red, green and blue have to be turned round.
+COLOURS = ("486nm", "589nm", "656nm")
+WAVES = (486e-9, 589e-9, 656e-9)
+PIXEL = 3.7e-6
+ABOUT = {"colours": list(COLOURS), "wavelengths_m": list(WAVES), "pixel_m": PIXEL, "near_m": [0.05, 0.08, 0.12]}
+LAYOUT = Layout(width=3, depth=1, wiener=False, near_estimate=False, refine=False)
+# Through single precision, the curve and back, and half a count of 16 bits.
+SIXTEEN = 0.5 / 65535 + 1e-6
+
+
+def bank(colours=COLOURS, depths=(0.05, 0.12, 5.0, np.inf), pixel=PIXEL, window=7, seed=0) -> PsfBank:
+    energy = np.random.default_rng(seed).uniform(0, 1, (len(colours), len(depths), window, window))
+    energy *= np.linspace(0.7, 0.9, len(colours))[:, None, None, None] / energy.sum(axis=(2, 3), keepdims=True)
+    return PsfBank(energy.astype(np.float32), colours, depths, pixel)
+
+
+def model_in(
+    folder: Path, layout: Layout = LAYOUT, about=ABOUT, spread: float = 0.0, psfs: PsfBank | None = None
+) -> Path:
+    """A model; with a spread of 0 its network hands the capture through."""
+    write_network(folder / "network.npz", drawn(layout, spread), about)
+    write_bank(folder / "psf.exr", psfs or bank(about["colours"] and tuple(about["colours"])))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run with a training."""
+    model_in(tmp_path / "run" / "trained")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def light() -> np.ndarray:
+    return np.random.default_rng(1).uniform(0, 1, (3, 30, 41)).astype(np.float32)
+
+
+@pytest.fixture
+def capture(tmp_path: Path, light: np.ndarray) -> Path:
+    write_picture(tmp_path / "capture.exr", dict(zip("RGB", light, strict=True)))
+    return tmp_path / "capture.exr"
+
+
+def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, run: Path, light: np.ndarray):
+    """Every kind of file: its colours, the way up, its curve, and more tiles than one."""
+    display = srgb_from_linear(light)
+    files = [tmp_path / f"{name}" for name in ("a.exr", "b.png", "c.png", "d.tif", "e.tif")]
+    for path, bits in zip(files, (None, 16, 8, 16, None), strict=True):
+        write_reconstruction(path, display, bits)
+    out = tmp_path / "out"
+    written = reconstruct(run, files, out, Request(tile=32, overlap=8))
+    assert written == [out / path.name for path in files]
+    for before, after in zip(files, written, strict=True):
+        one, other = read_capture(before), read_capture(after)
+        assert (one.bits, one.linear) == (other.bits, other.linear)
+        np.testing.assert_allclose(srgb_from_linear(other.light), srgb_from_linear(one.light), atol=SIXTEEN)
+
+
+def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
+    out = tmp_path / "out"
+    reconstruct(run, [capture], out, Request(near_m=0.07, kind=".png", beside=True))
+    manifest = read_json(out / "manifest.json")
+    assert manifest["format"] == FORMAT
+    assert set(manifest["results"]) == {"capture.png", "capture_beside.png"}
+    for name, said in manifest["results"].items():
+        assert said["sha256"] == sha256_file(out / name)
+        assert said["capture_sha256"] == sha256_file(capture)
+        assert said["model_sha256"]["network.npz"] == sha256_file(run / "trained" / "network.npz")
+        assert (said["near_m"], said["far_m"]) == (0.07, None)
+    assert {path.name for path in out.iterdir()} == {*manifest["results"], "manifest.json"}
+
+
+def test_side_by_side_shows_both(tmp_path: Path, run: Path, capture: Path, light: np.ndarray):
+    reconstruct(run, [capture], tmp_path / "out", Request(beside=True))
+    seen = np.asarray(Image.open(tmp_path / "out" / "capture_beside.png"))[::-1].transpose(2, 0, 1) / 255
+    assert seen.shape == (3, 30, 2 * 41 + 2)
+    for half in (seen[..., :41], seen[..., 43:]):
+        np.testing.assert_allclose(half, srgb_from_linear(light), atol=0.51 / 255)
+    assert seen[..., 41:43].min() == 1
+
+
+def test_same_inputs_same_bytes_and_a_later_call_adds(tmp_path: Path, run: Path, capture: Path):
+    out, other = tmp_path / "out", tmp_path / "other.exr"
+    shutil.copy(capture, other)
+    reconstruct(run, [capture], out)
+    first = {path.name: path.read_bytes() for path in out.iterdir()}
+    reconstruct(run, [capture], out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == first
+    reconstruct(run, [other], out)
+    assert set(read_json(out / "manifest.json")["results"]) == {"capture.exr", "other.exr"}
+    assert (out / "capture.exr").read_bytes() == first["capture.exr"]
+
+
+def test_captures_of_one_name_are_told_apart_by_their_folders(tmp_path: Path, run: Path, capture: Path):
+    copies = []
+    for name in ("0000_cat", "0001_dog"):
+        (tmp_path / name).mkdir()
+        copies.append(Path(shutil.copy(capture, tmp_path / name / "capture.exr")))
+    written = reconstruct(run, copies, tmp_path / "out")
+    assert [path.name for path in written] == ["0000_cat_capture.exr", "0001_dog_capture.exr"]
+    with pytest.raises(InputError, match="twice"):
+        reconstruct(run, [capture, capture], tmp_path / "out")
+
+
+def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
+    """A network with Wiener blocks gives another picture with other PSFs, and the same with its own handed in."""
+    model = model_in(tmp_path / "model", Layout(width=3, depth=1, features=False, refine=False), spread=0.1)
+    sharp = bank()
+    sharp = PsfBank(np.zeros_like(sharp.energy), COLOURS, sharp.depths_m, PIXEL)
+    sharp.energy[..., 3, 3] = 0.8
+    write_bank(tmp_path / "sharp.exr", sharp)
+    shutil.copy(model / "psf.exr", tmp_path / "same.exr")
+    pictures = []
+    for k, psf in enumerate(((), (tmp_path / "same.exr",), (tmp_path / "sharp.exr",))):
+        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", Request(psf=psf))
+        pictures.append(read_picture(path)[0]["G"])
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    assert np.abs(pictures[2] - pictures[0]).max() > 1e-3
+
+
+def test_depths_are_the_middle_of_the_near_ones_and_the_farthest(run: Path):
+    model = open_model(run)
+    psfs = psfs_of(model, Request())
+    assert psfs.near_m == pytest.approx(2 / (1 / 0.05 + 1 / 0.12))
+    assert psfs.far_m == np.inf
+    np.testing.assert_array_equal(psfs.far, model.bank.energy[:, 3])
+    # Half way in 1/z between the bank's two near depths is half of each.
+    np.testing.assert_allclose(psfs.near, model.bank.energy[:, :2].mean(axis=1), rtol=1e-5)
+    chosen = psfs_of(model, Request(near_m=0.05, far_m=5.0))
+    np.testing.assert_array_equal(chosen.near, model.bank.energy[:, 0])
+    np.testing.assert_array_equal(chosen.far, model.bank.energy[:, 2])
+
+
+def test_a_bank_in_another_order_is_put_in_order(tmp_path: Path, run: Path):
+    model, own = open_model(run), bank()
+    turned = PsfBank(own.energy[[2, 0, 1]], (COLOURS[2], COLOURS[0], COLOURS[1]), own.depths_m, PIXEL * 1.0005)
+    write_bank(tmp_path / "turned.exr", turned)
+    found, usual = psfs_of(model, Request(psf=(tmp_path / "turned.exr",))), psfs_of(model, Request())
+    np.testing.assert_array_equal(found.far, usual.far)
+    np.testing.assert_array_equal(found.near, usual.near)
+
+
+def measured(path: Path, window: int = 9, seed: int = 5) -> np.ndarray:
+    """Counts of another program, red, green and blue."""
+    counts = np.random.default_rng(seed).uniform(0, 4000, (3, window, window)).astype(np.float32)
+    write_picture(path, dict(zip("RGB", counts, strict=True)))
+    return counts
+
+
+def test_measured_psfs_take_the_energy_of_the_models(tmp_path: Path, run: Path):
+    far, near = measured(tmp_path / "far.exr"), measured(tmp_path / "near.exr", 11, 6)
+    model = open_model(run)
+    request = Request(psf=(tmp_path / "far.exr", tmp_path / "near.exr"), pixel_m=PIXEL)
+    found, own = psfs_of(model, request), psfs_of(model, Request())
+    for psf, usual, counts in ((found.far, own.far, far), (found.near, own.near, near)):
+        np.testing.assert_allclose(psf.sum(axis=(1, 2)), usual.sum(axis=(1, 2)), rtol=1e-5)
+        # Blue is the model's first channel.
+        np.testing.assert_allclose(psf / psf[:, :1, :1], counts[::-1] / counts[::-1][:, :1, :1], rtol=1e-5)
+
+
+def test_one_colour_takes_luminance_and_gives_grey(tmp_path: Path, capture: Path, light: np.ndarray):
+    about = ABOUT | {"colours": ["550nm"], "wavelengths_m": [550e-9]}
+    layout = Layout(colours=1, width=2, depth=1, wiener=False, near_estimate=False, refine=False)
+    model = model_in(tmp_path / "grey", layout, about)
+    (path,) = reconstruct(model, [capture], tmp_path / "out")
+    channels, _ = read_picture(path)
+    assert set(channels) == {"Y"}
+    # Luminance of linear sRGB, through the curve and back in single precision.
+    np.testing.assert_allclose(channels["Y"], np.tensordot([0.2126, 0.7152, 0.0722], light, 1), rtol=1e-4, atol=1e-5)
+
+
+def test_camera_facts_are_what_a_model_needs():
+    # Two lines of one colour, weighted: (2 · 580 + 607) / 3 = 589 nm.
+    colours = (
+        Colour("486nm", (486e-9,), (1.0,)),
+        Colour("589nm", (580e-9, 607e-9), (2 / 3, 1 / 3)),
+        Colour("656nm", (656e-9,), (1.0,)),
+    )
+    camera = Camera(Grid((16, 16), 2e-6), 30e-6, "fused_silica", colours, 1e-3, PIXEL, 15)
+    facts = camera_facts(camera, (0.05, 0.08, 0.12))
+    assert facts.pop("wavelengths_m") == pytest.approx(WAVES)
+    assert facts == {key: value for key, value in ABOUT.items() if key != "wavelengths_m"}
+
+
+def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, dict]]:
+    write_bank(tmp_path / "pitch.exr", bank(pixel=1.85e-6))
+    write_bank(tmp_path / "colours.exr", bank(("450nm", "550nm", "650nm")))
+    write_bank(tmp_path / "one.exr", bank(("589nm",)))
+    write_bank(tmp_path / "even.exr", bank(window=8))
+    write_bank(tmp_path / "depths.exr", bank(depths=(0.3, np.inf)))
+    measured(tmp_path / "far.exr")
+    write_picture(tmp_path / "dark.exr", {c: np.zeros((5, 5)) for c in "RGB"})
+    write_picture(tmp_path / "grey.exr", {"Y": np.ones((20, 20))})
+    nan = np.ones((20, 20))
+    nan[3, 4] = np.nan
+    write_picture(tmp_path / "nan.exr", {c: nan for c in "RGB"})
+
+    def psf(*names: str, **more) -> dict:
+        return {"request": Request(psf=[tmp_path / name for name in names], **more)}
+
+    return {
+        "pitch": (r"must have the 3\.7 um pixels .* but got 1\.85 um\. Compute or bin", psf("pitch.exr")),
+        "colours": (
+            r"the colours of the network, 486nm, 589nm, 656nm, but got 450nm, 550nm, 650nm",
+            psf("colours.exr"),
+        ),
+        "count": ("the colours of the network, 486nm, 589nm, 656nm, but got 589nm", psf("one.exr")),
+        "even": ("must have an odd window", psf("even.exr")),
+        "depths": ("--near-depth: must lie within the depths of the PSF bank, 0.3 to inf m", psf("depths.exr")),
+        "foreign": ("pixel pitch of a PSF from another program must be given", psf("far.exr", "far.exr")),
+        "single": ("are needed, but got one depth", psf("far.exr", pixel_m=PIXEL)),
+        "measured pitch": ("pixels that the network was trained with", psf("far.exr", "far.exr", pixel_m=4e-6)),
+        "dark": ("a PSF must hold light", psf("dark.exr", "dark.exr", pixel_m=PIXEL)),
+        "three": ("must be one bank, or one file of the scene", psf("far.exr", "far.exr", "far.exr")),
+        "no psf": ("must exist", psf("none.exr")),
+        "near beyond": ("--near-depth: must lie within", {"request": Request(near_m=0.01)}),
+        "negative": ("--near-depth: must be a positive distance", {"request": Request(near_m=-0.1)}),
+        "nan depth": ("--far-depth: must be a positive distance", {"request": Request(far_m=np.nan)}),
+        "order": ("the obstruction must be nearer", {"request": Request(near_m=6.0, far_m=5.0)}),
+        "tile": ("--tile, --overlap: overlap must be at most half", {"request": Request(tile=64, overlap=48)}),
+        "kind": ("--kind: must be one of", {"request": Request(kind=".jpg")}),
+        "grey": ("a capture must have the 3 colours of the network, but got 1", {"captures": [tmp_path / "grey.exr"]}),
+        "nan": ("NaN or infinity at row 3 from below, column 4", {"captures": [tmp_path / "nan.exr"]}),
+        "nothing": ("at least one capture", {"captures": []}),
+        "missing": ("must exist", {"captures": [tmp_path / "none.png"]}),
+        "no model": ("must hold a trained network", {"model_folder": tmp_path}),
+        "beside": ("a folder of their own", {"out": capture.parent}),
+        "run as out": ("a folder of their own", {"out": run}),
+    }
+
+
+def test_mistakes_are_told_and_leave_nothing(tmp_path: Path, run: Path, capture: Path):
+    for name, (message, wrong) in refusals(tmp_path, run, capture).items():
+        out = tmp_path / "results" / name.replace(" ", "_")
+        given = {"model_folder": run, "captures": [capture], "out": out} | wrong
+        with pytest.raises(InputError, match=message):
+            reconstruct(**given)
+        assert not out.exists() or {path.name for path in out.iterdir()} <= {"manifest.json"}, name
+
+
+def test_models_that_do_not_fit_together_are_refused(tmp_path: Path):
+    cases = {
+        "pitch": ({"psfs": bank(pixel=1.85e-6)}, "the network was trained with"),
+        "colours": ({"psfs": bank(("450nm", "550nm", "650nm"))}, "the colours of the network"),
+        "facts": ({"about": {"colours": ["a"]}, "psfs": bank()}, "must say colours, wavelengths_m, pixel_m and near_m"),
+        "layout": ({"about": ABOUT | {"colours": ["a", "b"]}, "psfs": bank()}, "must fit its layout, but got 2 names"),
+        "depths": ({"about": ABOUT | {"near_m": []}, "psfs": bank()}, "must fit its layout"),
+    }
+    for name, (wrong, message) in cases.items():
+        with pytest.raises(InputError, match=message):
+            open_model(model_in(tmp_path / name, **wrong))
+    (model_in(tmp_path / "bare") / "psf.exr").unlink()
+    with pytest.raises(InputError, match=r"psf\.exr"):
+        open_model(tmp_path / "bare")
+
+
+def test_a_capture_is_never_overwritten(tmp_path: Path, run: Path, capture: Path):
+    out = tmp_path / "out"
+    (first,) = reconstruct(run, [capture], out)
+    with pytest.raises(InputError, match="a capture must not be overwritten"):
+        reconstruct(run, [first], out)
+    whole = first.read_bytes()
+    (out / "manifest.json").write_bytes(canonical_json({"format": "another"}))
+    with pytest.raises(InputError, match="a folder of their own"):
+        reconstruct(run, [capture], out)
+    assert first.read_bytes() == whole
+
+
+def test_a_broken_capture_leaves_the_others(tmp_path: Path, run: Path, capture: Path):
+    (tmp_path / "broken.exr").write_bytes(capture.read_bytes()[:200])
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=r"broken\.exr"):
+        reconstruct(run, [capture, tmp_path / "broken.exr"], out)
+    assert set(read_json(out / "manifest.json")["results"]) == {"capture.exr"}
+    reconstruct(run, [capture], out)  # and the folder can be used again
+
+
+def test_half_precision_serves_as_well(tmp_path: Path, capture: Path):
+    model = model_in(tmp_path / "model", spread=0.1)
+    (before,) = reconstruct(model, [capture], tmp_path / "full")
+    network, about = read_network(model / "network.npz")
+    write_network(model / "network.npz", network, about, half=True)
+    (after,) = reconstruct(model, [capture], tmp_path / "half")
+    one, other = (srgb_from_linear(read_capture(path).light) for path in (before, after))
+    # Weights off by 2^-12 of themselves at most; corrections are of order 1 and so are sums of a few of them.
+    assert 0 < np.abs(one - other).max() < 5e-3
