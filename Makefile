@@ -9,11 +9,15 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
 FORMATTED := doedesign fab sim tests bench examples
 
-.PHONY: demo test lint bench clean
+.PHONY: demo train-demo test lint bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
 	$(DEMO)
+
+# About an hour and a half on two cores.
+train-demo: $(VENV)/.base
+	$(BIN)/python examples/train_demo.py
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2

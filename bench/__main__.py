@@ -12,6 +12,7 @@ TABLES = (
     "bench.order",
     "bench.plate",
     "bench.capture",
+    "bench.train",
     "bench.pipeline",
 )
 

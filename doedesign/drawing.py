@@ -18,7 +18,6 @@ from fab.layout import pixel_edges
 from fab.levels import Levels, height_of, quantise, quantise_wrapped
 from fab.manifest import read_manifest
 from fab.units import format_length
-from fab.verify import read_level_map
 
 
 @dataclass(frozen=True)
@@ -160,6 +159,8 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
     Raises:
         InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
     """
+    from fab.verify import read_level_map  # it needs what only those who draw have: training goes without
+
     manifest = read_manifest(folder)
     levels, grid = manifest.staircase(), manifest.grid()
     alike = grid.shape == drawing.grid.shape and levels.count == drawing.levels.count

@@ -1,6 +1,6 @@
 """What a training makes: scores and pictures of scenes it never saw, the trained plate, its PSFs, and the network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,25 +11,24 @@ from jaxtyping import Float
 
 from doedesign.capture import shown_as
 from doedesign.drawing import read_any_height
+from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.chain import RingPlate, StoredPlate
 from doedesign.recon.data import Batch, SceneData
-from doedesign.recon.heldout import Look, looks
+from doedesign.recon.heldout import looks
+from doedesign.recon.judged import Found, judge
 from doedesign.recon.perceptual import Lpips
-from doedesign.recon.scores import Scores, scores
 from doedesign.recon.train import State, Trainer
-from doedesign.recon.weights import NETWORK_NAME, camera_facts, write_network
-from doedesign.report.training import ValidationRow
+from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs import Run
 from doedesign.simulated import depth_range_m
 from fab.files import canonical_json, write_atomic
 from fab.levels import height_of
 from sim.camera import Camera
 from sim.hankel import radial_profile, revolve, ring_count
+from sim.light import srgb_from_linear
 from sim.obstruction import Kind
 from sim.psf import psf_bank
 from sim.store import write_bank, write_height
-
-BANK_NAME = "psf.exr"
 
 
 class HeldOut(NamedTuple):
@@ -46,21 +45,9 @@ class HeldOut(NamedTuple):
     lpips: Lpips | None
 
 
-class Found(NamedTuple):
-    """What a look at held-out scenes found.
-
-    Attributes:
-        means: scores by picture kind ("capture", "reconstruction"), region and name, averaged over the scenes.
-        scenes: the same of every scene, with its "name" and how much of it is "covered".
-        rows: the first scenes, for a picture.
-    """
-
-    means: dict[str, Any]
-    scenes: list[dict[str, Any]]
-    rows: list[ValidationRow]
-
-
-def validate(trainer: Trainer, state: State, held_out: HeldOut, most_rows: int = 4) -> Found:
+def validate(
+    trainer: Trainer, state: State, held_out: HeldOut, most_rows: int = 4, *, baselines: bool = False
+) -> Found:
     """Look at held-out scenes with the network as it is now.
 
     Args:
@@ -68,59 +55,29 @@ def validate(trainer: Trainer, state: State, held_out: HeldOut, most_rows: int =
         state: its state.
         held_out: the scenes.
         most_rows: scenes to keep for a picture.
+        baselines: judge the rows of Table 1 that need no training, too (`doedesign.recon.baselines`).
     """
+    camera = trainer.bench.camera
+    seen = looks(held_out.data, held_out.scenes, camera, lambda batch: _shown(trainer, state, batch, baselines))
+    return judge(seen, held_out.lpips, lambda image: shown_as(image, camera), most_rows)
 
-    def reconstruct(batch: Batch) -> tuple[Any, Any]:
-        shot, picture = trainer.reconstruct(state, batch)
-        return shot.capture, picture
 
-    camera, scenes, rows = trainer.bench.camera, [], []
-    for look in looks(held_out.data, held_out.scenes, camera, reconstruct):
-        judged = {
-            name: _told(scores(image[None], look.scene[None], look.mask[None], held_out.lpips))
-            for name, image in (("capture", look.capture), ("reconstruction", look.reconstruction))
+def _shown(trainer: Trainer, state: State, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
+    """What the camera records of a scene, and what the network and others make of it, in display values."""
+    shot, picture = trainer.reconstruct(state, batch)
+    light, far, near = (np.asarray(image, np.float32)[0] for image in shot)
+    found = {"capture": light}
+    if baselines:
+        variance = noise_variance(light, trainer.bench.sensor)
+        ratio = noise_to_signal(light, variance)
+        found |= {
+            "wiener_far": np.asarray(wiener(light, far, ratio)),
+            "wiener_near": np.asarray(wiener(light, near, ratio)),
+            "richardson_lucy_far": np.asarray(richardson_lucy(light, far, noise_variance=variance)),
         }
-        scenes.append({"name": look.name, "covered": float(look.mask.mean(dtype=np.float64)), **judged})
-        if len(rows) < most_rows:
-            rows.append(_row(look, judged, camera))
-    means = {
-        kind: {
-            region: {name: _mean([scene[kind][region][name] for scene in scenes]) for name in found}
-            for region, found in scenes[0][kind].items()
-        }
-        for kind in ("capture", "reconstruction")
+    return {name: srgb_from_linear(image) for name, image in found.items()} | {
+        "reconstruction": np.asarray(picture, np.float32)[0]
     }
-    return Found(means, scenes, rows)
-
-
-def _told(found: Scores) -> dict[str, dict[str, float | None]]:
-    """Scores of one scene for JSON; None where there is none."""
-    return {
-        region: {
-            name: float(values[0]) if np.isfinite(values[0]) else None
-            for name, values in of_region._asdict().items()
-            if values is not None
-        }
-        for region, of_region in found._asdict().items()
-    }
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
-
-
-def _row(look: Look, judged: Mapping[str, Any], camera: Camera) -> ValidationRow:
-    def decibels(kind: str) -> str:
-        full, hidden = (judged[kind][region]["psnr"] for region in ("full", "occluded"))
-        text = "?" if full is None else f"{full:.1f} dB"
-        return text if hidden is None else f"{text} ({hidden:.1f})"
-
-    label = f"{look.name}: {decibels('capture')} to {decibels('reconstruction')}"
-    capture, reconstruction, scene = (
-        shown_as(image, camera) for image in (look.capture, look.reconstruction, look.scene)
-    )
-    return ValidationRow(label, capture, reconstruction, scene)
 
 
 class PlateMaps(NamedTuple):
@@ -200,7 +157,7 @@ def write_results(
     depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
     bank = psf_bank(camera, maps.drawn_m, depths, propagation=spec.optics.propagation)
     write_bank(folder / BANK_NAME, bank, {"design": spec.name})
-    found = validate(trainer, state, held_out)
+    found = validate(trainer, state, held_out, baselines=True)
     write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
     write_network(folder / NETWORK_NAME, state.network, {**camera_facts(camera, near), **about})
     return names

@@ -5,40 +5,30 @@
         NAME_beside.png     the capture and the reconstruction side by side, on request
         manifest.json       for every file: capture, network, PSFs, depths, digests
 
-A model is a folder with a network and the PSFs of its plate: RUN/trained, or a released one. Its PSFs can be replaced
-by others, of the plate as fabricated or as measured, without training anew.
+The network and the PSFs of its plate are those of a model (`doedesign.recon.model`); other PSFs can be handed in.
 
 Files appear one by one, each whole. A later call adds to the folder and replaces what has the same name.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from doedesign.commands.psf import Say
 from doedesign.progress import meter
-from doedesign.recon.network import Network
-from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, write_reconstruction
+from doedesign.recon.model import Model, PsfChoice, Psfs, in_camera, open_model, psfs_of, released_model, shown
+from doedesign.recon.photos import PHOTO_FILES, WRITTEN_FILES, Photo, read_capture, write_reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles, reconstruct_tiled
-from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from doedesign.runs import alone_in
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
-from sim.formation import psf_at
 from sim.light import srgb_from_linear
-from sim.psf import PsfBank
-from sim.store import read_bank
 
 FORMAT = "doedesign reconstructions 1"
-
-_PITCH_TOLERANCE = 1e-3  # a ring of 500 pixels is then off by half a pixel
-_MEASURED = ("R", "G", "B")
-# Luminance of linear sRGB (IEC 61966-2-1).
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass(frozen=True)
@@ -46,11 +36,7 @@ class Request:
     """How to reconstruct.
 
     Attributes:
-        psf: PSFs other than the model's: one bank, or two files, of the scene and of the obstruction. A file of another
-            program (channels R, G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
-        pixel_m: pixel pitch of measured PSFs, metres.
-        near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
-        far_m: distance of the scene; the farthest of the bank if None.
+        psf: which PSFs the network is told of.
         tile: the most pixels of a tile's side.
         overlap: pixels that tiles share.
         linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
@@ -58,10 +44,7 @@ class Request:
         beside: draw captures and reconstructions side by side, too.
     """
 
-    psf: Sequence[Path] = ()
-    pixel_m: float | None = None
-    near_m: float | None = None
-    far_m: float | None = None
+    psf: PsfChoice = field(default_factory=PsfChoice)
     tile: int = TILE
     overlap: int = OVERLAP
     linear: bool | None = None
@@ -69,42 +52,16 @@ class Request:
     beside: bool = False
 
 
-class Model(NamedTuple):
-    """A trained network with its camera.
+def model_and_captures(paths: Sequence[Path]) -> tuple[Path, list[Path]]:
+    """Tell a model's folder from the captures after it; the released model if there are captures alone.
 
-    Attributes:
-        folder: where it was read from.
-        network: the network.
-        colours: names of its channels.
-        wavelengths_m: mean wavelength of each.
-        pixel_m: pixel pitch, metres.
-        near_m: depths of obstructions that it was trained on.
-        bank: PSFs of its plate.
-        digests: SHA-256 of its files.
+    Raises:
+        InputError: there is no released model.
     """
-
-    folder: Path
-    network: Network
-    colours: tuple[str, ...]
-    wavelengths_m: tuple[float, ...]
-    pixel_m: float
-    near_m: tuple[float, ...]
-    bank: PsfBank
-    digests: dict[str, str]
-
-    @property
-    def longest_first(self) -> list[int]:
-        """Channels by wavelength: what is shown as red, green and blue."""
-        return sorted(range(len(self.colours)), key=lambda c: -self.wavelengths_m[c])
-
-
-class Psfs(NamedTuple):
-    """What the network is told of the optics; `[c, y, x]`, and the depths in metres."""
-
-    far: Float[np.ndarray, "c ky kx"]
-    near: Float[np.ndarray, "c kv ku"]
-    far_m: float
-    near_m: float
+    first = paths[0]
+    if first.is_file() or (first.suffix.lower() in PHOTO_FILES and not first.is_dir()):
+        return released_model(), list(paths)
+    return first, list(paths[1:])
 
 
 def reconstruct(
@@ -136,7 +93,7 @@ def reconstruct(
     _require_own(folder, captures, names)
     model = open_model(model_folder)
     _require_tiles(request, model)
-    psfs = psfs_of(model, request)
+    psfs = psfs_of(model, request.psf)
     say(f"obstruction at {100 * psfs.near_m:.3g} cm, scene at {_told(psfs.far_m)}")
     written: list[Path] = []
     with alone_in(folder):
@@ -144,132 +101,13 @@ def reconstruct(
         _note(folder, {})
         for capture, name in zip(captures, names, strict=True):
             photo = read_capture(capture, request.linear)
-            light = _in_camera(photo, capture, model)
+            light = in_camera(photo, capture, model)
             display = _through(model, light, psfs, request, name)
-            files = _write(folder, name, photo, _shown(light, model), _shown(display, model), request.beside)
+            files = _write(folder, name, photo, shown(light, model), shown(display, model), request.beside)
             said = _said(capture, model, psfs, request)
             _note(folder, {each.name: {**said, "sha256": sha256_file(each)} for each in files})
             written += files
     return written
-
-
-def open_model(folder: Path) -> Model:
-    """Read a model.
-
-    Args:
-        folder: the folder with its files, or a run whose `trained` folder has them.
-
-    Raises:
-        InputError: files that are missing, broken, or do not belong together.
-    """
-    home = next((each for each in (folder / "trained", folder) if (each / NETWORK_NAME).is_file()), None)
-    if home is None:
-        cure = "Train one with doedesign train RUN --images DIR, or give the folder of a released model."
-        raise InputError(str(folder), f"must hold a trained network ({NETWORK_NAME})", "none", cure)
-    network, about = read_network(home / NETWORK_NAME)
-    where = home / NETWORK_NAME
-    try:
-        colours = tuple(str(name) for name in about["colours"])
-        waves, near = (tuple(float(value) for value in about[key]) for key in ("wavelengths_m", "near_m"))
-        pixel = float(about["pixel_m"])
-    except (KeyError, TypeError, ValueError) as error:
-        rule = "must say colours, wavelengths_m, pixel_m and near_m of its camera"
-        raise InputError(str(where), rule, f'"{error!r}"', "Write the network again with `camera_facts`.") from error
-    if not len(colours) == len(waves) == network.layout.colours or not near or min(near) <= 0 or not pixel > 0:
-        got = f"{len(colours)} names and {len(waves)} wavelengths for {network.layout.colours} channels"
-        raise InputError(str(where), "what it says of its camera must fit its layout", got, "Write it again.")
-    digests = {name: sha256_file(home / name) for name in (NETWORK_NAME, BANK_NAME)}
-    bare = Model(home, network, colours, waves, pixel, near, read_bank(home / BANK_NAME), digests)
-    return bare._replace(bank=_fitted(bare, bare.bank, home / BANK_NAME))
-
-
-def psfs_of(model: Model, request: Request) -> Psfs:
-    """PSFs of the scene and of the obstruction.
-
-    Raises:
-        InputError: files that cannot be used, or a depth beyond a bank's.
-    """
-    near_m = 2 / (1 / min(model.near_m) + 1 / max(model.near_m)) if request.near_m is None else request.near_m
-    far_m = request.far_m
-    if not request.psf:
-        far_m = max(model.bank.depths_m) if far_m is None else far_m
-        return _ordered(
-            Psfs(_at(model.bank, far_m, "--far-depth"), _at(model.bank, near_m, "--near-depth"), far_m, near_m)
-        )
-    if len(request.psf) > 2:
-        rule = "must be one bank, or one file of the scene and one of the obstruction"
-        raise InputError("--psf", rule, f"{len(request.psf)} files", "Give one or two.")
-    usual = max(model.bank.depths_m) if far_m is None else far_m
-    banks = [
-        _fitted(model, read_bank(path, request.pixel_m, depth), path, depth)
-        for path, depth in zip(request.psf, (usual, near_m), strict=False)
-    ]
-    if len(banks) == 1 and len(banks[0].depths_m) == 1:
-        rule = "PSFs of the scene and of the obstruction are needed"
-        raise InputError(str(request.psf[0]), rule, "one depth", "Give two files: --psf FAR --psf NEAR.")
-    far_m = max(banks[0].depths_m) if far_m is None else far_m
-    return _ordered(Psfs(_at(banks[0], far_m, "--far-depth"), _at(banks[-1], near_m, "--near-depth"), far_m, near_m))
-
-
-def _at(bank: PsfBank, depth_m: float, option: str) -> Float[np.ndarray, "c y x"]:
-    if not depth_m > 0:
-        raise InputError(option, "must be a positive distance", f"{depth_m:g} m", "Give metres, or inf.")
-    try:
-        return psf_at(bank, depth_m)
-    except InputError as error:
-        raise InputError(option, error.rule, error.got, error.cure) from error
-
-
-def _ordered(psfs: Psfs) -> Psfs:
-    if not psfs.near_m < psfs.far_m:
-        rule, got = "the obstruction must be nearer than the scene", f"{psfs.near_m:g} m before {psfs.far_m:g} m"
-        raise InputError("--near-depth", rule, got, "Exchange the two, or give --far-depth.")
-    return psfs
-
-
-def _fitted(model: Model, bank: PsfBank, path: Path, depth_m: float | None = None) -> PsfBank:
-    """A bank in the order of the model's colours; measured ones with the energy of the model's own PSF at `depth_m`."""
-    if abs(bank.pixel_m / model.pixel_m - 1) > _PITCH_TOLERANCE:
-        rule = f"PSFs must have the {1e6 * model.pixel_m:.5g} um pixels that the network was trained with"
-        cure = "Compute or bin them at that pitch, or train for this one."
-        raise InputError(str(path), rule, f"{1e6 * bank.pixel_m:.5g} um", cure)
-    if not all(side % 2 for side in bank.energy.shape[-2:]):
-        rule = "PSFs must have an odd window, with the chief ray on its middle pixel"
-        got = f"{bank.energy.shape[-1]} x {bank.energy.shape[-2]} pixels"
-        raise InputError(str(path), rule, got, "Compute them with an odd sensor.window, or cut them so.")
-    count = len(model.colours)
-    if set(bank.colours) == set(model.colours) and len(bank.colours) == count:
-        order = [bank.colours.index(name) for name in model.colours]
-        return PsfBank(bank.energy[order], model.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
-    measured = depth_m is not None and len(bank.depths_m) == 1
-    if not measured or len(bank.colours) != count or (count == 3 and bank.colours != _MEASURED):
-        rule = f"PSFs must have the colours of the network, {', '.join(model.colours)}"
-        got, cure = ", ".join(bank.colours), "Give PSFs of the camera that the network was trained for."
-        raise InputError(str(path), rule, got, cure)
-    assert depth_m is not None
-    own = _at(model.bank, depth_m, str(path)).sum(axis=(1, 2), dtype=np.float64)
-    energy = bank.energy[np.argsort(model.longest_first)]
-    total = energy.sum(axis=(1, 2, 3), dtype=np.float64)
-    if not (total > 0).all():
-        raise InputError(str(path), "a PSF must hold light", f"a sum of {total.min():.3g}", "Check its background.")
-    scaled = (energy * (own / total)[:, None, None, None]).astype(np.float32)
-    return PsfBank(scaled, model.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
-
-
-def _in_camera(photo: Photo, path: Path, model: Model) -> Float[np.ndarray, "c y x"]:
-    """A capture in the channels of the network."""
-    count, given = len(model.colours), len(photo.light)
-    if given == count:
-        return photo.light[np.argsort(model.longest_first)]
-    if count == 1:
-        return np.tensordot(_LUMINANCE, photo.light, 1)[None].astype(np.float32)
-    rule = f"a capture must have the {count} colours of the network"
-    raise InputError(str(path), rule, f"{given}", "Give a capture in colour, or a network trained on one colour.")
-
-
-def _shown(image: Float[np.ndarray, "c y x"], model: Model) -> Float[np.ndarray, "c y x"]:
-    """A picture of the network's channels in red, green and blue."""
-    return np.ascontiguousarray(image[model.longest_first])
 
 
 def _through(
@@ -365,7 +203,7 @@ def _said(capture: Path, model: Model, psfs: Psfs, request: Request) -> dict[str
         "capture": capture.name,
         "capture_sha256": sha256_file(capture),
         "model_sha256": model.digests,
-        "psf_sha256": {each.name: sha256_file(each) for each in request.psf},
+        "psf_sha256": {each.name: sha256_file(each) for each in request.psf.files},
         "near_m": psfs.near_m,
         "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
         "tile": request.tile,

@@ -20,9 +20,8 @@ history). SIGTERM and Ctrl-C end it after the step it is at, with a checkpoint.
 """
 
 import os
-import time
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,13 +33,12 @@ from doedesign.build import camera_of
 from doedesign.capture import obstruction_of, occlusion_of, plain_parameters
 from doedesign.commands.psf import Say
 from doedesign.images import Pictures, told_skips
-from doedesign.progress import meter
-from doedesign.recon.checkpoint import read_checkpoint, settled, write_checkpoint
+from doedesign.recon.checkpoint import settled, write_checkpoint
 from doedesign.recon.data import Batch, SceneData
 from doedesign.recon.heldout import SCENE_SEED, split_pictures
-from doedesign.recon.history import HISTORY_NAME, open_board, open_history, read_history, require_tensorboard
-from doedesign.recon.perceptual import Perceptual, read_lpips
-from doedesign.recon.similarity import MsSsim
+from doedesign.recon.history import HISTORY_NAME, read_history, require_tensorboard
+from doedesign.recon.hosts import gathered, join_hosts
+from doedesign.recon.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
 from doedesign.recon.train import State, Trainer, devices_mesh, layout_of, rates_at
 from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs import CHECKPOINT, Run, alone_in, open_run, spec_with
@@ -48,7 +46,7 @@ from doedesign.spec import Spec, spec_digest, spec_to_toml
 from doedesign.stopping import Stop, stoppable
 from doedesign.trained import HeldOut, heights_before, plate_at_rest, validate, write_results
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
 from sim.obstruction import Kind, View
 
 FORMAT = "doedesign training 1"
@@ -71,6 +69,9 @@ class Request:
         devices: number of devices; all if None.
         occlusion: occlusion model; that of the spec if None.
         obstruction: kind, or folder of masks; that of the spec if None.
+        coordinator: with several hosts, see `doedesign.recon.hosts.join_hosts`, like the next two.
+        hosts: their number.
+        host: number of this one.
     """
 
     images: Path | None = None
@@ -82,6 +83,9 @@ class Request:
     devices: int | None = None
     occlusion: str | None = None
     obstruction: str | None = None
+    coordinator: str | None = None
+    hosts: int | None = None
+    host: int | None = None
 
 
 class Work(NamedTuple):
@@ -109,6 +113,11 @@ class Work(NamedTuple):
         """SHA-256 of the settings."""
         return sha256_bytes(canonical_json(self.settings))
 
+    def claim(self) -> Claim:
+        """Whose a folder of this training is."""
+        others = "one with another run, spec, occlusion model, perceptual loss or other pictures"
+        return Claim(FORMAT, self.digest(), "training", others, ("spec.toml", "pictures.json"))
+
 
 def train(run_folder: Path, out: Path | None = None, request: Request | None = None, say: Say = lambda _: None) -> Path:
     """Train a run's network, or go on where an earlier call was stopped.
@@ -130,19 +139,30 @@ def train(run_folder: Path, out: Path | None = None, request: Request | None = N
     request = request or Request()
     if request.tensorboard:
         require_tensorboard()
+    if request.coordinator is not None and request.devices is not None:
+        rule = "must be left out with --coordinator: every host takes all that it has"
+        raise InputError("--devices", rule, request.devices, "Leave it out.")
+    join_hosts(request.coordinator, request.hosts, request.host)
     folder, leads = out or run_folder / "trained", jax.process_index() == 0
     with stoppable() as stop:
         work = _prepared(open_run(run_folder), request, say)
         with alone_in(folder) if leads else nullcontext():
-            if _is_done(folder, work.digest()):
+            # Host 0 looks, and clears away; the others hear of it.
+            if any(gathered(leads and is_done(folder, work.claim()))):
                 say(f"{folder} already holds this finished training")
                 return folder
             if leads:
                 _begin(folder, work, request)
-            state = _iterate(folder, work, _resumed(folder, work, say), request, stop, say)
+            start = settled(work.trainer.initial(heights_before(work.run, work.trainer)))
+            state = resumed(folder, start, work.digest(), say)
+            if len(set(found := gathered(state.step))) > 1:
+                rule, got = "every host must find the same checkpoint", f"those of steps {found}"
+                raise InputError(str(folder), rule, got, "Put the run where all hosts see it.")
+            state = _iterate(folder, work, state, request, stop, say)
             if leads:
                 say("judging the network and writing results")
                 _finish(folder, work, state)
+            gathered(0)  # nobody leaves before all is written
     if told := " ".join(filter(None, map(told_skips, (work.data.pictures, work.held_out.data.pictures)))):
         say(told)
     return folder
@@ -156,7 +176,7 @@ def _prepared(run: Run, request: Request, say: Say) -> Work:
     kind = obstruction_of(spec, source, request.obstruction)
     camera = camera_of(spec)
     view = View((options.size, options.size), camera.pixel_m, camera.sensor_distance_m)
-    lpips, perceptual = _perceptual(spec, source, request.lpips_weights, say)
+    lpips, perceptual = perceptual_of(options, options.size, f"{source}: train.size", request.lpips_weights, say)
     _require_possible(spec, source)
     split = split_pictures(request.images, request.validation, options.validation, options.seed)
     far = (min(spec.scene.far_m), max(spec.scene.far_m))
@@ -199,19 +219,6 @@ def _name(path: Path, folder: Path | None) -> str:
     return path.name if folder is None else path.relative_to(folder).as_posix()
 
 
-def _perceptual(spec: Spec, source: str, files: Sequence[Path], say: Say) -> tuple[Any, Perceptual | None]:
-    """LPIPS for scores, if its weights are at hand, and the distance of the loss."""
-    lpips = read_lpips(files) if files else None
-    if lpips is not None and spec.train.size < lpips.least_px:
-        rule = f"{lpips.name} needs pictures of at least {lpips.least_px} pixels"
-        raise InputError(f"{source}: train.size", rule, spec.train.size, "Enlarge it, or leave --lpips-weights out.")
-    if not spec.train.perceptual:
-        return lpips, None
-    if lpips is None:
-        say("warning: no --lpips-weights, so 1 - MS-SSIM stands in for the perceptual loss")
-    return lpips, lpips or MsSsim()
-
-
 def _require_possible(spec: Spec, source: str) -> None:
     """Refuse what the tables allow each for itself.
 
@@ -229,95 +236,44 @@ def _require_possible(spec: Spec, source: str) -> None:
         raise InputError(f"{source}: network", rule.replace("`", ""), got, "Change [network].") from error
 
 
-def _is_done(folder: Path, digest: str) -> bool:
-    """Whether the training is finished; clear away what a killed one was writing.
-
-    Raises:
-        InputError: the folder is that of something else, or a result was changed.
-    """
-    for path in (folder / "validation").glob(".*"):
-        path.unlink()
-    path = folder / MANIFEST_NAME
-    if not path.is_file():
-        if folder.is_dir() and any(not each.name.startswith(".") for each in folder.iterdir()):
-            rule = "a training needs a new or empty folder, or its own"
-            raise InputError(str(folder), rule, "other content", "Choose another --out.")
-        return False
-    found = read_json(path)
-    nothing_yet = {each.name for each in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml", "pictures.json"}
-    if found.get("format") == FORMAT and found.get("state") != "done" and nothing_yet:
-        return False  # there is nothing to lose, whatever it was
-    if found.get("format") != FORMAT or found.get("settings_sha256") != digest:
-        got = "one with another run, spec, occlusion model, perceptual loss or other pictures"
-        cure = "Choose another --out, or remove that folder."
-        raise InputError(str(folder), "the folder must belong to this training", got, cure)
-    if found["state"] != "done":
-        return False
-    for name, expected in found["results_sha256"].items():
-        if sha256_file(folder / name) != expected:
-            cure = f"Restore it, or remove {folder} and train again."
-            raise InputError(str(folder / name), "must be the file this training wrote", "a changed file", cure)
-    (folder / CHECKPOINT).unlink(missing_ok=True)  # it was killed just before
-    return True
-
-
-def _manifest(work: Work, state: str, **more: Any) -> bytes:
-    said = {"settings_sha256": work.digest(), "state": state, "version": __version__, "licence": work.names["licence"]}
-    return canonical_json({**work.settings, **said, **more})
+def _manifest(work: Work) -> dict[str, Any]:
+    said = {"settings_sha256": work.digest(), "state": "running", "version": __version__}
+    return {**work.settings, **said, "licence": work.names["licence"]}
 
 
 def _begin(folder: Path, work: Work, request: Request) -> None:
-    write_atomic(folder / MANIFEST_NAME, _manifest(work, "running"))
+    write_atomic(folder / MANIFEST_NAME, canonical_json(_manifest(work)))
     comments = ["every default filled in", *(f"--set {override}" for override in request.overrides)]
     write_atomic(folder / "spec.toml", spec_to_toml(work.run.spec, comments).encode())
     write_atomic(folder / "pictures.json", canonical_json(work.names))
 
 
-def _resumed(folder: Path, work: Work, say: Say) -> State:
-    """The state to go on from."""
-    start = settled(work.trainer.initial(heights_before(work.run, work.trainer)))
-    stored = read_checkpoint(folder / CHECKPOINT, start, work.digest())
-    if stored is None:
-        return start
-    state, step = stored
-    say(f"resuming after step {step}")
-    if (found := len(read_history(folder / HISTORY_NAME, step))) < step:
-        say(f"warning: {HISTORY_NAME} lacks {step - found} of the {step} steps before")
-    return state
-
-
 def _iterate(folder: Path, work: Work, state: State, request: Request, stop: Stop, say: Say) -> State:
     """Take the remaining steps."""
-    options, trainer, first, leads = work.run.spec.train, work.trainer, state.step, jax.process_index() == 0
-    if first == options.steps:
+    options, trainer = work.run.spec.train, work.trainer
+    if state.step == options.steps:
         return state
-    with ExitStack() as stack:
-        batches = stack.enter_context(work.data.batches(first, options.steps))
-        history = stack.enter_context(open_history(folder / HISTORY_NAME, first)) if leads else None
-        wants_board = request.tensorboard and leads
-        board = stack.enter_context(open_board(folder / "tensorboard", first)) if wants_board else None
-        progress = stack.enter_context(meter("training", options.steps, first))
-        stack.enter_context(stop.gently())
-        begun = time.monotonic()
-        for batch in batches:
-            rates = rates_at(options, state.step)
-            state, record = trainer.step(state, _part(batch))
-            line: dict[str, Any] = {**record._asdict(), "learning_rates": rates._asdict()}
-            if state.step % options.validate_every == 0 or state.step == options.steps:
-                line["validation"] = _look(folder, work, state)
-            now = time.monotonic()
-            line["seconds"], begun = round(now - begun, 4), now
-            for sink in filter(None, (history, board)):
-                sink.add(line)
-            progress.advance(state.step, f"loss {record.loss:.4f}")
-            stopping = stop.agreed()
-            if history and (stopping or state.step % options.checkpoint_every == 0 or state.step == options.steps):
-                history.sync()
-                write_checkpoint(folder / CHECKPOINT, state, state.step, work.digest())
-            if stopping:
-                say(f"stopped after step {state.step} of {options.steps}, with a checkpoint in {folder}")
-                raise KeyboardInterrupt
-    return state
+
+    def step(state: State, batch: Batch) -> tuple[State, dict[str, Any]]:
+        rates = rates_at(options, state.step)
+        state, record = trainer.step(state, _part(batch))
+        return state, {**record._asdict(), "learning_rates": rates._asdict()}
+
+    def save(state: State) -> None:
+        write_checkpoint(folder / CHECKPOINT, state, state.step, work.digest())
+
+    return take_steps(
+        folder,
+        state,
+        work.data.batches(state.step, options.steps),
+        Doings(step, lambda state: _look(folder, work, state), save),
+        Pace(options.steps, options.validate_every, options.checkpoint_every),
+        title="training",
+        stop=stop,
+        say=say,
+        leads=jax.process_index() == 0,
+        board=request.tensorboard,
+    )
 
 
 def _part(batch: Batch) -> Batch:
@@ -350,6 +306,4 @@ def _finish(folder: Path, work: Work, state: State) -> None:
         draw_training(folder / "curves.png", records, work.run.spec.name)
         names += ["curves.png", HISTORY_NAME]
     names += ["spec.toml", "pictures.json"]
-    digests = {name: sha256_file(folder / name) for name in sorted(names)}
-    write_atomic(folder / MANIFEST_NAME, _manifest(work, "done", results_sha256=digests))
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+    seal(folder, names, _manifest(work))

@@ -15,6 +15,7 @@ References:
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,7 +133,7 @@ def richardson_lucy(
     transpose = jax.linear_transpose(blur, seen)
     reached = jnp.maximum(transpose(jnp.ones_like(seen))[0], _DARK)
 
-    def step(_: int, light: Array) -> Array:
+    def step(_: Any, light: Array) -> Array:
         blurred = jnp.maximum(blur(light), _DARK)  # transforms round, and may leave the dark below 0
         better = light * jnp.maximum(transpose(seen / blurred)[0], 0.0) / reached
         off = jnp.mean((seen - blurred) ** 2, axis=(1, 2), keepdims=True)

@@ -6,9 +6,9 @@ same picture: hold out another film, in a folder of its own.) Their scenes are t
 seed of the training: one crop, one obstruction and one noise each.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -76,38 +76,35 @@ def _without(files: Sequence[Path], held_out: Sequence[Path]) -> tuple[Path, ...
 
 
 class Look(NamedTuple):
-    """One held-out scene as the camera and the network show it, display values in the camera's colours.
+    """One held-out scene, in the camera's colours and display values, 0 to 1.
 
     Attributes:
         name: name of the picture's file.
-        capture: `[c, y, x]` what the camera records.
-        reconstruction: what the network makes of it.
-        scene: what was to be seen.
+        shown: `[c, y, x]` pictures by name: "capture", "reconstruction", others.
+        scene: `[c, y, x]` what was to be seen.
         mask: `[y, x]` share of each direction that is blocked.
     """
 
     name: str
-    capture: Float[np.ndarray, "c y x"]
-    reconstruction: Float[np.ndarray, "c y x"]
+    shown: dict[str, Float[np.ndarray, "c y x"]]
     scene: Float[np.ndarray, "c y x"]
     mask: Float[np.ndarray, "y x"]
 
 
-Reconstruct = Callable[[Batch], tuple[Any, Any]]
+Show = Callable[[Batch], Mapping[str, Float[np.ndarray, "c y x"]]]
 
 
-def looks(data: SceneData, count: int, camera: Camera, reconstruct: Reconstruct) -> Iterator[Look]:
+def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[Look]:
     """Look at held-out scenes one by one.
 
     Args:
         data: held-out scenes, one to a batch.
         count: how many.
         camera: the camera, for its colours.
-        reconstruct: batch -> capture in linear light and reconstruction in display values, `[b, c, y, x]`.
+        show: batch -> pictures by name in display values.
     """
     with data.batches(stop=count) as batches:
         for batch in batches:
-            capture, reconstruction = (np.asarray(image, np.float32)[0] for image in reconstruct(batch))
+            shown = {name: np.clip(image, 0, 1) for name, image in show(batch).items()}
             scene = srgb_from_linear(seen_in(batch.background[0], camera))
-            shown = np.clip(srgb_from_linear(capture), 0, 1)
-            yield Look(batch.names[0], shown, np.clip(reconstruction, 0, 1), scene, batch.mask[0])
+            yield Look(batch.names[0], shown, scene, batch.mask[0])

@@ -2,8 +2,13 @@
 
 First stage: the capture and its Wiener estimate with the near PSF go down through `depth` halvings. At every scale the
 features are filtered with the inverse of the far PSF (`doedesign.recon.wiener`); the way up joins what it brings, the
-features and the filtered features. It ends in a correction that is added to the capture. Second stage: residual blocks
-that see the first stage's picture and the capture.
+features and the filtered features. The capture itself, freed of the far PSF's blur by one more such filter, still lies
+behind a veil and lacks the light that was kept off; by the form of eq. 10 both are undone by
+
+    light = (deblurred capture - veil) exp(gain),
+
+so veil and gain, which are smooth, are what the first stage ends in, with a correction of the picture for the rest.
+Second stage: residual blocks that see the first stage's picture and the capture.
 
 PSFs are inputs: simulated, as fabricated or measured ones are handed in at run time, and the same weights serve all of
 them.
@@ -12,8 +17,9 @@ Light is linear where blur is undone, and turns into display values (sRGB) where
 convolution by a PSF holds for light, an error of a picture is seen on a display.
 
 A block is a convolution, an instance normalisation without parameters, and a leaky ReLU. Normalised features no longer
-know how bright a place was, so the first scale goes without normalisation and so does the head; the public release's
-variant normalises there, too, and its second stage does not see the capture (`variant = "release"`).
+know how bright a place was, so the first scale goes without normalisation and so does the head. The public release's
+variant (`variant = "release"`) normalises there, too, adds nothing but a correction to the capture as it is, and its
+second stage does not see the capture.
 """
 
 from dataclasses import dataclass
@@ -36,6 +42,8 @@ _LEAK = 0.01
 _WIDTHS = (1, 2, 4, 8, 12)  # features of every scale over those of the first
 _REFINEMENTS = 3
 _LOG_REGULARISER = float(np.log(1e-2))
+_LOG_BASE_REGULARISER = float(np.log(1e-3))  # of a whole picture: about the noise of a sensor in daylight
+_MOST_GAIN = 3.5  # of the logarithm: no sensor shows more than a factor of thirty
 # Of the release, and not learnt there.
 _RELEASE_LOG_REGULARISER = float(np.log(1e-6))
 
@@ -175,16 +183,18 @@ class Network(eqx.Module):
 
     Attributes:
         near_log_regulariser: of the Wiener estimate with the near PSF; None without one.
+        far_log_regulariser: of that with the far PSF, from which the veil is taken; None for the capture as it is.
         down: scales, the finest first.
         bottom: blocks at the coarsest scale.
         up: ways up, the coarsest first.
-        head: blocks that end in the correction.
+        head: blocks that end in correction, veil and gain.
         residual: pairs of blocks of the second stage.
         last: its last block.
         layout: its shape.
     """
 
     near_log_regulariser: Float[Array, " c"] | None
+    far_log_regulariser: Float[Array, " c"] | None
     down: tuple[Scale, ...]
     bottom: tuple[Block, ...]
     up: tuple[Rise, ...]
@@ -231,7 +241,7 @@ class Network(eqx.Module):
         middle = c if release else layout.width
         head = (
             Block.make(rng, layout.width, middle, normal=release),
-            Block.make(rng, middle, c, 5, normal=False, act=False, gain=1e-2),
+            Block.make(rng, middle, c if release else 3 * c, 5, normal=False, act=False, gain=1e-2),
         )
         seen = c if release else 2 * c
         residual = tuple(
@@ -243,13 +253,14 @@ class Network(eqx.Module):
         )
         last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=1e-2) if layout.refine else None
         near = jnp.full(c, log_regulariser, jnp.float32) if layout.near_estimate else None
-        return cls(near, down, bottom, up, head, residual, last, layout)
+        far = jnp.full(c, _LOG_BASE_REGULARISER, jnp.float32) if layout.wiener and not release else None
+        return cls(near, far, down, bottom, up, head, residual, last, layout)
 
     def __call__(
         self,
         capture: Float[Array, "b c y x"],
         far: Float[Array, "b c ky kx"],
-        near: Float[Array, "b c ky kx"],
+        near: Float[Array, "b c kv ku"],
         *,
         half: bool = False,
         checkpointed: bool = False,
@@ -295,7 +306,13 @@ class Network(eqx.Module):
             image = keep(lambda r, i, b: r(i, b, half))(rise, image, skips.pop())
         for block in self.head:
             image = block(image, half)
-        picture = display + jnp.tanh(image)
+        if layout.variant == "release":
+            picture = display + jnp.tanh(image)
+        else:
+            correction, veil, gain = jnp.split(image, 3, axis=-1)
+            if self.far_log_regulariser is not None:
+                light = deblurred(light, blur_at(far, (capture.shape[2], capture.shape[3])), self.far_log_regulariser)
+            picture = srgb_from_linear((light - veil) * jnp.exp(_MOST_GAIN * jnp.tanh(gain))) + jnp.tanh(correction)
         if self.last is not None:
             picture = self._refined(picture, display, half)
         return picture.transpose(0, 3, 1, 2)

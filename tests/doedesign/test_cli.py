@@ -15,7 +15,7 @@ from doedesign.cli import exit_code, main
 from fab.errors import CheckFailed, InputError
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("optimize", "masks", "verify", "psf")
+COMMANDS = ("optimize", "masks", "verify", "psf", "train", "finetune", "reconstruct")
 HEAVY = ("jax", "numba", "numpy", "matplotlib", "klayout", "gdstk", "pint", "OpenEXR")
 
 
@@ -52,6 +52,8 @@ def test_version(capsys: pytest.CaptureFixture[str]):
         (["verify", "order", "another"], "another"),
         (["psf", "run", "--field-deg", "1"], "--field-deg"),
         (["optimize", "spec.toml", "--set"], "--set"),
+        (["finetune", "run"], "--pairs"),
+        (["reconstruct"], "RUN"),
     ],
 )
 def test_usage_mistakes(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]):

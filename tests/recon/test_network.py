@@ -28,7 +28,7 @@ def capture(side: int = 16) -> jax.Array:
 def by_hand(layout: Layout) -> int:
     """Parameters counted from the layers as they are described."""
     w, c = layout.widths, layout.colours
-    total = c  # regulariser of the estimate with the near PSF
+    total = 2 * c  # regularisers of the estimates with both PSFs
     inputs = 2 * c
     for level, wide in enumerate(w):
         first, more = (49, 1) if level == 0 else (9, 2)
@@ -37,13 +37,13 @@ def by_hand(layout: Layout) -> int:
         inputs = wide
     total += 9 * 2 * w[-1] * 2 * w[-1] + 9 * 2 * w[-1] * w[-1]
     total += sum(4 * w[k + 1] * w[k] + 9 * 3 * w[k] * w[k] for k in range(layout.depth))
-    total += 9 * w[0] * w[0] + w[0] + 25 * w[0] * c + c
+    total += 9 * w[0] * w[0] + w[0] + 25 * w[0] * 3 * c + 3 * c  # correction, veil and gain
     return total + 6 * 9 * (2 * c) ** 2 + 25 * 2 * c * c + c
 
 
 def test_the_paper_size_has_two_point_three_million_parameters() -> None:
     network = Network.make(Layout(), 0)
-    assert count_parameters(network) == by_hand(Layout()) == 2_309_319
+    assert count_parameters(network) == by_hand(Layout()) == 2_311_128
     # The public release's layers, 2 307 399 numbers with 1 677 biases that a normalisation takes away again and without
     # the 231 regularisers that are learnt here (324 and 3).
     release = Network.make(Layout(variant="release"), 0)
@@ -64,11 +64,13 @@ def test_every_block_can_be_left_out(change: dict[str, object]) -> None:
     assert (count_parameters(network) < whole) == bool(change)
 
 
-def test_a_fresh_network_hands_the_capture_through() -> None:
+def test_a_fresh_network_hands_the_deblurred_capture_through() -> None:
     network = Network.make(Layout(**SMALL), 1)
-    found = CALL(network, capture(), psfs(), psfs())
-    # Its last layers begin with a hundredth of the usual weights.
-    assert float(jnp.sqrt(jnp.mean((found - srgb_from_linear(capture())) ** 2))) < 0.05
+    point = jnp.zeros((1, 3, 9, 9)).at[..., 4, 4].set(1.0)
+    found = CALL(network, capture(), point, point)
+    # Behind a lens that blurs nothing that is the capture, less a thousandth for noise. The last layers begin with a
+    # hundredth of the usual weights, and a gain with 3.5 times that.
+    assert float(jnp.sqrt(jnp.mean((found - srgb_from_linear(capture())) ** 2))) < 0.1
 
 
 def test_both_psfs_matter() -> None:
@@ -78,7 +80,7 @@ def test_both_psfs_matter() -> None:
     assert float(jnp.abs(CALL(network, capture(), wide, psfs()) - before).max()) > 1e-4
     assert float(jnp.abs(CALL(network, capture(), psfs(), wide) - before).max()) > 1e-4
     # The far PSF is brought to unit sum, the near one is not: its estimate is a picture.
-    np.testing.assert_allclose(CALL(network, capture(), 2 * psfs(), psfs()), before, atol=1e-5)
+    np.testing.assert_allclose(CALL(network, capture(), 2 * psfs(), psfs()), before, atol=1e-4)
 
 
 def test_items_of_a_batch_do_not_mix() -> None:
@@ -103,8 +105,9 @@ def test_checkpointing_changes_memory_and_no_number() -> None:
 def test_half_precision_stays_close() -> None:
     network = Network.make(Layout(**SMALL), 1)
     whole, half = (CALL(network, capture(), psfs(), psfs(), half=flag) for flag in (False, True))
-    # Corrections are a few hundredths of the picture, and bfloat16 holds them to a hundredth.
-    assert 0 < float(jnp.abs(whole - half).max()) < 5e-3
+    # Correction, veil and gain begin at a few hundredths, and bfloat16 holds them to a hundredth; what the filter makes of
+    # this noise reaches up to some ten times white.
+    assert 0 < float(jnp.mean(jnp.abs(whole - half))) < 1e-2 * float(jnp.mean(jnp.abs(whole)))
 
 
 def test_normalisation() -> None:

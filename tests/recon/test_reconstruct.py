@@ -1,5 +1,6 @@
 """`doedesign reconstruct`: what it takes, what it leaves behind, and what it refuses."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -7,7 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.commands.reconstruct import FORMAT, Request, open_model, psfs_of, reconstruct
+import doedesign
+from doedesign.cli import main
+from doedesign.commands.reconstruct import FORMAT, Request, reconstruct
+from doedesign.recon.model import PsfChoice, open_model, psfs_of
 from doedesign.recon.network import Layout
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import camera_facts, read_network, write_network
@@ -80,7 +84,7 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
 
 def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
     out = tmp_path / "out"
-    reconstruct(run, [capture], out, Request(near_m=0.07, kind=".png", beside=True))
+    reconstruct(run, [capture], out, Request(PsfChoice(near_m=0.07), kind=".png", beside=True))
     manifest = read_json(out / "manifest.json")
     assert manifest["format"] == FORMAT
     assert set(manifest["results"]) == {"capture.png", "capture_beside.png"}
@@ -134,7 +138,7 @@ def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
     shutil.copy(model / "psf.exr", tmp_path / "same.exr")
     pictures = []
     for k, psf in enumerate(((), (tmp_path / "same.exr",), (tmp_path / "sharp.exr",))):
-        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", Request(psf=psf))
+        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", Request(PsfChoice(psf)))
         pictures.append(read_picture(path)[0]["G"])
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert np.abs(pictures[2] - pictures[0]).max() > 1e-3
@@ -142,13 +146,13 @@ def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
 
 def test_depths_are_the_middle_of_the_near_ones_and_the_farthest(run: Path):
     model = open_model(run)
-    psfs = psfs_of(model, Request())
+    psfs = psfs_of(model, PsfChoice())
     assert psfs.near_m == pytest.approx(2 / (1 / 0.05 + 1 / 0.12))
     assert psfs.far_m == np.inf
     np.testing.assert_array_equal(psfs.far, model.bank.energy[:, 3])
     # Half way in 1/z between the bank's two near depths is half of each.
     np.testing.assert_allclose(psfs.near, model.bank.energy[:, :2].mean(axis=1), rtol=1e-5)
-    chosen = psfs_of(model, Request(near_m=0.05, far_m=5.0))
+    chosen = psfs_of(model, PsfChoice(near_m=0.05, far_m=5.0))
     np.testing.assert_array_equal(chosen.near, model.bank.energy[:, 0])
     np.testing.assert_array_equal(chosen.far, model.bank.energy[:, 2])
 
@@ -157,7 +161,7 @@ def test_a_bank_in_another_order_is_put_in_order(tmp_path: Path, run: Path):
     model, own = open_model(run), bank()
     turned = PsfBank(own.energy[[2, 0, 1]], (COLOURS[2], COLOURS[0], COLOURS[1]), own.depths_m, PIXEL * 1.0005)
     write_bank(tmp_path / "turned.exr", turned)
-    found, usual = psfs_of(model, Request(psf=(tmp_path / "turned.exr",))), psfs_of(model, Request())
+    found, usual = psfs_of(model, PsfChoice([tmp_path / "turned.exr"])), psfs_of(model, PsfChoice())
     np.testing.assert_array_equal(found.far, usual.far)
     np.testing.assert_array_equal(found.near, usual.near)
 
@@ -172,9 +176,11 @@ def measured(path: Path, window: int = 9, seed: int = 5) -> np.ndarray:
 def test_measured_psfs_take_the_energy_of_the_models(tmp_path: Path, run: Path):
     far, near = measured(tmp_path / "far.exr"), measured(tmp_path / "near.exr", 11, 6)
     model = open_model(run)
-    request = Request(psf=(tmp_path / "far.exr", tmp_path / "near.exr"), pixel_m=PIXEL)
-    found, own = psfs_of(model, request), psfs_of(model, Request())
-    for psf, usual, counts in ((found.far, own.far, far), (found.near, own.near, near)):
+    choice = PsfChoice([tmp_path / "far.exr", tmp_path / "near.exr"], PIXEL)
+    found, own = psfs_of(model, choice), psfs_of(model, PsfChoice())
+    np.testing.assert_array_equal(found.bank.energy, np.stack([found.near, found.far], axis=1))
+    # The smaller one stands in the middle of the larger one's window.
+    for psf, usual, counts in ((found.far[:, 1:-1, 1:-1], own.far, far), (found.near, own.near, near)):
         np.testing.assert_allclose(psf.sum(axis=(1, 2)), usual.sum(axis=(1, 2)), rtol=1e-5)
         # Blue is the model's first channel.
         np.testing.assert_allclose(psf / psf[:, :1, :1], counts[::-1] / counts[::-1][:, :1, :1], rtol=1e-5)
@@ -218,7 +224,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
     write_picture(tmp_path / "nan.exr", {c: nan for c in "RGB"})
 
     def psf(*names: str, **more) -> dict:
-        return {"request": Request(psf=[tmp_path / name for name in names], **more)}
+        return {"request": Request(PsfChoice([tmp_path / name for name in names], **more))}
 
     return {
         "pitch": (r"must have the 3\.7 um pixels .* but got 1\.85 um\. Compute or bin", psf("pitch.exr")),
@@ -227,7 +233,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
             psf("colours.exr"),
         ),
         "count": ("the colours of the network, 486nm, 589nm, 656nm, but got 589nm", psf("one.exr")),
-        "even": ("must have an odd window", psf("even.exr")),
+        "even": (r"must have an odd window.*8 x 8 pixels.*odd sensor\.window, such as 9", psf("even.exr")),
         "depths": ("--near-depth: must lie within the depths of the PSF bank, 0.3 to inf m", psf("depths.exr")),
         "foreign": ("pixel pitch of a PSF from another program must be given", psf("far.exr", "far.exr")),
         "single": ("are needed, but got one depth", psf("far.exr", pixel_m=PIXEL)),
@@ -235,10 +241,10 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
         "dark": ("a PSF must hold light", psf("dark.exr", "dark.exr", pixel_m=PIXEL)),
         "three": ("must be one bank, or one file of the scene", psf("far.exr", "far.exr", "far.exr")),
         "no psf": ("must exist", psf("none.exr")),
-        "near beyond": ("--near-depth: must lie within", {"request": Request(near_m=0.01)}),
-        "negative": ("--near-depth: must be a positive distance", {"request": Request(near_m=-0.1)}),
-        "nan depth": ("--far-depth: must be a positive distance", {"request": Request(far_m=np.nan)}),
-        "order": ("the obstruction must be nearer", {"request": Request(near_m=6.0, far_m=5.0)}),
+        "near beyond": ("--near-depth: must lie within", {"request": Request(PsfChoice(near_m=0.01))}),
+        "negative": ("--near-depth: must be a positive distance", {"request": Request(PsfChoice(near_m=-0.1))}),
+        "nan depth": ("--far-depth: must be a positive distance", {"request": Request(PsfChoice(far_m=np.nan))}),
+        "order": ("the obstruction must be nearer", {"request": Request(PsfChoice(near_m=6.0, far_m=5.0))}),
         "tile": ("--tile, --overlap: overlap must be at most half", {"request": Request(tile=64, overlap=48)}),
         "kind": ("--kind: must be one of", {"request": Request(kind=".jpg")}),
         "grey": ("a capture must have the 3 colours of the network, but got 1", {"captures": [tmp_path / "grey.exr"]}),
@@ -306,3 +312,38 @@ def test_half_precision_serves_as_well(tmp_path: Path, capture: Path):
     one, other = (srgb_from_linear(read_capture(path).light) for path in (before, after))
     # Weights off by 2^-12 of themselves at most; corrections are of order 1 and so are sums of a few of them.
     assert 0 < np.abs(one - other).max() < 5e-3
+
+
+def test_captures_alone_go_through_the_released_model(
+    tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(doedesign, "__file__", str(tmp_path / "elsewhere" / "doedesign" / "__init__.py"))
+    assert main(["reconstruct", str(capture)]) == 2
+    assert "Give a model before the captures" in capsys.readouterr().err
+    released = tmp_path / "elsewhere" / "masks" / "released"
+    model_in(released)
+    arguments = ["reconstruct", str(capture), "--near-depth", "7 cm", "--far-depth", "inf", "--kind", "png", "--beside"]
+    assert main(arguments) == 0
+    names = ["reconstructed/capture.png", "reconstructed/capture_beside.png"]
+    assert capsys.readouterr().out.split() == names
+    manifest = read_json(tmp_path / "reconstructed" / "manifest.json")
+    said = manifest["results"]["capture.png"]
+    assert (said["near_m"], said["far_m"]) == (0.07, None)
+    assert said["model_sha256"]["network.npz"] == sha256_file(released / "network.npz")
+
+
+def test_the_command_line(tmp_path: Path, run: Path, capture: Path, capsys: pytest.CaptureFixture[str]):
+    """A model and captures, PSFs one by one, and what cannot be read as a length."""
+    for name, window, seed in (("far", 9, 5), ("near", 11, 6)):
+        measured(tmp_path / f"{name}.exr", window, seed)
+    psf = [word for name in ("far", "near") for word in ("--psf", str(tmp_path / f"{name}.exr"))]
+    arguments = ["reconstruct", *psf, "--pixel", "3.7 um", str(run), str(capture), "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"paths": [str(tmp_path / "out" / "capture.exr")]}
+    assert len(read_json(tmp_path / "out" / "manifest.json")["results"]["capture.exr"]["psf_sha256"]) == 2
+    for words, where in ((["--far-depth", "far"], "--far-depth"), (["--pixel", "-1 um"], "--pixel"), ([], "CAPTURE")):
+        paths = [str(run), str(capture)] if words else [str(run)]
+        assert main(["reconstruct", *paths, *words, "--out", str(tmp_path / "other")]) == 2
+        assert where in capsys.readouterr().err
+        assert not (tmp_path / "other").exists()
