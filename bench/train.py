@@ -40,6 +40,7 @@ from bench.capture import make_psf, verdict
 from bench.psf import high_water_mb
 from doedesign.capture import obstruction_of, occlusion_of
 from doedesign.recon.backbones import convolutions, weight_shapes
+from doedesign.recon.checkpoint import settled
 from doedesign.recon.conv import convolution
 from doedesign.recon.data import Batch
 from doedesign.recon.network import Layout, Network
@@ -71,8 +72,8 @@ def make_training(spec: Spec) -> tuple[Trainer, State, Batch]:
     size = spec.train.size
     background, radiance = (rng.random((1, 3, size, size), np.float32) for _ in range(2))
     mask = np.kron(rng.random((1, 8, 8)) > 0.8, np.ones((1, size // 8, size // 8))).astype(np.float32)
-    depths = (np.full(1, depth, np.float32) for depth in (0.08, 5.0))
-    return trainer, trainer.initial(height), Batch(background, mask, radiance, *depths, ("",), 0)
+    near, far = (np.full(1, depth, np.float32) for depth in (0.08, 5.0))
+    return trainer, settled(trainer.initial(height)), Batch(background, mask, radiance, near, far, ("",), 0)
 
 
 def stepping(spec: Spec) -> Call:

@@ -96,10 +96,8 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None) -> 
     for what, image in (("plain", plain), ("plate", plate), ("network", found)):
         judged = scores(image[None], clean[None], item.mask[None])
         psnr[what] = (float(judged.occluded.psnr[0]), float(judged.full.psnr[0]))
-    told = (
-        f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(item.depth_m, 4))}, occlusion model {name}. "
-        f"PSNR where it is covered, in brackets over all."
-    )
+    told = f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(item.depth_m, 4))}, "
+    told += f"occlusion model {name}. PSNR where it is covered, in brackets over all."
     pictures = {"scene": clean, "plain": plain, "plate": plate, "network": found, "far": psfs[0], "near": psfs[1]}
     shown = {name: shown_as(image, camera) for name, image in pictures.items()}
     return Chain(mask=item.mask, near_m=item.depth_m, psnr=psnr, words=told, **shown)

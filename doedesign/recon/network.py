@@ -44,6 +44,9 @@ _REFINEMENTS = 3
 _LOG_REGULARISER = float(np.log(1e-2))
 _LOG_BASE_REGULARISER = float(np.log(1e-3))  # of a whole picture: about the noise of a sensor in daylight
 _MOST_GAIN = 3.5  # of the logarithm: no sensor shows more than a factor of thirty
+# Of what leaves a stage: its last weights begin small, and as Adam moves every weight by as much whatever its slope,
+# what hundreds of them add up to has to be made small once more, or the first steps overshoot.
+_QUIET = 0.1
 # Of the release, and not learnt there.
 _RELEASE_LOG_REGULARISER = float(np.log(1e-6))
 
@@ -241,7 +244,7 @@ class Network(eqx.Module):
         middle = c if release else layout.width
         head = (
             Block.make(rng, layout.width, middle, normal=release),
-            Block.make(rng, middle, c if release else 3 * c, 5, normal=False, act=False, gain=1e-2),
+            Block.make(rng, middle, c if release else 3 * c, 5, normal=False, act=False, gain=_QUIET),
         )
         seen = c if release else 2 * c
         residual = tuple(
@@ -251,7 +254,7 @@ class Network(eqx.Module):
             )
             for _ in range(_REFINEMENTS if layout.refine else 0)
         )
-        last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=1e-2) if layout.refine else None
+        last = Block.make(rng, seen, c, 5, normal=False, act=False, gain=_QUIET) if layout.refine else None
         near = jnp.full(c, log_regulariser, jnp.float32) if layout.near_estimate else None
         far = jnp.full(c, _LOG_BASE_REGULARISER, jnp.float32) if layout.wiener and not release else None
         return cls(near, far, down, bottom, up, head, residual, last, layout)
@@ -306,6 +309,7 @@ class Network(eqx.Module):
             image = keep(lambda r, i, b: r(i, b, half))(rise, image, skips.pop())
         for block in self.head:
             image = block(image, half)
+        image = _QUIET * image
         if layout.variant == "release":
             picture = display + jnp.tanh(image)
         else:
@@ -324,7 +328,7 @@ class Network(eqx.Module):
         for first, second in self.residual:
             seen = jax.nn.leaky_relu(seen + second(first(seen, half), half), _LEAK)
         assert self.last is not None  # only then is there a second stage
-        found = picture + self.last(seen, half)
+        found = picture + _QUIET * self.last(seen, half)
         return jax.nn.relu(found) if release else found
 
 
