@@ -131,14 +131,34 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
     Raises:
         InputError: objectives that cannot be read, or a direct path that eq. 6 forbids.
     """
+    problem = plans_of(spec, files)
+    camera, radial = problem.camera, problem.radial
+    wavelengths = [wavelength for colour in camera.colours for wavelength in colour.wavelengths_m]
+    near, far = (
+        tuple(_sources(camera, depths, wavelength, radial) for wavelength in wavelengths)
+        for depths in (spec.scene.near_m, spec.scene.far_m)
+    )
+    lens = lens_participation(camera, spec.scene.near_m)
+    return problem, Scene(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
+
+
+def _is_sparse(spec: Spec) -> bool:
+    """Whether a step takes one sample of intensity per lambda d / D."""
+    optimize = spec.optimize
+    transformed = optimize.parametrization != "radial" and spec.optics.propagation != "fresnel"
+    return optimize.sampling == "sparse" and transformed
+
+
+def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
+    """Prepare plans and objectives alone, for those who bring sources of their own; see `problem_of`."""
     camera, process = camera_of(spec), spec.process
     # Depths that are to be chosen begin at 2^k steps.
     levels = levels_of(process, Levels(process.levels, process.level_step_m))
     radial = spec.optimize.parametrization == "radial"
     direct = spec.optics.propagation == "fresnel"
-    sparse = spec.optimize.sampling == "sparse" and not radial and not direct
+    sparse = _is_sparse(spec)
     terms = terms_of(spec, camera, files)
-    lines, near, far = [], [], []
+    lines = []
     for index, colour in enumerate(camera.colours):
         for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
             if radial:
@@ -149,17 +169,13 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
                 plan = plan_far_field(camera, wavelength, sampling=1.0 if sparse else None)
             rate = jnp.float32(camera.waves_per_metre(wavelength))
             lines.append(Line(plan, rate, weight * camera.transmission(wavelength), index))
-            near.append(_sources(camera, spec.scene.near_m, wavelength, radial))
-            far.append(_sources(camera, spec.scene.far_m, wavelength, radial))
-    problem = Problem(
+    return Problem(
         camera=camera,
         staircase=Staircase.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=terms,
         lines=tuple(lines),
         coverage=None if radial else jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)),
     )
-    lens = lens_participation(camera, spec.scene.near_m)
-    return problem, Scene(tuple(near), tuple(far), lens, camera.pixel_m / 2 if sparse else 0.0)
 
 
 def _sources(camera: Camera, depths_m: tuple[float, ...], wavelength_m: float, radial: bool) -> tuple[Array, ...]:

@@ -73,7 +73,7 @@ def noise_to_signal(capture: Float[np.ndarray, "c y x"], variance: Float[np.ndar
 def wiener(
     capture: Float[Array, "c y x"] | Float[np.ndarray, "c y x"],
     psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
-    noise_to_signal: Float[Array, " c"] | Float[np.ndarray, " c"] | float,
+    noise_to_signal: Float[Array, "*c"] | Float[np.ndarray, "*c"] | float,
 ) -> Float[Array, "c y x"]:
     """Wiener filter conj(H) / (|H|² + N/S).
 
@@ -102,7 +102,7 @@ def richardson_lucy(
     capture: Float[Array, "c y x"] | Float[np.ndarray, "c y x"],
     psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
     iterations: int = ITERATIONS,
-    noise_variance: Float[Array, " c"] | Float[np.ndarray, " c"] | float = 0.0,
+    noise_variance: Float[Array, "*c"] | Float[np.ndarray, "*c"] | float = 0.0,
 ) -> Float[Array, "c y x"]:
     """Richardson-Lucy iteration u ← u · Aᵀ(capture / A u) / Aᵀ1 (Richardson 1972, Lucy 1974).
 

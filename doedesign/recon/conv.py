@@ -5,6 +5,8 @@ Two of its habits cost up to ten times, with the same arithmetic. A convolution 
 again, does not. And the gradient by the weights is one convolution whose kernel is the whole image: for large images
 the matrix that the library gathers for it leaves the cache, unless it is taken in bands of rows. Other devices are
 given the plain form.
+
+The gradient of a mirrored margin is written out, too, which saves a tenth of a network's step.
 """
 
 from functools import partial
@@ -19,11 +21,37 @@ _DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 _BAND, _LEAST_ROWS = 16, 128
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(1,))
 def mirrored(image: Float[Array, "b y x c"], margin: int) -> Float[Array, "b v u c"]:
     """Extend an image by `margin` pixels on every side, mirrored at the middle of its outermost pixels."""
     if margin == 0:
         return image
     return jnp.pad(image, ((0, 0), (margin, margin), (margin, margin), (0, 0)), mode="reflect")
+
+
+def _mirrored_forward(image: Array, margin: int) -> tuple[Array, None]:
+    return mirrored(image, margin), None
+
+
+def _mirrored_backward(margin: int, _: None, slope: Array) -> tuple[Array]:
+    """Fold the margins back: what jax derives adds whole images up, of which all but the margins is zero."""
+    return (slope if margin == 0 else _folded(_folded(slope, margin, 2), margin, 1),)
+
+
+def _folded(slope: Array, margin: int, axis: int) -> Array:
+    length = slope.shape[axis] - 2 * margin
+
+    def part(start: int, count: int) -> Array:
+        return jax.lax.slice_in_dim(slope, start, start + count, axis=axis)
+
+    def at(start: int) -> tuple[slice, ...]:
+        return (*(slice(None) for _ in range(axis)), slice(start, start + margin))
+
+    inner = part(margin, length).at[at(1)].add(jnp.flip(part(0, margin), axis))
+    return inner.at[at(length - 1 - margin)].add(jnp.flip(part(margin + length, margin), axis))
+
+
+mirrored.defvjp(_mirrored_forward, _mirrored_backward)
 
 
 def convolution(

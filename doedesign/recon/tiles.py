@@ -85,7 +85,7 @@ def reconstruct_tiled(
     network: Reconstructs,
     capture: Float[np.ndarray, "c y x"],
     far: Float[np.ndarray, "c ky kx"],
-    near: Float[np.ndarray, "c ky kx"],
+    near: Float[np.ndarray, "c kv ku"],
     *,
     tile: int = TILE,
     overlap: int = OVERLAP,

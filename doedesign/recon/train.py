@@ -26,9 +26,10 @@ from doedesign.build import camera_of, process_of
 from doedesign.capture import outside_of, seen_in, sensor_of
 from doedesign.optimize import Free
 from doedesign.parametrize import softness_at
-from doedesign.problem import compiler_options, problem_of
+from doedesign.problem import compiler_options, plans_of
 from doedesign.recon.chain import Bench, LivePlate, Plate, RingPlate, Seen, Shot, StoredPlate, shots
 from doedesign.recon.data import Batch
+from doedesign.recon.hosts import on_all, own_copy, parts_of
 from doedesign.recon.loss import TERMS, Weights, losses
 from doedesign.recon.network import Layout, Network
 from doedesign.simulated import depth_range_m, shadow_window
@@ -157,6 +158,7 @@ class Trainer(eqx.Module):
         bench = Bench(camera, model, outside_of(kind), sensor, shadow_window(kind, camera))
         weights = Weights(train.l1, train.perceptual, train.masked)
         process = process_of(spec.process) if train.fabricated else None
+        plate = plate if mesh is None else on_all(plate, mesh)
         return cls(plate, perceptual, bench, weights, process, spec, mesh)
 
     def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> State:
@@ -171,10 +173,13 @@ class Trainer(eqx.Module):
             network = Network.make(layout, self.spec.train.seed)
         adam = optax.scale_by_adam()
         moments = adam.init(eqx.filter(network, eqx.is_inexact_array))
-        if isinstance(self.plate, StoredPlate):
-            return State(0, network, None, moments, None)
-        free = jnp.asarray(self.plate.staircase.radians_of(height_m))
-        return State(0, network, free, moments, adam.init(free) if self.spec.train.moves_optics else None)
+        free, optics_moments = None, None
+        if not isinstance(self.plate, StoredPlate):
+            free = jnp.asarray(self.plate.staircase.radians_of(height_m))
+            optics_moments = adam.init(free) if self.spec.train.moves_optics else None
+        state = State(0, network, free, moments, optics_moments)
+        # Where the step will leave it: otherwise the second step would be compiled anew.
+        return state if self.mesh is None else on_all(state, self.mesh)
 
     def step(self, state: State, batch: Batch) -> tuple[State, Record]:
         """Take one step.
@@ -189,7 +194,9 @@ class Trainer(eqx.Module):
         train = self.spec.train
         rates = rates_at(train, state.step)
         trainer = self._with_errors(state, batch.step)
-        seen, keys = self._seen(batch, train.seed, train.field == "random")
+        seen, keys = self._seen(batch, train.seed, train.field == "random", part=self.mesh is not None)
+        if self.mesh is not None:
+            seen, keys = parts_of((seen, keys), self.mesh)
         softness = jnp.float32(softness_at(self.spec.optimize.quantisation, state.step, train.steps))
         learnt = (state.network, state.free)
         moves = (rates.network > 0, rates.optics > 0)
@@ -209,14 +216,17 @@ class Trainer(eqx.Module):
             the captures, and the pictures `[b, c, y, x]` in display values.
         """
         seen, keys = self._seen(batch, _SALT_LOOK, False)
-        return _look(state.network, state.free, self, seen, keys)
+        network, free, trainer = state.network, state.free, self
+        if self.mesh is not None:
+            network, free, trainer = own_copy((network, free, trainer))
+        return _look(network, free, trainer, seen, keys)
 
-    def _seen(self, batch: Batch, seed: int, off_axis: bool) -> tuple[Seen, Key[Array, " b"]]:
-        """A batch as the compiled step takes it, with a key of noise for every scene."""
+    def _seen(self, batch: Batch, seed: int, off_axis: bool, *, part: bool = False) -> tuple[Seen, Key[Array, " b"]]:
+        """A batch, or this host's part of one, as the compiled step takes it, with a key of noise for every scene."""
         camera, count = self.bench.camera, len(batch.names)
         # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
-        hosts = jax.process_count() if self.mesh is not None else 1
-        first = batch.step * count * hosts + (jax.process_index() * count if hosts > 1 else 0)
+        hosts, host = (jax.process_count(), jax.process_index()) if part else (1, 0)
+        first = (batch.step * hosts + host) * count
         items = []
         for k in range(count):
             angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
@@ -248,7 +258,7 @@ class Trainer(eqx.Module):
 
 
 @eqx.filter_jit
-def _error_of(transmission: Array, height_m: Array, rate: float) -> Array:
+def _error_of(transmission: Array, height_m: Array, rate: Array | float) -> Array:
     """What a plate does to light beside its nominal heights."""
     return transmission * jnp.exp(-2j * np.pi * height_m * rate)
 
@@ -299,7 +309,7 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
 
 def _live_plate(spec: Spec, files: Mapping[str, Path], source: str, camera: Camera) -> LivePlate | RingPlate:
     """A plate that is learnt, or looked at off the axis, or with errors."""
-    problem, _ = problem_of(spec.model_copy(update={"sensor": _odd_window(spec)}), files)
+    problem = plans_of(spec.model_copy(update={"sensor": _odd_window(spec)}), files)
     wavelengths = tuple(w for colour in camera.colours for w in colour.wavelengths_m)
     if not problem.radial:
         assert problem.coverage is not None  # only rings go without
@@ -325,7 +335,8 @@ def resting_depths_m(spec: Spec, kind: Kind) -> tuple[float, ...]:
     least, most = depth_range_m(kind)
     near = 1 / np.linspace(1 / most, 1 / least, _NEAR_DEPTHS)
     far = spec.scene.far_m
-    backs = 1 / np.linspace(1 / max(far), 1 / min(far), _FAR_DEPTHS)
+    with np.errstate(divide="ignore"):  # of infinity
+        backs = 1 / np.linspace(1 / max(far), 1 / min(far), _FAR_DEPTHS)
     return tuple(dict.fromkeys(float(depth) for depth in (*backs, *near)))
 
 

@@ -125,8 +125,8 @@ def test_plans_cover_and_fit():
         assert count == 1 or side >= 2 * overlap  # so that no three tiles meet along an axis
         found = (
             reconstruct_tiled(
-                lambda capture, far, near: np.ones(capture.shape, np.float32),  # pyright: ignore[reportArgumentType]
-                np.zeros((1, samples, 1), np.float32),
+                lambda capture, far, near: jnp.ones(capture.shape),
+                np.zeros((3, samples, 1), np.float32),
                 PSF,
                 PSF,
                 tile=tile,
