@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from doedesign.recon.data import Batch, SceneData
 from doedesign.recon.heldout import looks
 from doedesign.recon.judged import Found, judge
 from doedesign.recon.perceptual import Lpips
-from doedesign.recon.train import State, Trainer
+from doedesign.recon.train import State, Trainer, resting_depths_m
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs import Run
 from doedesign.simulated import depth_range_m
@@ -58,8 +59,23 @@ def validate(
         baselines: judge the rows of Table 1 that need no training, too (`doedesign.recon.baselines`).
     """
     camera = trainer.bench.camera
+    trainer, state = _at_rest(trainer, state, held_out.data.kind)
     seen = looks(held_out.data, held_out.scenes, camera, lambda batch: _shown(trainer, state, batch, baselines))
     return judge(seen, held_out.lpips, lambda image: shown_as(image, camera), most_rows)
+
+
+def _at_rest(trainer: Trainer, state: State, kind: Kind) -> tuple[Trainer, State]:
+    """The same with the plate that is to be drawn, and its exact PSFs.
+
+    Within a step PSFs are estimates: samples may be sparse, and a near source lights the cells obliquely, which plans
+    for all depths leave out (`sim.farfield`): at 5 cm that is up to a fifth of the light in the window.
+    """
+    if isinstance(trainer.plate, StoredPlate):
+        return trainer, state
+    height_m = _maps_of(trainer, state).drawn_m
+    depths_m = resting_depths_m(trainer.spec, kind)
+    bank = psf_bank(trainer.bench.camera, height_m, depths_m, propagation=trainer.spec.optics.propagation)
+    return eqx.tree_at(lambda t: t.plate, trainer, StoredPlate.of(bank)), state._replace(free=None)
 
 
 def _shown(trainer: Trainer, state: State, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
@@ -114,16 +130,22 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
 
 
 def plate_after(run: Run, trainer: Trainer, state: State) -> PlateMaps:
-    """The plate of a state, as `doedesign.optimize.finished_design` makes it of parameters."""
-    spec, camera, plate = run.spec, trainer.bench.camera, trainer.plate
-    if not spec.train.moves_optics or isinstance(plate, StoredPlate):
-        return PlateMaps(plate_at_rest(run, camera), None)
+    """The plate of a state: as it was, or as `doedesign.optimize.finished_design` makes it of parameters."""
+    if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
+        return PlateMaps(plate_at_rest(run, trainer.bench.camera), None)
+    return _maps_of(trainer, state)
+
+
+def _maps_of(trainer: Trainer, state: State) -> PlateMaps:
+    """What parameters make."""
+    plate = trainer.plate
+    assert not isinstance(plate, StoredPlate)  # which has none
     # A finished run has chosen its depths, so only the map is free.
     assert isinstance(state.free, jax.Array)
     continuous = np.asarray(plate.staircase.continuous_m(state.free))
     if isinstance(plate, RingPlate):
-        continuous = revolve(continuous, camera.grid)
-    if spec.optimize.quantisation == "none":
+        continuous = revolve(continuous, trainer.bench.camera.grid)
+    if trainer.spec.optimize.quantisation == "none":
         return PlateMaps(continuous, continuous)
     level = np.asarray(plate.staircase.level(jnp.asarray(continuous))).astype(np.uint8)
     return PlateMaps(height_of(level, plate.staircase.levels).astype(np.float32), continuous)

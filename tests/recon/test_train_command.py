@@ -510,7 +510,10 @@ def _still(run: Path) -> Any:
     spec = load_spec(run / "spec.toml")
     bench = SimpleNamespace(camera=SimpleNamespace(colours=(1,)))
     return SimpleNamespace(
-        spec=spec, bench=bench, plate=doedesign.trained.StoredPlate(jax.numpy.zeros((2, 1, 1, 1)), jax.numpy.zeros(2))
+        spec=spec,
+        bench=bench,
+        mesh=None,
+        plate=doedesign.trained.StoredPlate(jax.numpy.zeros((2, 1, 1, 1)), jax.numpy.zeros(2)),
     )
 
 
