@@ -18,7 +18,7 @@ from doedesign.recon.data import Batch, SceneData
 from doedesign.recon.heldout import looks
 from doedesign.recon.judged import Found, judge
 from doedesign.recon.perceptual import Lpips
-from doedesign.recon.train import State, Trainer, resting_depths_m
+from doedesign.recon.train import State, Trainer, resting_plate
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs import Run
 from doedesign.simulated import depth_range_m
@@ -72,10 +72,8 @@ def _at_rest(trainer: Trainer, state: State, kind: Kind) -> tuple[Trainer, State
     """
     if isinstance(trainer.plate, StoredPlate):
         return trainer, state
-    height_m = _maps_of(trainer, state).drawn_m
-    depths_m = resting_depths_m(trainer.spec, kind)
-    bank = psf_bank(trainer.bench.camera, height_m, depths_m, propagation=trainer.spec.optics.propagation)
-    return eqx.tree_at(lambda t: t.plate, trainer, StoredPlate.of(bank)), state._replace(free=None)
+    plate = resting_plate(trainer.spec, trainer.bench.camera, kind, _maps_of(trainer, state).drawn_m)
+    return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
 
 
 def _shown(trainer: Trainer, state: State, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
@@ -108,7 +106,7 @@ class PlateMaps(NamedTuple):
     continuous_m: Float[np.ndarray, "y x"] | None
 
 
-def plate_at_rest(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
+def height_at_rest_m(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
     """The plate that a run draws, or a flat one where the spec wants a conventional camera."""
     if run.spec.train.camera == "conventional":
         return np.zeros(camera.grid.shape, np.float32)
@@ -132,7 +130,7 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
 def plate_after(run: Run, trainer: Trainer, state: State) -> PlateMaps:
     """The plate of a state: as it was, or as `doedesign.optimize.finished_design` makes it of parameters."""
     if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
-        return PlateMaps(plate_at_rest(run, trainer.bench.camera), None)
+        return PlateMaps(height_at_rest_m(run, trainer.bench.camera), None)
     return _maps_of(trainer, state)
 
 

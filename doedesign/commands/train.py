@@ -44,7 +44,7 @@ from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs import CHECKPOINT, Run, alone_in, open_run, spec_with
 from doedesign.spec import Spec, spec_digest, spec_to_toml
 from doedesign.stopping import Stop, stoppable
-from doedesign.trained import HeldOut, heights_before, plate_at_rest, validate, write_results
+from doedesign.trained import HeldOut, height_at_rest_m, heights_before, validate, write_results
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
 from sim.obstruction import Kind, View
@@ -187,7 +187,7 @@ def _prepared(run: Run, request: Request, say: Say) -> Work:
     say("preparing propagation")
     # Objectives are done with, and the files that they name lie beside the spec that the run was made from.
     bare = spec.model_copy(update={"objectives": ()})
-    at_rest = plate_at_rest(run, camera)
+    at_rest = height_at_rest_m(run, camera)
     mesh = devices_mesh(request.devices)
     trainer = Trainer.of(bare, {}, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
     settings = {

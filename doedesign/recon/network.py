@@ -222,8 +222,7 @@ class Network(eqx.Module):
             wide, normal = widths[level], level > 0 or release
             first = Block.make(rng, inputs, wide, 3 if level else 7, 2 if level else 1, normal=normal)
             more = [Block.make(rng, wide, wide, normal=normal) for _ in range(2 if level else 1)]
-            filtered = wide if layout.features else c
-            wiener = jnp.full(filtered, log_regulariser, jnp.float32) if layout.wiener else None
+            wiener = jnp.full(wide, log_regulariser, jnp.float32) if layout.wiener else None
             return Scale((first, *more), wiener)
 
         def beside(level: int) -> int:
@@ -288,7 +287,7 @@ class Network(eqx.Module):
             raise ValueError(f"`capture` must have {layout.colours} colours, but got {capture.shape[1]}")
         if any(side % layout.multiple for side in capture.shape[2:]):
             raise ValueError(f"sides of `capture` must be multiples of {layout.multiple}, but got {capture.shape[2:]}")
-        keep = partial(jax.checkpoint, static_argnums=()) if checkpointed else lambda call: call
+        keep: Any = jax.checkpoint if checkpointed else lambda call: call
         light = capture.transpose(0, 2, 3, 1)
         display = srgb_from_linear(light)
         inputs = [light]

@@ -154,7 +154,7 @@ class Trainer(eqx.Module):
         if train.camera == "conventional":
             height_m = np.zeros(camera.grid.shape, np.float32)
         alive = train.moves_optics or train.fabricated or train.field == "random"
-        plate = _live_plate(spec, files, source, camera) if alive else _plate_at_rest(spec, camera, kind, height_m)
+        plate = _live_plate(spec, files, source, camera) if alive else resting_plate(spec, camera, kind, height_m)
         bench = Bench(camera, model, outside_of(kind), sensor, shadow_window(kind, camera))
         weights = Weights(train.l1, train.perceptual, train.masked)
         process = process_of(spec.process) if train.fabricated else None
@@ -210,7 +210,7 @@ class Trainer(eqx.Module):
         return State(state.step + 1, network, free, *moments), record
 
     def reconstruct(self, state: State, batch: Batch) -> tuple[Shot, Float[Array, "b c y x"]]:
-        """Photograph and reconstruct scenes, on the axis and with a plate as drawn, on one device.
+        """Photograph and reconstruct scenes on one device, on the axis and without errors of a process.
 
         Returns:
             the captures, and the pictures `[b, c, y, x]` in display values.
@@ -325,9 +325,10 @@ def _odd_window(spec: Spec) -> Any:
     return spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
 
 
-def _plate_at_rest(spec: Spec, camera: Camera, kind: Kind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
-    """A plate from a bank over all depths that scenes may have."""
-    return StoredPlate.of(psf_bank(camera, height_m, resting_depths_m(spec, kind)))
+def resting_plate(spec: Spec, camera: Camera, kind: Kind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
+    """A plate that stays as it is, by exact PSFs over all depths that scenes may have."""
+    bank = psf_bank(camera, height_m, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
+    return StoredPlate.of(bank)
 
 
 def resting_depths_m(spec: Spec, kind: Kind) -> tuple[float, ...]:
