@@ -10,7 +10,7 @@ Reading order, from what they share to the single picture:
     pattern     a target pattern beside what the plate draws
     calibration measured images beside the model's, errors with their uncertainty
     family      what would explain a measured ring:disc ratio
-    contact     simulated captures side by side
+    sheet       rows of pictures below each other: contact (simulated captures), training (held-out scenes, and curves)
     tolerance   what a process makes of a design: histograms, yield, which errors matter and how large they may be
 
 Conventions: SI units in every argument, human units on the axes; up in a picture is +y. The same input gives the

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.canvas import DPI, FAINT, INK, SERIES, SMALL, note, picture, place, wrapped
+from doedesign.report.canvas import FAINT, INK, SERIES, picture, place
+from doedesign.report.sheet import SheetRow, draw_sheet, reduced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_SIDE, _GAP = 1.6, 0.08  # inches
+_SIDE = 1.6  # inches
 _MOST_ROWS = 4
 
 
@@ -44,33 +45,16 @@ def draw_validation(path: str | Path, rows: Sequence[ValidationRow], title: str,
     Raises:
         InputError: the system refuses the path.
     """
-    shown = rows[:_MOST_ROWS]
-    heads = ("capture", "reconstruction", "scene")
-    across = len(heads) * (_SIDE + _GAP) + 0.16
-    text = wrapped(words, across - 0.3)
-    foot = 0.2 + 0.15 * (text.count("\n") + 1)
-    highs = [_SIDE * row.scene.shape[1] / row.scene.shape[2] + 0.22 for row in shown]
-    with picture(path, (across, foot + sum(highs) + 0.65), title) as figure:
-        top = foot + sum(highs)
-        for k, head in enumerate(heads):
-            at = ((0.12 + k * (_SIDE + _GAP)) / across, (top + 0.08) / figure.get_figheight())
-            figure.text(*at, head, fontsize=SMALL, va="baseline")
-        for row, high in zip(shown, highs, strict=True):
-            top -= high
-            for k, image in enumerate((row.capture, row.reconstruction, row.scene)):
-                axes = place(figure, 0.12 + k * (_SIDE + _GAP), top, _SIDE, high - 0.22)
-                axes.imshow(_reduced(image), origin="lower", interpolation="nearest", aspect="auto")
-                axes.set_axis_off()
-            note(figure, 0.12, top + high - 0.2, row.label)
-        note(figure, 0.12, 0.1, text)
+    shown = [
+        SheetRow(row.label, tuple(_displayed(image) for image in (row.capture, row.reconstruction, row.scene)))
+        for row in rows[:_MOST_ROWS]
+    ]
+    draw_sheet(path, ("capture", "reconstruction", "scene"), shown, _SIDE, title, words)
 
 
-def _reduced(image: Float[np.ndarray, "3 y x"]) -> np.ndarray:
-    """`[y, x, c]` cut to what a display shows, in blocks of pixels no finer than the picture."""
-    factor = max(1, -(-max(image.shape[1:]) // round(_SIDE * DPI)))
-    y, x = (n // factor * factor for n in image.shape[1:])
-    blocks = np.clip(image[:, :y, :x], 0, 1).reshape(3, y // factor, factor, x // factor, factor)
-    return blocks.mean(axis=(2, 4)).transpose(1, 2, 0)
+def _displayed(image: Float[np.ndarray, "3 y x"]) -> np.ndarray:
+    """`[y, x, c]` cut to what a display shows."""
+    return reduced(np.clip(image, 0, 1), _SIDE).transpose(1, 2, 0)
 
 
 def draw_training(path: str | Path, records: Sequence[Mapping[str, Any]], title: str) -> None:
