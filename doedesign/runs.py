@@ -19,7 +19,6 @@ process at a time works in a run folder.
 
 import contextlib
 import fcntl
-import io
 import json
 import os
 import re
@@ -32,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from doedesign import __version__
+from doedesign.archive import read_archive, write_archive
 from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
@@ -291,12 +291,8 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 
 def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: Sequence[Mapping[str, Any]]) -> None:
     """Store everything a run needs to go on: arrays in their order, the number of steps done, the history."""
-    buffer = io.BytesIO()
-    named: dict[str, Any] = {f"array{i}": array for i, array in enumerate(arrays)}
-    text = np.frombuffer(json.dumps(list(history)).encode(), np.uint8)
-    digest = np.frombuffer(spec_digest(run.spec).encode(), np.uint8)
-    np.savez(buffer, step=np.int64(step), history=text, spec=digest, **named)
-    write_atomic(run.path(CHECKPOINT), buffer.getvalue())
+    header = {"spec": spec_digest(run.spec), "step": step, "history": list(history)}
+    write_archive(run.path(CHECKPOINT), header, {f"array{i}": array for i, array in enumerate(arrays)})
 
 
 def load_checkpoint(
@@ -311,22 +307,10 @@ def load_checkpoint(
     if not path.exists():
         return None
     cure = f"Remove {path.name} to start this run again from the beginning."
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            arrays = [stored[f"array{i}"] for i in range(len(shapes))]
-            step, history = int(stored["step"]), json.loads(stored["history"].tobytes())
-            digest = stored["spec"].tobytes().decode()
-    # What numpy, zipfile and json raise depends on where the damage is.
-    except Exception as error:
-        got = f'"{error}"' if str(error) else type(error).__name__
-        raise InputError(str(path), "must be a whole checkpoint", got, cure) from error
-    if digest != spec_digest(run.spec) or [a.shape for a in arrays] != list(shapes):
+    header, arrays = read_archive(path, "checkpoint", cure)
+    if header.get("spec") != spec_digest(run.spec) or [a.shape for a in arrays.values()] != list(shapes):
         raise InputError(str(path), "must belong to this run's spec", "a checkpoint of another spec", cure)
-    return arrays, step, history
+    return list(arrays.values()), header["step"], header["history"]
 
 
 def write_history(run: Run, history: Sequence[Mapping[str, Any]]) -> None:

@@ -1,22 +1,17 @@
 """Checkpoints of training: one file that holds everything a step changes, whole or not at all.
 
-    checkpoint.npz
-        header          JSON: format, whose it is, step; name, shape and kind of every array; SHA-256 of it all
+    checkpoint.npz      an archive (`doedesign.archive`)
+        header          format, whose it is, step; name, shape and kind of every array
         array00000 ...  the arrays, in the order of the state's leaves
 
 What else training depends on follows from the spec and the step: the scenes of a batch (`doedesign.recon.data`), every
 random key, and the step sizes. So a training that goes on from a checkpoint ends with the bytes of one that was never
 stopped.
 
-The file is written beside the old one and renamed (`fab.files.write_atomic`): a full disk or a kill leaves the old one.
-A state that is not finite never replaces one that is. On reading, the digest is checked before anything is used, and
-nothing is unpickled.
+A full disk or a kill leaves the checkpoint before, and a state that is not finite never replaces one that is.
 """
 
-import hashlib
-import io
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from doedesign.archive import read_archive, write_archive
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, write_atomic
 
 __all__ = ["FORMAT", "read_checkpoint", "settled", "write_checkpoint"]
 
@@ -60,12 +55,7 @@ def write_checkpoint(path: Path, state: Any, step: int, owner: str) -> None:
         "step": step,
         "arrays": [[name, list(array.shape), array.dtype.name] for name, array in leaves],
     }
-    arrays = [_plain(array) for _, array in leaves]
-    header["sha256"] = _digest(header, arrays)
-    named: dict[str, Any] = {f"array{k:05d}": array for k, array in enumerate(arrays)}
-    buffer = io.BytesIO()
-    np.savez(buffer, header=np.frombuffer(canonical_json(header), np.uint8), **named)
-    write_atomic(path, buffer.getvalue())
+    write_archive(path, header, {f"array{k:05d}": _plain(array) for k, (_, array) in enumerate(leaves)})
 
 
 def read_checkpoint(path: Path, like: _State, owner: str) -> tuple[_State, int] | None:
@@ -85,25 +75,11 @@ def read_checkpoint(path: Path, like: _State, owner: str) -> tuple[_State, int] 
     if not path.exists():
         return None
     cure = f"Remove {path.name} to start this training again from the beginning."
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            header = json.loads(stored["header"].tobytes())
-            arrays = [stored[f"array{k:05d}"] for k in range(len(header["arrays"]))]
-        whole = header.pop("sha256") == _digest(header, arrays) and header["format"] == FORMAT
-    # What numpy, zipfile and json raise depends on where the damage is.
-    except Exception as error:
-        got = f'"{error}"' if str(error) else type(error).__name__
-        raise InputError(str(path), "must be a whole checkpoint", got, cure) from error
-    if not whole:
-        raise InputError(str(path), "must be a whole checkpoint", "one that was changed", cure)
+    header, arrays = read_archive(path, "checkpoint", cure)
     expected = [[name, list(array.shape), array.dtype.name] for name, array in _leaves(like)]
-    if header["owner"] != owner or header["arrays"] != expected:
+    if (header.get("format"), header.get("owner"), header.get("arrays")) != (FORMAT, owner, expected):
         raise InputError(str(path), "must belong to this training", "a checkpoint of another one", cure)
-    return _rebuilt(like, arrays), header["step"]
+    return _rebuilt(like, list(arrays.values())), header["step"]
 
 
 def settled(state: _State) -> _State:
@@ -124,13 +100,6 @@ def _leaves(state: Any) -> list[tuple[str, np.ndarray]]:
 def _plain(array: np.ndarray) -> np.ndarray:
     """Kinds of number that a file of numpy has no name for (bfloat16), as integers of the same bits."""
     return array.view(f"u{array.dtype.itemsize}") if array.dtype.kind == "V" else array
-
-
-def _digest(header: Mapping[str, Any], arrays: Sequence[np.ndarray]) -> str:
-    digest = hashlib.sha256(canonical_json(header))
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def _rebuilt(like: _State, arrays: Sequence[np.ndarray]) -> _State:

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from doedesign.recon.conv import convolution, doubled
-from doedesign.recon.wiener import Blur, blur_at, deblurred
+from doedesign.recon.wiener import Blur, blur_at, deblurred, sharpened
 from sim.light import srgb_from_linear
 
 Variant = Literal["paper", "release"]
@@ -292,8 +292,7 @@ class Network(eqx.Module):
         display = srgb_from_linear(light)
         inputs = [light]
         if self.near_log_regulariser is not None:
-            whole = blur_at(near, (capture.shape[2], capture.shape[3]), unit=False)
-            inputs.append(deblurred(light, whole, self.near_log_regulariser))
+            inputs.append(sharpened(light, near, self.near_log_regulariser))
         features, skips = jnp.concatenate(inputs, axis=-1), []
         for level, scale in enumerate(self.down):
             shape = (capture.shape[2] >> level, capture.shape[3] >> level)
@@ -313,9 +312,10 @@ class Network(eqx.Module):
             picture = display + jnp.tanh(image)
         else:
             correction, veil, gain = jnp.split(image, 3, axis=-1)
+            light = (light - veil) * jnp.exp(_MOST_GAIN * jnp.tanh(gain))
             if self.far_log_regulariser is not None:
-                light = deblurred(light, blur_at(far, (capture.shape[2], capture.shape[3])), self.far_log_regulariser)
-            picture = srgb_from_linear((light - veil) * jnp.exp(_MOST_GAIN * jnp.tanh(gain))) + jnp.tanh(correction)
+                light = sharpened(light, far, self.far_log_regulariser)
+            picture = srgb_from_linear(light) + jnp.tanh(correction)
         if self.last is not None:
             picture = self._refined(picture, display, half)
         return picture.transpose(0, 3, 1, 2)

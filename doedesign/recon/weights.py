@@ -1,12 +1,10 @@
 """A network's file: its weights, its shape, and what it was trained on and with.
 
-    network.npz
-        header      JSON: format, layout, what it is about, shapes and kinds of all arrays, SHA-256 of everything
+    network.npz     an archive (`doedesign.archive`)
+        header      format, layout, what it is about
         .down[0].blocks[0].weights ...      one array for each place in the network
 
-It is a plain archive of arrays, as `numpy.savez` writes it and `numpy.load` reads it: nothing is compressed, and
-nothing is ever unpickled. The same network gives the same bytes. In half precision it takes half the room, and every
-weight keeps three digits.
+In half precision it takes half the room, and every weight keeps three digits.
 
 What a file is about has to say which camera it was trained for, in these keys; `camera_facts` takes them from a camera:
 
@@ -18,9 +16,6 @@ What a file is about has to say which camera it was trained for, in these keys; 
 Anything else that JSON can say may stand beside them: digests of spec and design, occlusion model, pictures, licences.
 """
 
-import io
-import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -31,9 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from doedesign.archive import read_archive, write_archive
 from doedesign.recon.network import Layout, Network
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, sha256_bytes, write_atomic
 from sim.camera import Camera
 from sim.metrics import mean_wavelength_m
 
@@ -42,8 +37,6 @@ __all__ = ["BANK_NAME", "FORMAT", "NETWORK_NAME", "camera_facts", "read_network"
 FORMAT = "doedesign network 1"
 NETWORK_NAME, BANK_NAME = "network.npz", "psf.exr"  # as they lie beside each other in a model's folder
 
-_HEADER, _DIGEST = "header", "sha256"
-_RULE = "must be a whole network file"
 _CURE = "Copy it again from where it was made, or train again."
 
 
@@ -82,16 +75,8 @@ def write_network(path: str | Path, network: Network, about: Mapping[str, Any], 
         if not np.isfinite(array).all():
             got = f"others in {name}"
             raise InputError(str(path), "weights must be finite", got, "Go back to a checkpoint before training broke.")
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "layout": asdict(network.layout),
-        "about": dict(about),
-        "arrays": {name: [array.dtype.name, *array.shape] for name, array in stored.items()},
-    }
-    header[_DIGEST] = _digest(header, stored)
-    stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **{_HEADER: np.frombuffer(canonical_json(header), np.uint8)}, **stored)
-    write_atomic(path, stream.getvalue())
+    header = {"format": FORMAT, "layout": asdict(network.layout), "about": dict(about)}
+    write_archive(path, header, stored)
 
 
 def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
@@ -108,10 +93,10 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
             not know, or lacks an array.
     """
     path = Path(path)
-    arrays = _arrays(path)
-    header = _header(path, arrays.pop(_HEADER, None))
-    if header.get(_DIGEST) != _digest({key: value for key, value in header.items() if key != _DIGEST}, arrays):
-        raise InputError(str(path), "arrays must match the digest written with them", "a file changed since", _CURE)
+    header, arrays = read_archive(path, "network file", _CURE)
+    if header.get("format") != FORMAT:
+        cure = "Give the network.npz of a training or of a released model, written by this version."
+        raise InputError(str(path), f'the format must be "{FORMAT}"', repr(header.get("format")), cure)
     layout, about = _layout(path, header.get("layout")), header.get("about")
     if not isinstance(about, dict):
         raise InputError(str(path), "must say what it is about", repr(about), _CURE)
@@ -122,42 +107,6 @@ def _named(tree: Any) -> dict[str, Any]:
     """Arrays of a tree by where they stand."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))
     return {jax.tree_util.keystr(where): leaf for where, leaf in leaves}
-
-
-def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 over the header without it, then the arrays by name as they lie in the file."""
-    data = [np.ascontiguousarray(arrays[name]).astype(arrays[name].dtype.newbyteorder("<")) for name in sorted(arrays)]
-    return sha256_bytes(b"".join([canonical_json(header), *(array.tobytes() for array in data)]))
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Every array of the archive, its checksum tested before anything in it is believed."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # What is compressed is none of ours, and could unfold to more than memory holds.
-            members = [member for member in archive.infolist() if member.compress_type == zipfile.ZIP_STORED]
-            found = {member.filename.removesuffix(".npy"): archive.read(member) for member in members}
-        return {name: np.lib.format.read_array(io.BytesIO(raw), allow_pickle=False) for name, raw in found.items()}
-    # What a damaged archive raises depends on where the damage is.
-    except Exception as error:
-        raise InputError(str(path), _RULE, f'"{error or type(error).__name__}"', _CURE) from error
-
-
-def _header(path: Path, raw: np.ndarray | None) -> dict[str, Any]:
-    try:
-        header = json.loads(raw.tobytes()) if raw is not None else None
-    except ValueError:
-        header = None
-    if not isinstance(header, dict):
-        raise InputError(str(path), _RULE, "another archive, without a header", _CURE)
-    if header.get("format") != FORMAT:
-        cure = "Give the network.npz of a training or of a released model, written by this version."
-        raise InputError(str(path), f'the format must be "{FORMAT}"', repr(header.get("format")), cure)
-    return header
 
 
 def _layout(path: Path, said: Any) -> Layout:

@@ -121,7 +121,7 @@ def test_numbers_that_are_changed_with_their_checksum(path: Path):
         arrays = dict(stored)
     arrays["array00001"] = arrays["array00001"] + 1
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match="one that was changed"):
+    with pytest.raises(InputError, match="a file changed since"):
         read_checkpoint(path, state(), "me")
 
 

@@ -1,6 +1,5 @@
 """A network's file: what comes back, how large it is, and what is refused."""
 
-import io
 import json
 import zipfile
 from pathlib import Path
@@ -11,10 +10,11 @@ import jax
 import numpy as np
 import pytest
 
+from doedesign.archive import read_archive, write_archive
 from doedesign.recon.network import Layout, Network, count_parameters
 from doedesign.recon.weights import FORMAT, read_network, write_network
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes
+from fab.files import canonical_json
 from tests.recon.drawn_networks import drawn
 
 SMALL = Layout(width=3, depth=1)
@@ -43,15 +43,9 @@ def members(path: Path) -> dict[str, Any]:
 
 def forged(path: Path, change) -> Path:
     """The file with a header or arrays changed on purpose, and a digest that fits."""
-    arrays = members(path)
-    header = json.loads(arrays.pop("header").tobytes())
-    header.pop("sha256")
+    header, arrays = read_archive(path, "network file", "")
     change(header, arrays)
-    data = b"".join(np.ascontiguousarray(arrays[name]).tobytes() for name in sorted(arrays))
-    header["sha256"] = sha256_bytes(canonical_json(header) + data)
-    stream = io.BytesIO()
-    np.savez(stream, header=np.frombuffer(canonical_json(header), np.uint8), **arrays)
-    path.write_bytes(stream.getvalue())
+    write_archive(path, header, arrays)
     return path
 
 

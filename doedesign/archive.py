@@ -1,0 +1,90 @@
+"""Arrays on the disk: a header of JSON and named arrays in one file, whole or not at all.
+
+    FILE.npz
+        header      JSON: what the caller says, and "sha256" of that and all arrays
+        NAME ...    the arrays
+
+It is a plain archive, as `numpy.savez` writes it and `numpy.load` reads it: nothing is compressed, and nothing is ever
+unpickled. The same content gives the same bytes. It is written beside an old file and renamed
+(`fab.files.write_atomic`), so a full disk or a kill leaves the old one.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fab.errors import InputError
+from fab.files import canonical_json, explain_os_error, write_atomic
+
+_HEADER, _DIGEST = "header", "sha256"
+
+
+def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays and what is said about them.
+
+    Args:
+        path: the file; its folder is made if missing.
+        header: for JSON.
+        arrays: arrays by name, of kinds that numpy's files know.
+
+    Raises:
+        InputError: the system refuses the path.
+        ValueError: `header` holds what JSON cannot say.
+    """
+    told = canonical_json({**header, _DIGEST: _digest(header, arrays)})
+    named: dict[str, Any] = {_HEADER: np.frombuffer(told, np.uint8), **arrays}
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **named)
+    write_atomic(path, stream.getvalue())
+
+
+def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read what `write_archive` wrote, after every check on the way.
+
+    Args:
+        path: the file.
+        what: what it should be, for messages: "checkpoint".
+        cure: what to do if it is not, for messages.
+
+    Returns:
+        the header and the arrays by name.
+
+    Raises:
+        InputError: the file is missing, cut off, another archive, or changed since it was written.
+    """
+    rule = f"must be a whole {what}"
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            # What is compressed is none of ours, and could unfold to more than memory holds.
+            members = [member for member in archive.infolist() if member.compress_type == zipfile.ZIP_STORED]
+            raw = {member.filename.removesuffix(".npy"): archive.read(member) for member in members}
+        arrays = {name: np.lib.format.read_array(io.BytesIO(each), allow_pickle=False) for name, each in raw.items()}
+        header = json.loads(arrays.pop(_HEADER).tobytes()) if _HEADER in arrays else None
+    # What a damaged archive raises depends on where the damage is.
+    except Exception as error:
+        got = f'"{error}"' if str(error) else type(error).__name__
+        raise InputError(str(path), rule, got, cure) from error
+    if not isinstance(header, dict):
+        raise InputError(str(path), rule, "another archive, without a header", cure)
+    if header.pop(_DIGEST, None) != _digest(header, arrays):
+        raise InputError(str(path), rule, "a file changed since it was written", cure)
+    return header, arrays
+
+
+def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 over the header, then over names, kinds, shapes and numbers of the arrays in their order."""
+    digest = hashlib.sha256(canonical_json(header))
+    for name, array in arrays.items():
+        digest.update(canonical_json([name, array.dtype.str, list(array.shape)]))
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
