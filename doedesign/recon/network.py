@@ -2,12 +2,12 @@
 
 First stage: the capture and its Wiener estimate with the near PSF go down through `depth` halvings. At every scale the
 features are filtered with the inverse of the far PSF (`doedesign.recon.wiener`); the way up joins what it brings, the
-features and the filtered features. The capture itself, freed of the far PSF's blur by one more such filter, still lies
-behind a veil and lacks the light that was kept off; by the form of eq. 10 both are undone by
+features and the filtered features. The capture itself is taken back along the form of eq. 10: a veil lies on it, it
+lacks the light that was kept off, and behind both it is blurred with the far PSF,
 
-    light = (deblurred capture - veil) exp(gain),
+    light = F⁻¹[(capture - veil) exp(gain)].
 
-so veil and gain, which are smooth, are what the first stage ends in, with a correction of the picture for the rest.
+Veil and gain, which are smooth, are what the first stage ends in, with a correction of the picture for the rest.
 Second stage: residual blocks that see the first stage's picture and the capture.
 
 PSFs are inputs: simulated, as fabricated or measured ones are handed in at run time, and the same weights serve all of

@@ -121,8 +121,9 @@ def sharpened(
     """Wiener filter of a whole picture, which goes on beyond its edges as its mirror image.
 
     A tapered edge is lost as far as the PSF reaches, and a plate that spreads light reaches half across a training
-    picture. Light goes on beyond a frame, and its mirror image is the best guess at how; it is also what training
-    scenes are made with (`sim.convolve`, border "reflect"). Four times the samples: for pictures, not for features.
+    picture. Light goes on beyond a frame, and its mirror image is the best guess at how; training scenes go on so, too
+    (`sim.convolve`, border "reflect", which has the outermost samples once; here they stand twice, for transforms of
+    even lengths). Four times the samples: for pictures, not for features.
 
     Args:
         image: `[b, y, x, c]` a picture, one channel for every colour.
