@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import doedesign.archive
 import doedesign.commands.train as command
-import doedesign.recon.checkpoint
 import doedesign.trained
 from doedesign.build import camera_of
 from doedesign.cli import exit_code
@@ -129,7 +129,7 @@ def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> t
     said: list[str] = []
     request = Request(images=images, overrides=changes, **more)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("doedesign.cli._say", said.append)
+        patch.setattr("doedesign.cli.talk.say", said.append)
         code = exit_code(lambda: train(run, out, request, said.append))
     return code, "\n".join(said)
 
@@ -377,7 +377,7 @@ def test_a_process_that_is_told_to_end(
 
 def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The training stands at its last checkpoint, and goes on when there is room again."""
-    write, room = doedesign.recon.checkpoint.write_atomic, iter(range(2))
+    write, room = doedesign.archive.write_atomic, iter(range(2))
 
     def filling(path: Path, data: bytes) -> None:
         if next(room, None) is None:
@@ -390,7 +390,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(doedesign.recon.checkpoint, "write_atomic", filling)
+        patch.setattr(doedesign.archive, "write_atomic", filling)
         code, said = trained(run, tmp_path / "out", images)
     assert code == 2
     assert "checkpoint.npz: the disk must have room" in said

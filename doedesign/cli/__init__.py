@@ -1,0 +1,35 @@
+"""The command line, a file for each family of commands.
+
+Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted. Heavy packages are imported where they are used, so
+that --help answers at once.
+"""
+
+from collections.abc import Sequence
+
+from cyclopts import App
+
+from doedesign import __version__
+from doedesign.cli.design import masks, optimize, verify
+from doedesign.cli.light import psf, simulate
+from doedesign.cli.network import finetune, reconstruct, train
+from doedesign.cli.process import calibrate, tolerance
+from doedesign.cli.talk import exit_code
+
+__all__ = ["app", "exit_code", "main"]
+
+app = App(
+    name="doedesign",
+    help="Design diffractive optical elements and the masks that make them.",
+    version=__version__,
+    # Leave both to `exit_code`.
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+for _command in (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate):
+    app.command(_command)
+app.command(reconstruct, usage="Usage: doedesign reconstruct [OPTIONS] [RUN] CAPTURE...")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the `doedesign` command."""
+    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False))

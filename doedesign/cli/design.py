@@ -1,0 +1,139 @@
+"""From a spec to a design and its masks: optimize, masks, verify."""
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from doedesign.cli.options import AsJson, Overrides, length_of
+from doedesign.cli.talk import print_paths, print_text, say
+from fab.errors import InputError
+
+
+def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_: AsJson = False) -> None:
+    """Optimise a spec into a run folder, or resume it where it was stopped.
+
+    Args:
+        spec: TOML spec, such as examples/automotive.toml.
+        out: Run folder; runs/NAME by default.
+    """
+    from doedesign.commands.optimize import optimize as work
+    from doedesign.spec import load_spec, spec_warnings
+
+    for warning in spec_warnings(load_spec(spec, set_)):
+        say(f"warning: {warning}")
+    run = work(spec, out, set_, say)
+    print_paths([run.folder], json_, metrics=str(run.path("metrics.json")))
+
+
+def masks(
+    source: Path,
+    *,
+    levels: int | None = None,
+    out: Path | None = None,
+    step: str | None = None,
+    etch_depths: str | None = None,
+    pitch_um: float | None = None,
+    scale: str | None = None,
+    aperture: str | None = None,
+    on_violation: Literal["warn", "fail", "fix"] = "warn",
+    probe: str | None = None,
+    patch: str | None = None,
+    mesh_patch: str | None = None,
+    as_built: Path | None = None,
+    order: Path | None = None,
+    process: Path | None = None,
+    wafer: Path | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Write the mask order of a run or of any height map, and prove it by reading it back.
+
+    With --as-built, take the filled run sheet of a finished wafer instead and predict its plate into RUN/as-built.
+
+    Args:
+        source: Run folder, or a height map (.exr, .npy, .tif, .png).
+        levels: Number of heights; the run's own by default.
+        out: Order folder; masks/NAME by default.
+        step: Height of one level, such as "75 nm"; for a bare height map.
+        etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.
+        pitch_um: Pixel pitch of a bare height map in micrometres.
+        scale: Height of one count of an integer map, such as "1 nm".
+        aperture: Diameter of the relief; the map's shorter side by default.
+        on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
+        probe: Wavelength of the laser that the lab tests the plate with; 520 nm by default.
+        patch: Also write a window of the relief, "X, Y, EDGE" about its middle, as STEP (at most 2000 boxes) and mesh.
+        mesh_patch: Also write a window of the relief as a mesh alone, up to 1000 x 1000 pixels.
+        as_built: JSON of the run sheet with measured numbers filled in.
+        order: With --as-built, the order that was made; masks/NAME by default.
+        process: A TOML file with another [process] table; with --as-built, for what was not measured.
+        wafer: A TOML file with another [wafer] table.
+    """
+    if as_built is not None:
+        if wafer is not None:
+            raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
+        from doedesign.commands.asbuilt import as_built as work
+
+        folder = work(source, as_built, order, process=process, say=say)
+        print_paths([folder, *sorted(folder.iterdir())], json_)
+        return
+    if order is not None:
+        raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
+    from doedesign.commands.masks import write_masks
+    from doedesign.drawing import level_map_from
+    from doedesign.outlook import PROBE_M
+
+    drawing = level_map_from(
+        source,
+        levels,
+        step_m=length_of("--step", step),
+        depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
+        pitch_m=None if pitch_um is None else pitch_um * 1e-6,
+        scale_m=length_of("--scale", scale),
+        aperture_m=length_of("--aperture", aperture),
+    )
+    probe_m = PROBE_M if probe is None else length_of("--probe", probe) or PROBE_M
+    window = _patch(patch, mesh_patch)
+    folder, report = write_masks(
+        source,
+        drawing,
+        out,
+        on_violation=on_violation,
+        probe_m=probe_m,
+        patch=window,
+        process_file=process,
+        wafer_file=wafer,
+        say=say,
+    )
+    say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
+    print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
+
+
+def verify(order: Path, *, json_: AsJson = False) -> None:
+    """Prove a mask order from its files alone; exit 1 names what differs.
+
+    Args:
+        order: Folder that masks wrote.
+    """
+    from doedesign.commands.masks import verify as work
+
+    report = work(order)
+    if json_:
+        checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
+        print_text(json.dumps({"passed": report.passed, "checks": checks}))
+    report.require()
+    say(f"{len(report.checks)} checks passed")
+
+
+def _patch(step: str | None, mesh: str | None) -> Any:
+    """The patch of --patch or --mesh-patch, or None."""
+    if step is not None and mesh is not None:
+        raise InputError("--mesh-patch", "does not go with --patch", mesh, "Leave one out; --patch writes both kinds.")
+    option, text = ("--mesh-patch", mesh) if step is None else ("--patch", step)
+    if text is None:
+        return None
+    from fab.patch import Patch
+
+    lengths = [length_of(option, part.strip()) or 0.0 for part in text.split(",")]
+    if len(lengths) != 3:
+        cure = f'Write x and y of its middle and its edge: {option} "0 um, 100 um, 50 um".'
+        raise InputError(option, "must be three lengths", f'"{text}"', cure)
+    return Patch(*lengths, step=step is not None)

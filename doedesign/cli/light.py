@@ -1,0 +1,118 @@
+"""What a design does with light: psf, simulate."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from doedesign.cli.options import AsJson, Overrides, length_of
+from doedesign.cli.talk import print_paths, say
+from fab.errors import InputError
+
+
+def psf(
+    run: Path,
+    *,
+    masks: Path | None = None,
+    depths: tuple[str, ...] = (),
+    field_deg: tuple[float, float] = (0.0, 0.0),
+    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    process: Path | None = None,
+    variation: Path | None = None,
+    seed: int | None = None,
+    draw: str = "normal/0",
+    json_: AsJson = False,
+) -> None:
+    """Compute PSF banks and pictures of the continuous, the quantised and the drawn design.
+
+    With --fabricated, those of one plate as the process makes it: with the errors of --variation, those of --seed, or
+    each at its mean.
+
+    Args:
+        run: Run folder.
+        masks: Its mask order; masks/NAME by default.
+        depths: Source depths, such as "5 cm" or inf; the spec's by default.
+        field_deg: Field angles along y and x in degrees.
+        fabricated: Predict a plate as fabricated, into RUN/fabricated.
+        process: TOML file with a [process] table; the run's own by default.
+        variation: TOML file with the errors of the plate.
+        seed: Draw the errors of the plate from the process.
+        draw: Which draw of the seed, as in a tolerance study.
+    """
+    if fabricated:
+        if depths or any(field_deg):
+            option = "--depths" if depths else "--field-deg"
+            cure = "Leave it out; the depths are those of the spec, on the axis."
+            raise InputError(option, "does not go with --fabricated", "a value", cure)
+        from doedesign.commands.fabricated import fabricated as predict
+
+        folder = predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, say=say)
+        print_paths([folder, *sorted(folder.iterdir())], json_)
+        return
+    if process is not None or variation is not None or seed is not None:
+        raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
+    from math import inf, radians
+
+    from doedesign.commands.psf import psf as work
+
+    depths_m = [inf if text == "inf" else length_of("--depths", text) or 0.0 for text in depths]
+    if any(not z > 0 for z in depths_m):
+        raise InputError("--depths", "must be positive", ", ".join(depths), 'For example --depths "5 cm".')
+    if not all(abs(angle) <= 60 for angle in field_deg):
+        raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
+    folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), say)
+    print_paths([folder, *sorted(folder.iterdir())], json_)
+
+
+def simulate(
+    run: Path,
+    *,
+    images: Path | None = None,
+    obstruction: str | None = None,
+    occlusion: str | None = None,
+    out: Path | None = None,
+    count: int | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    process: Path | None = None,
+    variation: Path | None = None,
+    plate_seed: int | None = None,
+    draw: str = "normal/0",
+    masks: Path | None = None,
+    png: Annotated[bool, Parameter(negative="")] = False,
+    set_: Overrides = (),
+    json_: AsJson = False,
+) -> None:
+    """Photograph pictures through dirt, drops or a fence, with the plate of a run and without.
+
+    Writes clean scenes, conventional and DOE captures, masks, alpha, depth, and a contact sheet.
+
+    Args:
+        run: Run folder.
+        images: Folder of pictures; sample pictures of scikit-image by default.
+        obstruction: Kind, such as dirt, raindrop or fence, or a folder of masks; the spec's by default.
+        occlusion: radiometric, reciprocal, paper or paper_release; the spec's by default, which has no default.
+        out: Folder; RUN/simulated by default. The same command resumes a stopped simulation.
+        count: Number of items; one per picture and at most six by default.
+        seed: Seed of everything.
+        size: Binned pixels per side of a frame; 512 by default, or what the sensor has.
+        fabricated: Look through a plate with errors: those of --variation, of --plate-seed, or the process's means.
+        process: With --fabricated, a TOML file with a [process] table; the run's own by default.
+        variation: With --fabricated, a TOML file with the errors of the plate.
+        plate_seed: With --fabricated, draw the errors of the plate from the process.
+        draw: With --plate-seed, which draw, as in a tolerance study.
+        masks: The run's mask order; masks/NAME by default.
+        png: Write 16-bit PNG instead of EXR.
+    """
+    if not fabricated and (process is not None or variation is not None or plate_seed is not None):
+        rule = "must be given with --process, --variation or --plate-seed"
+        raise InputError("--fabricated", rule, "not there", "Add it.")
+    from doedesign.commands.simulate import Fabrication, Request
+    from doedesign.commands.simulate import simulate as work
+
+    request = Request(images, obstruction, occlusion, count, seed, size, set_, png)
+    plate = Fabrication(process, variation, plate_seed, draw) if fabricated else None
+    done = work(run, out, request, masks=masks, fabrication=plate, say=say)
+    paths = [done.folder, *(done.folder / name for name in ("contact.png", "manifest.json", *done.items))]
+    print_paths(paths, json_, items=list(done.items), skipped=done.skipped)

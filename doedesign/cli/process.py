@@ -1,0 +1,136 @@
+"""What the errors of a process do, and which there were: tolerance, calibrate."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from doedesign.cli.options import AsJson, length_of
+from doedesign.cli.talk import print_paths, print_text, say
+from fab.errors import InputError
+
+
+def tolerance(
+    run: Path,
+    *,
+    draws: int = 100,
+    seed: int = 0,
+    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
+    sobol: int = 64,
+    corners: Annotated[bool, Parameter(negative="")] = False,
+    budget: str | None = None,
+    yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
+    limit: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    process: Path | None = None,
+    masks: Path | None = None,
+    draw: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    out: Path | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Study what the errors of a process make of a run: yield, which errors matter, and how large they may be.
+
+    Args:
+        run: Run folder.
+        draws: Plates of the Monte-Carlo study, and per point of the budget.
+        seed: Seed of every draw.
+        sensitivity: Which errors matter, each alone or as shares of variance.
+        sobol: Rows of the samples behind Sobol indices, a power of two; each costs sources + 2 plates.
+        corners: Look at worst-case corners, too.
+        budget: Errors for which the largest sigma is sought, such as overlay, overlay_x or overlay_x[3].
+        yield_: Yield that the budget is for.
+        limit: What a good plate obeys, such as "zeroth_order <= 5 %"; the spec's limits by default.
+        process: TOML file with a [process] table; the run's own by default.
+        masks: Its mask order; masks/NAME by default.
+        draw: Repeat a single plate, such as normal/17, and print its errors as TOML and its numbers.
+        workers: Worker processes; as many as there are cores and memory for by default.
+        scheduler: Address of a Dask scheduler whose workers are taken instead.
+        out: Folder; RUN/tolerance by default. The same command resumes a stopped study.
+    """
+    from doedesign.commands.tolerance import Plan, one_draw
+    from doedesign.commands.tolerance import tolerance as work
+
+    settings = {"process": process, "limits": limit or None, "seed": seed, "masks": masks, "scheduler": scheduler}
+    if draw is not None:
+        print_text(one_draw(run, draw, json_, **settings).rstrip())
+        return
+    plan = Plan(draws, sensitivity, sobol, corners, budget, yield_)
+    folder = work(run, plan, out, say, workers=workers, **settings)
+    print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
+
+
+def calibrate(
+    run: Path,
+    measurement: Path | None = None,
+    *,
+    errors: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    process: Path | None = None,
+    masks: Path | None = None,
+    evaluations: int = 60,
+    polish: int = 0,
+    seed: int = 0,
+    ring_to_disc: float | None = None,
+    throughput: float | None = None,
+    throughput_sigma: float = 0.02,
+    probe: str | None = None,
+    depth: str | None = None,
+    pairs: bool = True,
+    reach: float = 4.0,
+    out: Path | None = None,
+    json_: AsJson = False,
+) -> None:
+    """Find the process errors that explain measured PSFs, or list those that would explain a measured ring:disc ratio.
+
+    With MEASUREMENT, the errors of the plate with their uncertainty go into process-estimate.toml. With --ring-to-disc
+    instead, every error and pair of errors is found that would give this ratio.
+
+    Args:
+        run: Run folder.
+        measurement: TOML file that names the images and says how they were taken.
+        errors: Errors to look for, such as depth, overlay_x or cd_bias[3]; by default depth, line width and overlay.
+        process: TOML file with a [process] table, for what is believed beforehand; the run's own by default.
+        masks: The run's mask order; masks/NAME by default.
+        evaluations: Plates of the global search, which begins only if it is needed.
+        polish: Exact gradients to follow at the end.
+        seed: Seed of the global search.
+        ring_to_disc: Measured ratio of the energy outside the geometric defocus disc to that inside.
+        throughput: Measured share of the light that arrives in the sensor window, 0-1.
+        throughput_sigma: Its standard deviation.
+        probe: Wavelength at which the ratio was measured, such as "520 nm".
+        depth: Depth at which it was measured, such as "10 cm".
+        pairs: Look at two errors together, too.
+        reach: Standard deviations to look at.
+        out: Folder; RUN/calibration or RUN/explanations by default.
+    """
+    if (measurement is None) == (ring_to_disc is None):
+        got = "neither" if measurement is None else "both"
+        cure = "Give the measurement's TOML file, or --ring-to-disc with --probe and --depth."
+        raise InputError("calibrate", "must be given a measurement or a ring:disc ratio", got, cure)
+    if measurement is not None:
+        from doedesign.commands.calibrate import calibrate as fit
+
+        settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
+        folder, result = fit(run, measurement, errors, **settings, out=out, say=say)
+        estimate = str(folder / "process-estimate.toml")
+        print_paths([folder, *sorted(folder.iterdir())], json_, estimate=estimate, explained=result.explained)
+        return
+    from doedesign.calibrate import Targets
+    from doedesign.commands.calibrate import explain
+
+    lengths = {}
+    for option, text, example in (("--probe", probe, "520 nm"), ("--depth", depth, "10 cm")):
+        if text is None:
+            raise InputError(
+                option, "must be given with --ring-to-disc", "nothing", f'For example {option} "{example}".'
+            )
+        lengths[option] = length_of(option, text)
+        if not lengths[option] > 0:
+            raise InputError(option, "must be positive", text, f'For example {option} "{example}".')
+    if throughput is not None and not 0 < throughput <= 1:
+        raise InputError("--throughput", "must be a share of the light, above 0 and up to 1", throughput, "Write 0.86.")
+    if not (throughput_sigma > 0 and reach > 0):
+        raise InputError("--throughput-sigma, --reach", "must be positive", (throughput_sigma, reach), "Correct them.")
+    targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
+    folder, _ = explain(run, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=out, say=say)
+    print_paths([folder, *sorted(folder.iterdir())], json_)

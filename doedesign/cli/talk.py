@@ -1,0 +1,67 @@
+"""What commands print, and how they end. stdout is data (paths, or JSON with --json), stderr is talk."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from cyclopts import CycloptsError
+
+from fab.errors import CheckFailed, InputError
+
+
+def say(text: str) -> None:
+    """Tell what is going on."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def print_text(text: str) -> None:
+    """Print a result; what the terminal's encoding lacks is escaped."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    except OSError as error:
+        # What could not be printed would be tried again, and fail again, when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # a reader that has seen enough is no error
+            raise
+
+
+def print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
+    """Print paths, or JSON with what else there is to say."""
+    names = [str(path) for path in paths]
+    print_text(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(names))
+
+
+def exit_code(work: Callable[[], Any]) -> int:
+    """Run a command's work; tell a user's mistake in one message instead of a traceback.
+
+    Returns:
+        0 done, 1 a check failed, 2 bad input, 130 interrupted.
+    """
+    try:
+        work()
+    except InputError as error:
+        say(f"doedesign: {error}")
+        return 2
+    except CheckFailed as error:
+        say(f"doedesign: check failed\n{error}")
+        return 1
+    except CycloptsError as error:
+        say(f"doedesign: {error}\nTry: doedesign --help")
+        return 2
+    except KeyboardInterrupt:
+        say("doedesign: interrupted; what was finished is kept, the same command goes on from there")
+        return 130
+    except BrokenPipeError:  # nobody listens to stderr any more
+        return 130
+    except OSError as error:
+        from fab.files import explain_os_error
+
+        if error.filename is None and error.errno is None:
+            raise
+        say(f"doedesign: {explain_os_error(error, str(error.filename or 'output'))}")
+        return 2
+    return 0
