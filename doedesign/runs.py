@@ -37,6 +37,7 @@ from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
 
 FORMAT = "doedesign run 1"
+TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a plate of its own
 CHECKPOINT = "checkpoint.npz"
 _DEPTHS = "etch_depths_m"
 # Of the sensor, what a plate is designed for.
@@ -200,16 +201,17 @@ def finish_run(
 
 
 def open_run(folder: Path) -> Run:
-    """A finished run.
+    """A finished run, or a finished training, whose plate has learnt beside its network.
 
     Raises:
-        InputError: no run, an unfinished one, or one whose spec or height map changed since it was made.
+        InputError: no run, an unfinished one, one without a plate, or one whose spec or height map changed since it was
+            made.
     """
     if not folder.is_dir():
         raise InputError(str(folder), "must be a run folder", "no folder", "Make one with: doedesign optimize SPEC")
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
-    manifest = _read_manifest(folder)
+    manifest = _read_manifest(folder, (FORMAT, TRAINING))
     spec = load_spec(folder / "spec.toml")
     if spec_digest(spec) != manifest["spec_sha256"]:
         raise InputError(
@@ -220,8 +222,11 @@ def open_run(folder: Path) -> Run:
         )
     if manifest["state"] != "done":
         raise InputError(
-            str(folder), "the run must be finished", "an unfinished run", "Resume it with the same optimize command."
+            str(folder), "the run must be finished", "an unfinished run", "Resume it with the same command."
         )
+    if not (folder / "height.exr").is_file():
+        cure = "Give the run, or a training behind its plate."
+        raise InputError(str(folder), "must hold a plate, height.exr", "none", cure)
     for name, digest in manifest["results_sha256"].items():
         if name.endswith(".exr") and sha256_file(folder / name) != digest:
             raise InputError(
@@ -267,18 +272,20 @@ def _with_depths(spec: Spec, manifest: Mapping[str, Any], path: Path) -> Spec:
     return spec_from_json(spec_to_json(spec) | {"process": process}, str(path))
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
+def _read_manifest(folder: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, Any]:
     """The manifest of a run, with everything in it that is relied upon."""
     path = folder / MANIFEST_NAME
     manifest = read_json(path)
-    if manifest.get("format") != FORMAT:
+    if manifest.get("format") not in formats:
         raise InputError(
             str(path),
             f'must say format "{FORMAT}"',
             repr(manifest.get("format")),
             "Give a folder that optimize of this version wrote.",
         )
-    kinds = {"state": str, "spec_sha256": str, "inputs_sha256": dict}
+    kinds: dict[str, type] = {"state": str, "spec_sha256": str}
+    if manifest["format"] == FORMAT:
+        kinds["inputs_sha256"] = dict
     if manifest.get("state") == "done":
         kinds["results_sha256"] = dict
     for key, kind in kinds.items():

@@ -68,13 +68,21 @@ class Chain(NamedTuple):
     words: str
 
 
-def photographed(model: Model, file: Path, seed: int, occlusion: str | None) -> Chain:
-    """Put a picture behind the obstruction, and take it through the chain."""
+def photographed(model: Model, file: Path, seed: int, occlusion: str | None = None, side: int | None = None) -> Chain:
+    """Put a picture behind the obstruction, and take it through the chain.
+
+    Args:
+        model: plate and network.
+        file: the picture.
+        seed: of the obstruction and the noise.
+        occlusion: occlusion model; that of the training if None.
+        side: pixels per side; those of the training if None.
+    """
     spec = load_spec(model.folder / "spec.toml")
     camera = replace(camera_of(spec), window=model.bank.energy.shape[-1])
     kind, sensor = obstruction_of(spec, str(model.folder / "spec.toml")), sensor_of(spec)
     name: Any = occlusion or model.about["occlusion"]
-    side = spec.train.size
+    side = side or spec.train.size
     view = View((side, side), camera.pixel_m, camera.sensor_distance_m)
     far = (min(spec.scene.far_m), max(spec.scene.far_m))
     item = SceneData(Pictures((file,), most_px=2 * side), kind, view, far, seed, mirrored=False).item(0, 0)

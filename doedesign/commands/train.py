@@ -41,15 +41,13 @@ from doedesign.recon.hosts import gathered, join_hosts
 from doedesign.recon.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
 from doedesign.recon.train import State, Trainer, devices_mesh, layout_of, rates_at
 from doedesign.report.training import draw_training, draw_validation
-from doedesign.runs import CHECKPOINT, Run, alone_in, open_run, spec_with
+from doedesign.runs import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
 from doedesign.spec import Spec, spec_digest, spec_to_toml
 from doedesign.stopping import Stop, stoppable
 from doedesign.trained import HeldOut, height_at_rest_m, heights_before, validate, write_results
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
 from sim.obstruction import Kind, View
-
-FORMAT = "doedesign training 1"
 
 _FREE = ("scene", "sensor", "obstruction", "network", "train")
 _MOST_THREADS = 8
@@ -116,7 +114,7 @@ class Work(NamedTuple):
     def claim(self) -> Claim:
         """Whose a folder of this training is."""
         others = "one with another run, spec, occlusion model, perceptual loss or other pictures"
-        return Claim(FORMAT, self.digest(), "training", others, ("spec.toml", "pictures.json"))
+        return Claim(TRAINING, self.digest(), "training", others, ("spec.toml", "pictures.json"))
 
 
 def train(run_folder: Path, out: Path | None = None, request: Request | None = None, say: Say = lambda _: None) -> Path:
@@ -191,7 +189,7 @@ def _prepared(run: Run, request: Request, say: Say) -> Work:
     mesh = devices_mesh(request.devices)
     trainer = Trainer.of(bare, {}, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
     settings = {
-        "format": FORMAT,
+        "format": TRAINING,
         "run": spec.name,
         "spec_sha256": spec_digest(spec),
         "height_sha256": sha256_file(run.path("height_continuous.exr")),

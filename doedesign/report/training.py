@@ -77,7 +77,9 @@ def draw_training(path: str | Path, records: Sequence[Mapping[str, Any]], title:
     steps = np.array([record["step"] for record in records])
     series = {"loss": np.array([record["loss"] for record in records], np.float64)}
     for name in records[0]["parts"]:
-        series[name] = np.array([record["parts"].get(name, np.nan) for record in records], np.float64)
+        values = np.array([record["parts"].get(name, np.nan) for record in records], np.float64)
+        if np.any(values != 0):  # a term without weight is not computed
+            series[name] = values
     looks = [record for record in records if record.get("validation")]
     with picture(path, (8.4, 4.0), title) as figure:
         left = place(figure, 0.65, 0.5, 3.3, 2.65)

@@ -24,7 +24,7 @@ import doedesign.archive
 import doedesign.commands.train as command
 import doedesign.trained
 from doedesign.build import camera_of
-from doedesign.cli import exit_code
+from doedesign.cli import exit_code, main
 from doedesign.commands.train import Request, train
 from doedesign.drawing import level_map_from
 from doedesign.images import decoded, sample_files
@@ -35,7 +35,7 @@ from doedesign.recon.weights import read_network
 from doedesign.report.training import ValidationRow, draw_training, draw_validation
 from doedesign.spec import load_spec
 from fab.errors import InputError
-from fab.files import read_json, write_atomic
+from fab.files import read_json, sha256_file, write_atomic
 from sim.psf import psf_bank
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
@@ -227,6 +227,22 @@ def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     assert (tmp_path / "b.png").read_bytes() != (tmp_path / "c.png").read_bytes()
     with pytest.raises(ValueError, match="at least one step"):
         draw_training(tmp_path / "d.png", [], "small")
+
+
+def test_the_trained_plate_can_be_drawn(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A training is a run with another plate: its masks are those of the map that it learnt."""
+    assert main(["masks", str(whole), "--out", str(tmp_path / "order"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["checks"] > 0
+    source = read_json(tmp_path / "order" / "manifest.json")["source"]
+    assert source["height_sha256"] == sha256_file(whole / "height.exr")
+
+
+def test_a_training_without_a_plate_has_no_masks(
+    run: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert trained(run, tmp_path / "out", images, 'train.camera="conventional"', "train.steps=1")[0] == 0
+    assert main(["masks", str(tmp_path / "out"), "--out", str(tmp_path / "order")]) == 2
+    assert "must hold a plate, height.exr" in capsys.readouterr().err
 
 
 # --- stopped and resumed ---------------------------------------------------------------------------------------------
