@@ -37,7 +37,7 @@ from sim.scene import Obstruction, Scene
 from sim.sensor import developed, expose
 from sim.store import read_height
 
-SIDE, GAP = 1.75, 0.12  # inches
+SIDE, GAP, ROW = 1.75, 0.12, 0.42  # inches; ROW between two rows, for a scale bar and words
 
 
 class Chain(NamedTuple):
@@ -114,9 +114,9 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
 def draw(path: Path, chain: Chain, model: Model, camera: Camera) -> None:
     """Draw the chain: optics above, pictures below."""
     height = read_height(model.folder / "height.exr").height_m
-    across, up = 4 * (SIDE + GAP) + GAP, 2 * (SIDE + 0.3) + 0.75
+    across, up = 4 * (SIDE + GAP) + GAP, 2 * (SIDE + ROW) + 0.65
     with picture(path, (across, up), "Through the dirt") as figure:
-        tops = (up - 0.6, up - 0.6 - SIDE - 0.3)
+        tops = (up - 0.6, up - 0.6 - SIDE - ROW)
         lens = np.log10(np.maximum(chain.far, 1e-7)), np.log10(np.maximum(chain.near, 1e-7))
         peak = max(float(image.max()) for image in lens)
         psfs = [np.clip((image - peak + 5) / 5, 0, 1) for image in lens]

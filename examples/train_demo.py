@@ -1,6 +1,6 @@
 """What a learnt plate is worth: the same network trained behind it and behind a plain lens, on the same scenes.
 
-    make train-demo                     about an hour and a half on two cores
+    make train-demo                     about an hour on two cores
     python examples/train_demo.py --images DIR --test DIR [--steps N] [--seeds 0 1 2] [--out runs/train_demo]
 
 For each occlusion model that is asked for, two trainings with the same pictures, scenes, steps and seed: the plate of
@@ -62,6 +62,7 @@ class Plan:
         test: pictures to judge by; the same.
         models: occlusion models.
         seeds: seeds of the trainings.
+        spec: what is trained.
         overrides: changes to the spec.
     """
 
@@ -70,6 +71,7 @@ class Plan:
     test: Path | None = None
     models: Sequence[str] = ("paper", "radiometric")
     seeds: Sequence[int] = (0,)
+    spec: Path = SPEC
     overrides: Sequence[str] = field(default_factory=tuple)
 
 
@@ -160,7 +162,7 @@ def written(found: dict[str, Any]) -> str:
 
 def run(plan: Plan) -> dict[str, Any]:
     """Train everything and write the table."""
-    design = optimize(SPEC, plan.out / "design", (), say).folder
+    design = optimize(plan.spec, plan.out / "design", (), say).folder
     found = {}
     for model in plan.models:
         judged = {camera: [trained(plan, design, model, camera, seed) for seed in plan.seeds] for camera in CAMERAS}
@@ -182,7 +184,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs") / "train_demo")
     given = parser.parse_args()
     overrides = [] if given.steps is None else [f"train.steps={given.steps}"]
-    plan = Plan(given.out, given.images, given.test, given.models, given.seeds, overrides)
+    plan = Plan(given.out, given.images, given.test, given.models, given.seeds, overrides=overrides)
 
     def work() -> None:
         run(plan)

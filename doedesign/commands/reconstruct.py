@@ -94,6 +94,8 @@ def reconstruct(
     model = open_model(model_folder)
     _require_tiles(request, model)
     psfs = psfs_of(model, request.psf)
+    if {"obstruction", "occlusion"} <= model.about.keys():
+        say(f"{model.folder}: trained behind {model.about['obstruction']}, occlusion model {model.about['occlusion']}")
     say(f"obstruction at {100 * psfs.near_m:.3g} cm, scene at {_told(psfs.far_m)}")
     written: list[Path] = []
     with alone_in(folder):

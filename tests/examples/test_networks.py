@@ -1,0 +1,86 @@
+"""The released model works where it lies, its record is true, and the scripts around networks do what they say."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign.cli import main
+from doedesign.images import sample_files
+from doedesign.recon.model import RELEASED, open_model, released_model
+from doedesign.recon.photos import read_capture
+from fab.errors import InputError
+from fab.files import read_json, sha256_file
+from sim.light import srgb_from_linear
+from tests.recon.small_training import SPEC
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "examples"))  # as `python examples/NAME.py` has it
+
+import release_model  # noqa: E402
+import see_through  # noqa: E402
+import train_demo  # noqa: E402
+
+
+def psnr(image: np.ndarray, scene: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((image - scene) ** 2)))
+
+
+def test_the_released_model_is_what_its_manifest_says():
+    folder = ROOT / RELEASED
+    said = read_json(folder / "manifest.json")
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", *said["sha256"]}
+    assert all(sha256_file(folder / name) == digest for name, digest in said["sha256"].items())
+    assert (folder / "network.npz").stat().st_size < 10e6
+    model = open_model(folder)
+    assert model.about["pictures"]["licence"] == said["trained"]["licence"]
+    assert len(model.about["pictures"]["training"]) > 20
+    masks = read_json(folder / "masks.json")
+    assert masks["source"]["height_sha256"] == said["sha256"]["height.exr"]
+
+
+def test_reconstruct_works_out_of_the_box(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Without a model named: the capture that lies beside the released one comes out nearer to its scene."""
+    monkeypatch.chdir(tmp_path)
+    capture = released_model() / "capture.png"
+    assert main(["reconstruct", str(capture), "--out", str(tmp_path / "out")]) == 0
+    assert "occlusion model" in capsys.readouterr().err
+    images = [np.clip(srgb_from_linear(read_capture(p).light), 0, 1) for p in (capture, tmp_path / "out/capture.png")]
+    chain = see_through.photographed(
+        open_model(released_model()), sample_files()[0], release_model.SEED, side=release_model.SIDE
+    )
+    # Both were rounded to 16 bits, and transforms differ in the last digits from machine to machine.
+    assert psnr(images[0], chain.plate) > 60
+    assert psnr(images[1], chain.scene) > psnr(images[0], chain.scene) + 4
+
+
+def test_the_chain_in_one_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["see_through.py", "--out", str(tmp_path / "chain.png")])
+    assert see_through.main() == 0
+    assert (tmp_path / "chain.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
+    """At the smallest size, where numbers mean nothing: that the table is that of the trainings' own scores."""
+    spec = tmp_path / "small.toml"
+    # Enough of it that no scene is without an occluded region.
+    spec.write_text(SPEC.replace('kind = "dirt"', 'kind = "dirt"\noptions = { coverage = [0.6, 0.8] }'))
+    changes = ("train.steps=2", "train.validation=2", "network.width=1", "network.refine=false")
+    plan = train_demo.Plan(tmp_path / "out", models=("paper",), seeds=(0, 1), spec=spec, overrides=changes)
+    # Its pictures are scikit-image's where the checkout has no others beside it.
+    train_demo.DATA = tmp_path
+    table = train_demo.run(plan)["paper"]
+    assert json.loads((plan.out / "table.json").read_text())["paper"] == table
+    folders = [plan.out / f"paper_doe_{seed}" for seed in plan.seeds]
+    scores = [read_json(folder / "metrics.json")["reconstruction"]["full"]["psnr"] for folder in folders]
+    assert table["full"]["rows"]["doe: network"]["psnr"] == pytest.approx(np.mean(scores))
+    assert "## Occlusion model `paper`, 2 scenes" in (plan.out / "table.md").read_text()
+    with pytest.raises(InputError, match="must be a finished training behind a plate"):
+        release_model.release(plan.out / "paper_conventional_0", None, tmp_path / "released")
+    release_model.release(folders[0], None, tmp_path / "released")
+    assert open_model(tmp_path / "released").colours == ("550nm",)
