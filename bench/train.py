@@ -10,7 +10,8 @@ new state. The floor is what the step cannot do without, each thing in a program
 * optics: for every colour, near and far, forth and back, one transform of all cells;
 * capture: what `bench.capture` counts for the model with PSFs that are learned, and on the way back the transforms of
   the three sums and of the six PSFs;
-* Wiener filters: transforms of the image and the result, the same on the way back, and of the PSFs at every scale;
+* Wiener filters: transforms of the image and the result, the same on the way back, and of the PSFs at every scale; for
+  whole pictures at twice the side, with their mirror images;
 * convolutions: forward, the gradient by the image, the gradient by the weights, and the same of the transposed ones,
   each in the fastest of the forms that are known (see `doedesign.recon.conv`), which is looked for at the beginning.
 
@@ -143,11 +144,13 @@ def network_floor(network: Network, size: int, window: int) -> tuple[list[Call],
 
     colours = network.layout.colours
     shapes = [jax.ShapeDtypeStruct((1, colours, n, n), jnp.float32) for n in (size, window, window)]
-    with watched("convolution"), watched("doubled"), watched("deblurred"), watched("blur_at"):
+    with watched("convolution"), watched("doubled"), watched("deblurred"), watched("blur_at"), watched("sharpened"):
         jax.eval_shape(network, *shapes)
     filters = []
     for (_, side, _, channels), *_ in seen["deblurred"]:
         filters += [transforms(2 * channels, side), transforms(2 * channels, side, forth=False)]
+    for (_, side, _, channels), *_ in seen["sharpened"]:  # with its mirror images, and the PSF each time
+        filters += [transforms(3 * channels, 2 * side), transforms(3 * channels, 2 * side, forth=False)]
     # A PSF that is wanted twice at one scale is transformed once; `unit` tells the far one from the near one.
     for side, _ in {(shape[0], unit) for _, shape, *_, unit in seen["blur_at"]}:
         filters += [transforms(colours, side), transforms(colours, side, forth=False)]

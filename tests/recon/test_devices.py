@@ -132,7 +132,7 @@ def start_both(arguments: list[Any], cache: Path) -> list[subprocess.Popen[str]]
 def ended(processes: list[subprocess.Popen[str]], code: int) -> list[bool]:
     """Whether each wrote anything, when all have ended by themselves."""
     try:
-        said = [process.communicate(timeout=150) for process in processes]
+        said = [process.communicate(timeout=300) for process in processes]
     finally:
         for process in processes:
             process.kill()
@@ -152,7 +152,7 @@ def test_two_hosts_train_as_one_and_stop_together(tmp_path: Path) -> None:
     assert ended([start([run, images, alone, "--occlusion", "paper"], tmp_path / "cache")], 0) == [True]
 
     arguments = [run, images, both, "--occlusion", "paper"]
-    processes, history, end = start_both(arguments, tmp_path), both / "history.jsonl", time.monotonic() + 150
+    processes, history, end = start_both(arguments, tmp_path), both / "history.jsonl", time.monotonic() + 300
     while not (history.exists() and history.read_bytes().count(b"\n") >= 1):
         if any(process.poll() is not None for process in processes) or time.monotonic() > end:
             ended(processes, 130)
