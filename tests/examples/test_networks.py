@@ -16,12 +16,13 @@ from fab.files import read_json, sha256_file
 from sim.light import srgb_from_linear
 from tests.recon.small_training import SPEC
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "examples"))  # as `python examples/NAME.py` has it
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
-import release_model  # noqa: E402
-import see_through  # noqa: E402
-import train_demo  # noqa: E402
+import release_model  # pyright: ignore[reportMissingImports]
+import see_through  # pyright: ignore[reportMissingImports]
+import train_demo  # pyright: ignore[reportMissingImports]
+
+ROOT = Path(__file__).parents[2]
 
 
 def psnr(image: np.ndarray, scene: np.ndarray) -> float:
