@@ -224,7 +224,7 @@ def open_run(folder: Path) -> Run:
         raise InputError(
             str(folder), "the run must be finished", "an unfinished run", "Resume it with the same command."
         )
-    if not (folder / "height.exr").is_file():
+    if manifest["format"] == TRAINING and "height.exr" not in manifest["results_sha256"]:  # behind a plain lens
         cure = "Give the run, or a training behind its plate."
         raise InputError(str(folder), "must hold a plate, height.exr", "none", cure)
     for name, digest in manifest["results_sha256"].items():
