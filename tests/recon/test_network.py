@@ -83,16 +83,16 @@ def test_both_psfs_matter() -> None:
     wide = jnp.full((1, 3, 9, 9), 1 / 81, jnp.float32)
     assert float(jnp.abs(CALL(network, capture(), wide, psfs()) - before).max()) > 1e-4
     assert float(jnp.abs(CALL(network, capture(), psfs(), wide) - before).max()) > 1e-4
-    # The far PSF is brought to unit sum, the near one is not: its estimate is a picture.
-    np.testing.assert_allclose(CALL(network, capture(), 2 * psfs(), psfs()), before, atol=1e-4)
+    # What a PSF loses is made up for in pictures, so its sum counts, too.
+    assert float(jnp.abs(CALL(network, capture(), 2 * psfs(), psfs()) - before).max()) > 1e-4
 
 
 def test_items_of_a_batch_do_not_mix() -> None:
     network = Network.make(SMALL, 1)
     one, other = capture(), 1 - capture()
     both = CALL(network, *(jnp.concatenate(pair) for pair in ((one, other), (psfs(), psfs()), (psfs(), psfs()))))
-    # The same sums in blocks of another size.
-    np.testing.assert_allclose(both[1:], CALL(network, other, psfs(), psfs()), atol=2e-5)
+    # The same sums in blocks of another size, and an inverse filter that magnifies their rounding.
+    np.testing.assert_allclose(both[1:], CALL(network, other, psfs(), psfs()), rtol=1e-4, atol=2e-5)
 
 
 def test_checkpointing_changes_memory_and_no_number() -> None:
