@@ -279,9 +279,9 @@ def _read_manifest(folder: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str
     if manifest.get("format") not in formats:
         raise InputError(
             str(path),
-            f'must say format "{FORMAT}"',
+            "must say format " + " or ".join(f'"{name}"' for name in formats),
             repr(manifest.get("format")),
-            "Give a folder that optimize of this version wrote.",
+            "Give a folder that this version wrote.",
         )
     kinds: dict[str, type] = {"state": str, "spec_sha256": str}
     if manifest["format"] == FORMAT:

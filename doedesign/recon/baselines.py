@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.convolve import convolve, landed, plan_otf, spectrum
+from doedesign.recon.wiener import sharpened
+from sim.convolve import convolve, plan_otf
 from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
 from sim.sensor import Sensor
 
@@ -75,7 +76,7 @@ def wiener(
     psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
     noise_to_signal: Float[Array, "*c"] | Float[np.ndarray, "*c"] | float,
 ) -> Float[Array, "c y x"]:
-    """Wiener filter conj(H) / (|H|² + N/S).
+    """Wiener filter conj(H) / (|H|² + N/S), as the network has it (`doedesign.recon.wiener.sharpened`).
 
     Args:
         capture: `[c, y, x]` linear light.
@@ -90,11 +91,9 @@ def wiener(
         ValueError: an even window.
     """
     _require_odd(psf)
-    # Turned round, a PSF has the conjugate transform, in the phase that `landed` undoes.
-    otf = plan_otf(jnp.asarray(psf)[:, ::-1, ::-1], (capture.shape[1], capture.shape[2]), "reflect")
-    power = otf.transfer.real**2 + otf.transfer.imag**2
-    ratio = jnp.broadcast_to(jnp.asarray(noise_to_signal, jnp.float32), (len(psf),))[:, None, None]
-    return landed(spectrum(capture, otf) * otf.transfer / (power + ratio), otf)
+    ratio = jnp.broadcast_to(jnp.asarray(noise_to_signal, jnp.float32), (len(psf),))
+    image = jnp.asarray(capture).transpose(1, 2, 0)[None]
+    return sharpened(image, jnp.asarray(psf)[None], jnp.log(ratio))[0].transpose(2, 0, 1)
 
 
 @partial(jax.jit, static_argnames="iterations")
