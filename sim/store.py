@@ -20,6 +20,7 @@ import hashlib
 import io
 import json
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _BANK = "psf_bank"
 _DIGEST = "sha256"
 _GUARDED = ("aperture_m", "pitch_m", _BANK)
+_SILENT = threading.Lock()
 
 
 class StoredHeight(NamedTuple):
@@ -362,19 +364,14 @@ def _broken(path: Path, what: str) -> InputError:
 def _silence() -> Iterator[Callable[[], str]]:
     """Keep what OpenEXR prints about broken files off the terminal; yields a function that returns it.
 
-    It prints through Python's stdout, which must carry data only, and says more straight to the process's stderr.
+    It prints through Python's stdout, which must carry data only, and says more straight to the process's stderr. Both
+    are the whole process's: of two threads at once, the second would put back what the first had put there.
     """
     printed = io.StringIO()
-    try:
-        saved = os.dup(2)
-    except OSError:  # the caller closed it
-        with contextlib.redirect_stdout(printed):
-            yield lambda: printed.getvalue().removeprefix("Warning: ")
-        return
-    with contextlib.redirect_stdout(printed), open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), 2)
-        try:
-            yield lambda: printed.getvalue().removeprefix("Warning: ")
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
+    with _SILENT, contextlib.redirect_stdout(printed), contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # the caller closed it
+            saved = os.dup(2)
+            stack.callback(os.close, saved)
+            stack.callback(os.dup2, saved, 2)
+            os.dup2(stack.enter_context(open(os.devnull, "wb")).fileno(), 2)
+        yield lambda: printed.getvalue().removeprefix("Warning: ")

@@ -1,6 +1,8 @@
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -248,3 +250,15 @@ def test_pictures_keep_their_maps_and_words(tmp_path: Path, rng: np.random.Gener
     assert texts == {"what": "light"}
     with pytest.raises(ValueError, match="one shape"):
         write_picture(tmp_path / "b.exr", {**maps, "G": np.zeros((4, 5))})
+
+
+def test_threads_that_read_at_once_leave_the_terminal_as_it_was(tmp_path: Path):
+    """Broken files are talked about on stdout and stderr; what hides that must not hide anything afterwards."""
+    paths = [tmp_path / f"{k}.exr" for k in range(4)]
+    for path in paths:
+        write_picture(path, {"Y": np.zeros((64, 64), np.float32)})
+    before, place = sys.stdout, os.fstat(2)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(read_picture, paths * 50))
+    assert sys.stdout is before
+    assert os.path.samestat(os.fstat(2), place)
