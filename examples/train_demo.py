@@ -6,8 +6,8 @@
 For each occlusion model that is asked for, two trainings with the same pictures, scenes, steps and seed: the plate of
 `examples/automotive_cpu.toml`, learnt together with its network, and a conventional camera, which is the same one with
 a flat plate. Both are judged on the same dirty scenes, made from pictures that neither was trained on. The table gives
-means and, because scenes are the same, the interval of the mean difference scene by scene; beside it stand the rows of
-the paper's Table 1 that need no training. Written to OUT:
+means and, because scenes are the same, the interval of the mean difference scene by scene (and seed by seed, where
+there are several); beside it stand the rows of the paper's Table 1 that need no training. Written to OUT:
 
     design/, MODEL_CAMERA_SEED/     the design to begin with, and a training for each
     table.json, table.md            what came out
@@ -109,53 +109,53 @@ def trained(plan: Plan, design: Path, model: str, camera: str, seed: int) -> dic
 
 
 def scores_of(found: Sequence[dict[str, Any]], row: str, region: str, score: str) -> np.ndarray:
-    """`[scene]` a score of every scene, averaged over seeds; NaN where nothing is occluded."""
-    values = [[each[row][region][score] for each in one["scenes"]] for one in found]
-    return np.array(values, np.float64).mean(axis=0)
+    """`[seed, scene]` a score; NaN where nothing is occluded."""
+    return np.array([[each[row][region][score] for each in one["scenes"]] for one in found], np.float64)
 
 
 def compared(judged: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Means, and differences scene by scene with their 95 % intervals."""
-    table: dict[str, Any] = {"scenes": len(judged["doe"][0]["scenes"])}
+    table: dict[str, Any] = {"scenes": len(judged["doe"][0]["scenes"]), "seeds": len(judged["doe"])}
     for region in ("occluded", "full"):
         rows = {
-            f"{camera}: {label}": {s: _mean(scores_of(judged[camera], row, region, s)) for s in ("psnr", "ssim")}
+            f"{camera}: {label}": {
+                s: mean_and_interval(scores_of(judged[camera], row, region, s)).mean for s in ("psnr", "ssim")
+            }
             for camera in CAMERAS
             for row, label in ROWS.items()
         }
         psnr = {c: scores_of(judged[c], "reconstruction", region, "psnr") for c in CAMERAS}
-        raw = scores_of(judged["doe"], "capture", region, "psnr")
+        others = {
+            "network behind the plate over its capture": scores_of(judged["doe"], "capture", region, "psnr"),
+            "network behind the plate over the one behind a plain lens": psnr["conventional"],
+        }
         differences = {
-            "network behind the plate over its capture": paired_difference(psnr["doe"], raw),
-            "network behind the plate over the one behind a plain lens": paired_difference(
-                psnr["doe"], psnr["conventional"]
-            ),
+            name: paired_difference(psnr["doe"], other)._asdict()
+            | {"by_seed": np.nanmean(psnr["doe"] - other, axis=1).tolist()}
+            for name, other in others.items()
         }
-        table[region] = {
-            "rows": rows,
-            "psnr_differences": {name: found._asdict() for name, found in differences.items()},
-        }
+        table[region] = {"rows": rows, "psnr_differences": differences}
     return table
-
-
-def _mean(values: np.ndarray) -> float:
-    return mean_and_interval(values).mean
 
 
 def written(found: dict[str, Any]) -> str:
     """The tables as Markdown."""
     lines = []
     for model, table in found.items():
-        lines += [f"## Occlusion model `{model}`, {table['scenes']} scenes", ""]
+        seeds = f"{table['seeds']} seed{'s' if table['seeds'] > 1 else ''}"
+        lines += [f"## Occlusion model `{model}`, {table['scenes']} scenes, {seeds}", ""]
         lines += ["| occluded region (full picture) | PSNR, dB | SSIM |", "| --- | --- | --- |"]
         for name, hidden in table["occluded"]["rows"].items():
             full = table["full"]["rows"][name]
             psnr, ssim = (f"{hidden[s]:.{n}f} ({full[s]:.{n}f})" for s, n in (("psnr", 2), ("ssim", 3)))
             lines.append(f"| {name} | {psnr} | {ssim} |")
-        lines += ["", "PSNR differences, dB, with 95 % intervals of the mean over scenes:", ""]
+        draws = "scenes and seeds" if table["seeds"] > 1 else "scenes"
+        lines += ["", f"PSNR differences, dB, with 95 % intervals of the mean over {draws}:", ""]
         for region in ("occluded", "full"):
             for name, d in table[region]["psnr_differences"].items():
-                lines.append(f"- {region}: {name}: {d['mean']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f})")
+                by_seed = ", ".join(f"{value:+.2f}" for value in d["by_seed"])
+                told = f"; by seed {by_seed}" if table["seeds"] > 1 else ""
+                lines.append(f"- {region}: {name}: {d['mean']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f}){told}")
         lines.append("")
     return "\n".join(lines)
 

@@ -29,6 +29,7 @@ from doedesign.recon.perceptual import Lpips, lpips, lpips_map
 from doedesign.recon.similarity import WINDOW, Images, ssim_maps
 
 Masks = Float[Array, "b y x"] | Float[np.ndarray, "b y x"]
+Values = Sequence[float] | Float[np.ndarray, "..."]
 
 
 class Region(NamedTuple):
@@ -130,7 +131,7 @@ class Interval(NamedTuple):
         mean: of the values.
         low: lower end of its confidence interval.
         high: upper end.
-        size: how many values there were.
+        size: how many pictures there were.
     """
 
     mean: float
@@ -139,49 +140,58 @@ class Interval(NamedTuple):
     size: int
 
 
-def mean_and_interval(values: Sequence[float] | Float[np.ndarray, " n"], confidence: float = 0.95) -> Interval:
-    """Mean of scores over pictures, with Student's t interval.
+def mean_and_interval(values: Values, confidence: float = 0.95) -> Interval:
+    """Mean of scores over pictures, and over seeds where there are several, with Student's t interval.
 
-    It takes the pictures for independent draws. Several crops of one photograph are not: average them first.
+    It takes the pictures for independent draws. Several crops of one photograph are not: average them first. With
+    several seeds both are draws: the variance of the mean is that of the seeds' means plus that of the pictures' means,
+    which counts what belongs to neither twice, and its degrees of freedom are Satterthwaite's (Biometrics Bulletin 2,
+    110, 1946). One seed says nothing about others, and the interval then holds for that seed.
 
     Args:
-        values: one score per picture; NaN (a picture without a score) is left out.
+        values: `[picture]` or `[seed, picture]` scores; a picture with a NaN (which has no score) is left out.
         confidence: how often such an interval holds the true mean, between 0 and 1.
 
     Returns:
-        The mean; its interval is infinite for a single value.
+        The mean and the number of pictures; the interval is infinite for a single picture.
 
     Raises:
         ValueError: no value, an infinite one, or a confidence out of range.
     """
     if not 0 < confidence < 1:
         raise ValueError(f"`confidence` must lie between 0 and 1, but got {confidence}")
-    given = np.asarray(values, np.float64)
-    known = given[~np.isnan(given)]
+    given = np.atleast_2d(np.asarray(values, np.float64))
+    known = given[:, ~np.isnan(given).any(axis=0)]
+    seeds, pictures = known.shape
     if not known.size or np.isinf(known).any():
-        raise ValueError(f"`values` must hold at least one number and no infinite one, but got {given}")
+        raise ValueError(f"`values` must hold at least one number and no infinite one, but got {np.asarray(values)}")
     mean = float(known.mean())
-    if known.size == 1:
+    if pictures == 1:
         return Interval(mean, -np.inf, np.inf, 1)
-    reach = float(scipy.stats.t.ppf(0.5 + confidence / 2, known.size - 1) * scipy.stats.sem(known))
-    return Interval(mean, mean - reach, mean + reach, int(known.size))
+    freedom = np.array([n - 1 for n in (seeds, pictures) if n > 1])
+    of_means = [known.mean(axis=1 - axis) for axis in (0, 1) if known.shape[axis] > 1]
+    parts = np.array([np.var(means, ddof=1) / means.size for means in of_means])
+    if not parts.any():
+        return Interval(mean, mean, mean, pictures)
+    together = np.square(parts.sum()) / np.sum(np.square(parts) / freedom)
+    reach = float(scipy.stats.t.ppf(0.5 + confidence / 2, together) * np.sqrt(parts.sum()))
+    return Interval(mean, mean - reach, mean + reach, pictures)
 
 
-def paired_difference(
-    a: Sequence[float] | Float[np.ndarray, " n"],
-    b: Sequence[float] | Float[np.ndarray, " m"],
-    confidence: float = 0.95,
-) -> Interval:
+def paired_difference(a: Values, b: Values, confidence: float = 0.95) -> Interval:
     """By how much `a` is above `b` on the same pictures: the mean of the differences, with its interval.
 
     Args:
-        a: one score per picture.
-        b: scores of another method on the same pictures, in the same order.
+        a: `[picture]` or `[seed, picture]` scores.
+        b: scores of another method on the same pictures (and with the same seeds), in the same order.
         confidence: as in `mean_and_interval`.
 
     Raises:
         ValueError: unlike numbers of scores, or as in `mean_and_interval`.
     """
-    if len(a) != len(b):
-        raise ValueError(f"both methods must have one score per picture, but got {len(a)} and {len(b)}")
+    shapes = np.shape(a), np.shape(b)
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"both methods must have one score per picture (and seed), but got {shapes[0]} and {shapes[1]}"
+        )
     return mean_and_interval(np.asarray(a, np.float64) - np.asarray(b, np.float64), confidence)

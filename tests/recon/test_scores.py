@@ -158,6 +158,23 @@ def test_mean_and_interval():
         mean_and_interval([1.0, 2.0], 95)
 
 
+def test_seeds_and_pictures_are_both_draws(rng):
+    """Both spreads count, so that the interval holds as often as it says, which that over pictures alone does not."""
+    seeds, pictures, turns = 3, 40, 1000
+    shared = [0.3 * rng.standard_normal((turns, seeds, 1)), rng.standard_normal((turns, 1, pictures))]
+    drawn = sum(shared) + 0.2 * rng.standard_normal((turns, seeds, pictures))
+    both, one = ([mean_and_interval(values) for values in given] for given in (drawn, drawn.mean(axis=1)))
+    assert [found.mean for found in both] == pytest.approx([found.mean for found in one])
+    share, share_of_one = (np.mean([found.low < 0 < found.high for found in each]) for each in (both, one))
+    assert share > 0.94  # 0.95, less 1.5 standard errors of a share of 1000
+    assert share_of_one < 0.9
+    np.testing.assert_allclose(mean_and_interval(drawn[0, :1]), mean_and_interval(drawn[0, 0]))
+    assert mean_and_interval(np.ones((2, 5))) == (1, 1, 1, 5)
+    gap = drawn[0].copy()
+    gap[1, 7] = np.nan
+    assert mean_and_interval(gap) == mean_and_interval(np.delete(drawn[0], 7, axis=1))
+
+
 def test_pairs_tell_more_than_the_spread_of_pictures(rng):
     easy = rng.normal(22, 4, 40)
     a, b = easy + rng.normal(0.5, 0.2, 40), easy
