@@ -16,8 +16,9 @@ from doedesign.predict import Drawn
 from doedesign.recon.data import Item
 from fab.process import Process, Variation
 from sim.camera import Camera
+from sim.convolve import Border
 from sim.disc import disc_window
-from sim.formation import Optics, capture, lost_share
+from sim.formation import Optics, capture, lost_share, own_margin_px
 from sim.obstruction import Kind
 from sim.occlusion import Model, Outside
 from sim.psf import psf_bank, surface_bank
@@ -39,6 +40,8 @@ class Bench(NamedTuple):
         outside: see `sim.formation.capture`.
         sensor: the sensor.
         shadow_px: window of the shadow discs.
+        border: what lies beyond an item. With `own` an item brings its surroundings along, so that light comes in over
+            the edges as it does in the world, and everything captured is smaller than the item, by `margin_px`.
     """
 
     camera: Camera
@@ -48,6 +51,12 @@ class Bench(NamedTuple):
     outside: Outside
     sensor: Sensor
     shadow_px: int
+    border: Border = "reflect"
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels per axis by which items are larger than what is captured of them."""
+        return own_margin_px(self.camera.window, self.shadow_px, self.model) if self.border == "own" else 0
 
 
 class Captured(NamedTuple):
@@ -86,8 +95,22 @@ def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
         _recorded(scene, optics, bench, jax.random.fold_in(key, k)) for k, optics in enumerate((without, with_plate))
     )
     alpha = np.asarray(lost_share(scene, with_plate, bench.model))
-    depth = np.where(item.mask >= 0.5, np.float32(item.depth_m), np.float32(item.background_depth_m))
-    return Captured(np.asarray(scene.background), conventional, doe, item.mask, alpha, depth)
+    seen = within(item, bench.margin_px)
+    depth = np.where(seen.mask >= 0.5, np.float32(item.depth_m), np.float32(item.background_depth_m))
+    clean, alpha = (_within(np.asarray(image), bench.margin_px) for image in (scene.background, alpha))
+    return Captured(clean, conventional, doe, seen.mask, alpha, depth)
+
+
+def within(item: Item, margin_px: int) -> Item:
+    """The middle of a scene: `margin_px` smaller along each axis."""
+    names = ("background", "mask", "radiance")
+    return item._replace(**{name: _within(getattr(item, name), margin_px) for name in names})
+
+
+def _within(image: np.ndarray, margin_px: int) -> np.ndarray:
+    first = margin_px // 2
+    y, x = (n - margin_px for n in image.shape[-2:])
+    return image[..., first : first + y, first : first + x]
 
 
 def plate_psfs(drawn: Drawn, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
@@ -137,6 +160,6 @@ def _optics(psfs: Psfs, bench: Bench, item: Item) -> Optics:
 
 def _recorded(scene: Scene, optics: Optics, bench: Bench, key: Array) -> Float[np.ndarray, "c y x"]:
     """The developed capture."""
-    light = capture(scene, optics, bench.model, outside=bench.outside)
+    light = capture(scene, optics, bench.model, border=bench.border, outside=bench.outside)
     raw = np.asarray(expose(light, bench.sensor, key))
     return np.asarray(developed(demosaiced(raw, bench.sensor) if bench.sensor.pattern else raw, bench.sensor))

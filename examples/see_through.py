@@ -4,14 +4,16 @@
 
 MODEL is the folder of a training (RUN/trained), or the released one if left out. A picture that the network was not
 trained on is put behind the obstruction of its spec, photographed with the plate and with a plain lens, with all noise
-of the sensor, and reconstructed from the plate's capture.
+of the sensor, and reconstructed from the plate's capture. The picture goes on beyond what is shown of it, so that
+light comes in over the edges as it does in the world.
 """
 
 import argparse
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,22 +21,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from doedesign.build import camera_of
-from doedesign.capture import obstruction_of, outside_of, seen_in, sensor_of, shown_as
+from doedesign.capture import obstruction_of, occlusion_of, outside_of, sensor_of, shown_as
 from doedesign.cli import exit_code
 from doedesign.images import Pictures, sample_files
 from doedesign.recon.data import SceneData
 from doedesign.recon.model import Model, open_model, released_model
 from doedesign.recon.scores import scores
 from doedesign.report.canvas import note, picture, place, scale_bar
+from doedesign.simulated import Bench, captured, flat_psfs, shadow_window
 from doedesign.spec import load_spec
 from fab.units import format_length
 from sim.camera import Camera
-from sim.formation import Optics, capture, psf_at
+from sim.formation import psf_at
 from sim.light import srgb_from_linear
-from sim.obstruction import View
-from sim.psf import psf_bank
-from sim.scene import Obstruction, Scene
-from sim.sensor import developed, expose
+from sim.obstruction import Kind, View
 from sim.store import read_height
 
 SIDE, GAP, ROW = 1.75, 0.12, 0.42  # inches; ROW between two rows, for a scale bar and words
@@ -73,42 +73,52 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
 
     Args:
         model: plate and network.
-        file: the picture.
+        file: the picture; enlarged where it does not hold the scene and what lies around it.
         seed: of the obstruction and the noise.
         occlusion: occlusion model; that of the training if None.
         side: pixels per side; those of the training if None.
     """
-    spec = load_spec(model.folder / "spec.toml")
-    camera = replace(camera_of(spec), window=model.bank.energy.shape[-1])
-    kind, sensor = obstruction_of(spec, str(model.folder / "spec.toml")), sensor_of(spec)
-    name: Any = occlusion or model.about["occlusion"]
-    side = side or spec.train.size
-    view = View((side, side), camera.pixel_m, camera.sensor_distance_m)
-    far = (min(spec.scene.far_m), max(spec.scene.far_m))
-    item = SceneData(Pictures((file,), most_px=2 * side), kind, view, far, seed, mirrored=False).item(0, 0)
-    light = seen_in(item.background, camera)
-    near = Obstruction(item.mask, seen_in(item.radiance, camera), item.depth_m)
-    scene = Scene(light, item.background_depth_m, (near,))
-    depths = (item.background_depth_m, item.depth_m)
-    flat = psf_bank(camera, np.zeros(camera.grid.shape, np.float32), depths)
-    shots = []
-    for k, bank in enumerate((flat, model.bank)):
-        optics = Optics.of(bank, camera, depths)
-        seen = capture(scene, optics, name, outside=outside_of(kind))
-        shots.append(np.asarray(developed(expose(seen, sensor, jax.random.key(seed + k)), sensor)))
-    psfs = [psf_at(model.bank, depth) for depth in depths]
-    found = np.asarray(eqx.filter_jit(model.network)(*(jnp.asarray(image[None]) for image in (shots[1], *psfs))))[0]
-    clean, plain, plate = (np.clip(srgb_from_linear(np.asarray(image)), 0, 1) for image in (light, *shots))
-    found = np.clip(found, 0, 1)
+    bench, kind, far = bench_of(model, occlusion)
+    wanted = (side or load_spec(model.folder / "spec.toml").train.size) + bench.margin_px
+    view = View((wanted, wanted), bench.camera.pixel_m, bench.camera.sensor_distance_m)
+    item = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0, 0)
+    shot = captured(item, bench, jax.random.key(seed))
+    psfs = [psf_at(model.bank, depth) for depth in (item.background_depth_m, item.depth_m)]
+    clean, plain, plate = (
+        np.clip(srgb_from_linear(image), 0, 1) for image in (shot.clean, shot.conventional, shot.doe)
+    )
+    pictures = {"scene": clean, "plain": plain, "plate": plate, "network": restored(model, shot.doe, *psfs)}
     psnr = {}
-    for what, image in (("plain", plain), ("plate", plate), ("network", found)):
-        judged = scores(image[None], clean[None], item.mask[None])
+    for what in ("plain", "plate", "network"):
+        judged = scores(pictures[what][None], clean[None], shot.mask[None])
         psnr[what] = (float(judged.occluded.psnr[0]), float(judged.full.psnr[0]))
     told = f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(item.depth_m, 4))}, "
-    told += f"occlusion model {name}. PSNR where it is covered, in brackets over all."
-    pictures = {"scene": clean, "plain": plain, "plate": plate, "network": found, "far": psfs[0], "near": psfs[1]}
-    shown = {name: shown_as(image, camera) for name, image in pictures.items()}
-    return Chain(mask=item.mask, near_m=item.depth_m, psnr=psnr, words=told, **shown)
+    told += f"occlusion model {bench.model}. PSNR where it is covered, in brackets over all."
+    pictures |= {"far": psfs[0], "near": psfs[1]}
+    shown = {name: shown_as(image, bench.camera) for name, image in pictures.items()}
+    return Chain(mask=shot.mask, near_m=item.depth_m, psnr=psnr, words=told, **shown)
+
+
+def bench_of(model: Model, occlusion: str | None = None) -> tuple[Bench, Kind, tuple[float, float]]:
+    """The camera of a model beside a conventional one, its obstruction, and the distances of its scenes.
+
+    Args:
+        model: plate and network.
+        occlusion: occlusion model; that of the training if None.
+    """
+    where = str(model.folder / "spec.toml")
+    spec = load_spec(model.folder / "spec.toml")
+    camera = replace(camera_of(spec), window=model.bank.energy.shape[-1])
+    kind, name = obstruction_of(spec, where), occlusion_of(spec, where, occlusion or model.about["occlusion"])
+    eyes = partial(psf_at, model.bank), flat_psfs(camera)
+    bench = Bench(camera, *eyes, name, outside_of(kind), sensor_of(spec), shadow_window(kind, camera), "own")
+    return bench, kind, (min(spec.scene.far_m), max(spec.scene.far_m))
+
+
+def restored(model: Model, capture: np.ndarray, far: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """What a network makes of a capture, `[c, y, x]` display values, told the PSFs of the scene and the obstruction."""
+    found = eqx.filter_jit(model.network)(*(jnp.asarray(image[None]) for image in (capture, far, near)))
+    return np.clip(np.asarray(found)[0], 0, 1)
 
 
 def draw(path: Path, chain: Chain, model: Model, camera: Camera) -> None:

@@ -7,7 +7,9 @@ For each occlusion model that is asked for, two trainings with the same pictures
 `examples/automotive_cpu.toml`, learnt together with its network, and a conventional camera, which is the same one with
 a flat plate. Both are judged on the same dirty scenes, made from pictures that neither was trained on. The table gives
 means and, because scenes are the same, the interval of the mean difference scene by scene (and seed by seed, where
-there are several); beside it stand the rows of the paper's Table 1 that need no training. Written to OUT:
+there are several); beside it stand the rows of the paper's Table 1 that need no training. Trainings let a scene go on
+beyond its edges as its mirror image, and filters know that: the last lines tell what is left of the differences where
+it goes on as the picture does. Written to OUT:
 
     design/, MODEL_CAMERA_SEED/     the design to begin with, and a training for each
     table.json, table.md            what came out
@@ -21,17 +23,30 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+import see_through
 
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.commands.train import Request, train
-from doedesign.images import PICTURE_FILES
-from doedesign.recon.scores import mean_and_interval, paired_difference
+from doedesign.images import PICTURE_FILES, Pictures, picture_files, sample_files
+from doedesign.progress import meter
+from doedesign.recon.data import SceneData
+from doedesign.recon.heldout import SCENE_SEED
+from doedesign.recon.model import open_model
+from doedesign.recon.scores import mean_and_interval, paired_difference, scores
+from doedesign.simulated import captured, within
+from doedesign.spec import load_spec
+from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
+from sim.formation import psf_at
+from sim.light import srgb_from_linear
+from sim.obstruction import View
 
 SPEC = Path(__file__).parent / "automotive_cpu.toml"
 # Where the checkout has a folder of data beside it. Trained on: pictures whose licences allow it (Unsplash, CC0, free
@@ -43,6 +58,14 @@ JUDGED_BY = ("backgrounds_bsds500/val/*", "driving_camvid480/*", "driving_720p/b
 MOST_JUDGED = 48
 
 CAMERAS = ("doe", "conventional")
+BORDERS = ("own", "reflect")
+# Where differences are taken.
+PARTS = {
+    "occluded": "occluded",
+    "full": "full",
+    "own": "occluded, scenes that go on as the picture does",
+    "reflect": "occluded, the same scenes mirrored",
+}
 ROWS = {
     "reconstruction": "network",
     "wiener_far": "Wiener (far)",
@@ -80,62 +103,135 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def linked(folder: Path, patterns: Sequence[str], most: int | None = None) -> Path | None:
-    """A folder of links to pictures of DATA, evenly chosen; None where there are none."""
-    found = [path for pattern in patterns for path in sorted(DATA.glob(pattern)) if path.suffix in PICTURE_FILES]
-    if not found:
-        return None
-    if most is not None and len(found) > most:
-        found = [found[k] for k in np.linspace(0, len(found) - 1, most).round().astype(int)]
+def link(folder: Path, files: Sequence[Path], most: int | None = None) -> None:
+    """Make a folder of links to pictures, evenly chosen where there are too many."""
+    if most is not None and len(files) > most:
+        files = [files[k] for k in np.linspace(0, len(files) - 1, most).round().astype(int)]
     folder.mkdir(parents=True, exist_ok=True)
-    for path in found:
-        link = folder / path.name
-        if not link.exists():
-            link.symlink_to(path.resolve())
-    return folder
+    for path in files:
+        name = folder / path.name
+        if not name.exists():
+            name.unlink(missing_ok=True)  # a link to where the pictures were before
+            name.symlink_to(path.resolve())
+
+
+class Source(NamedTuple):
+    """Where pictures come from.
+
+    Attributes:
+        images: folder of those to train on.
+        test: folder of those to judge by.
+        licence: that of the first, where it is known.
+    """
+
+    images: Path
+    test: Path
+    licence: str | None
+
+
+def source_of(plan: Plan) -> Source:
+    """The user's pictures; or links to those of DATA, or to scikit-image's where there are none."""
+    if plan.images is not None and plan.test is not None:
+        return Source(plan.images, plan.test, None)
+    if plan.images is not None or plan.test is not None:
+        given = "--images" if plan.test is None else "--test"
+        raise InputError("--images, --test", "must be given together", f"{given} alone", "Give both, or neither.")
+    folders = plan.out / "pictures" / "trained_on", plan.out / "pictures" / "judged_by"
+    sets = [[p for pattern in given for p in sorted(DATA.glob(pattern))] for given in (TRAINED_ON, JUDGED_BY)]
+    known = all(sets)
+    if not known:
+        samples = sample_files()
+        sets = [[path for k, path in enumerate(samples) if k % 3], samples[::3]]
+    for folder, files, most in zip(folders, sets, (None, MOST_JUDGED), strict=True):
+        link(folder, [path for path in files if path.suffix.lower() in PICTURE_FILES], most)
+    return Source(*folders, LICENCES if known else None)
 
 
 def trained(plan: Plan, design: Path, model: str, camera: str, seed: int) -> dict[str, Any]:
     """Train one network, and return how it is judged."""
-    images = plan.images or linked(plan.out / "pictures" / "trained_on", TRAINED_ON)
-    test = plan.test or (linked(plan.out / "pictures" / "judged_by", JUDGED_BY, MOST_JUDGED) if images else None)
-    settings = [f'train.camera="{camera}"', f"train.seed={seed}", *plan.overrides]
-    if test is not None:
-        settings.insert(0, f"train.validation={sum(p.suffix.lower() in PICTURE_FILES for p in test.iterdir())}")
-    licence = LICENCES if plan.images is None and images is not None else None
-    request = Request(images, test, settings, licence=licence, occlusion=model)
+    images, test, licence = source_of(plan)
+    settings = [f"train.validation={len(picture_files(test))}", f'train.camera="{camera}"', f"train.seed={seed}"]
+    request = Request(images, test, (*settings, *plan.overrides), licence=licence, occlusion=model)
     folder = train(design, plan.out / f"{model}_{camera}_{seed}", request, say)
     return json.loads((folder / "metrics.json").read_text())
 
 
+def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[float]]]:
+    """PSNR in the occluded region of every scene, by what lies beyond its edges ("own", "reflect") and by picture.
+
+    Both show the same scenes. They bring their surroundings along, so they are larger than those that the trainings
+    were judged by, other ones, and small pictures are enlarged for them.
+    """
+    models = {camera: open_model(plan.out / f"{model}_{camera}_{seed}") for camera in CAMERAS}
+    bench, kind, far = see_through.bench_of(models["doe"])
+    bench = bench._replace(without=partial(psf_at, models["conventional"].bank))
+    side = load_spec(models["doe"].folder / "spec.toml").train.size + bench.margin_px
+    view = View((side, side), bench.camera.pixel_m, bench.camera.sensor_distance_m)
+    files = picture_files(source_of(plan).test)
+    data = SceneData(Pictures(files, most_px=2 * side), kind, view, far, SCENE_SEED, mirrored=False)
+    found: dict[str, dict[str, list[float]]] = {border: {} for border in BORDERS}
+    with meter(f"surroundings, {model}, seed {seed}", len(files)) as progress:
+        for number in range(len(files)):
+            item, key = data.item(0, number), jax.random.key(number)
+            turns = {"own": (item, bench), "reflect": (within(item, bench.margin_px), bench._replace(border="reflect"))}
+            for border, turn in turns.items():
+                shot = captured(*turn, key)
+                for camera, light in zip(CAMERAS, (shot.doe, shot.conventional), strict=True):
+                    bank = models[camera].bank
+                    far_psf, near_psf = (psf_at(bank, depth) for depth in (item.background_depth_m, item.depth_m))
+                    network = see_through.restored(models[camera], light, far_psf, near_psf)
+                    for name, image in (("capture", srgb_from_linear(light)), ("network", network)):
+                        judged = scores(image[None], srgb_from_linear(shot.clean)[None], shot.mask[None])
+                        found[border].setdefault(f"{camera}: {name}", []).append(float(judged.occluded.psnr[0]))
+            progress.advance(number + 1)
+    return found
+
+
 def scores_of(found: Sequence[dict[str, Any]], row: str, region: str, score: str) -> np.ndarray:
-    """`[seed, scene]` a score; NaN where nothing is occluded."""
-    return np.array([[each[row][region][score] for each in one["scenes"]] for one in found], np.float64)
+    """`[seed, picture]` a score, in the order of the pictures' names; NaN where nothing is occluded."""
+    ordered = [sorted(one["scenes"], key=lambda scene: scene["name"]) for one in found]
+    return np.array([[each[row][region][score] for each in scenes] for scenes in ordered], np.float64)
 
 
-def compared(judged: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
-    """Means, and differences scene by scene with their 95 % intervals."""
+def compared(judged: dict[str, list[dict[str, Any]]], beyond: Sequence[dict[str, dict[str, list[float]]]]) -> Any:
+    """Means, and differences scene by scene with their 95 % intervals.
+
+    Args:
+        judged: by camera, the metrics of every seed's training.
+        beyond: `surroundings` of every seed.
+    """
     table: dict[str, Any] = {"scenes": len(judged["doe"][0]["scenes"]), "seeds": len(judged["doe"])}
     for region in ("occluded", "full"):
-        rows = {
-            f"{camera}: {label}": {
-                s: mean_and_interval(scores_of(judged[camera], row, region, s)).mean for s in ("psnr", "ssim")
-            }
-            for camera in CAMERAS
-            for row, label in ROWS.items()
+        table[region] = {
+            "rows": {
+                f"{camera}: {label}": {
+                    s: mean_and_interval(scores_of(judged[camera], row, region, s)).mean for s in ("psnr", "ssim")
+                }
+                for camera in CAMERAS
+                for row, label in ROWS.items()
+            },
+            "psnr_differences": differences(
+                scores_of(judged["doe"], "reconstruction", region, "psnr"),
+                scores_of(judged["doe"], "capture", region, "psnr"),
+                scores_of(judged["conventional"], "reconstruction", region, "psnr"),
+            ),
         }
-        psnr = {c: scores_of(judged[c], "reconstruction", region, "psnr") for c in CAMERAS}
-        others = {
-            "network behind the plate over its capture": scores_of(judged["doe"], "capture", region, "psnr"),
-            "network behind the plate over the one behind a plain lens": psnr["conventional"],
-        }
-        differences = {
-            name: paired_difference(psnr["doe"], other)._asdict()
-            | {"by_seed": np.nanmean(psnr["doe"] - other, axis=1).tolist()}
-            for name, other in others.items()
-        }
-        table[region] = {"rows": rows, "psnr_differences": differences}
+    for border in BORDERS:
+        kinds = ("doe: network", "doe: capture", "conventional: network")
+        psnr = [np.array([one[border][kind] for one in beyond]) for kind in kinds]
+        table[border] = {"psnr_differences": differences(*psnr)}
     return table
+
+
+def differences(network: np.ndarray, capture: np.ndarray, plain: np.ndarray) -> dict[str, Any]:
+    """What the network behind the plate wins, in dB; all `[seed, picture]`."""
+    return {
+        name: paired_difference(network, other)._asdict() | {"by_seed": np.nanmean(network - other, axis=1).tolist()}
+        for name, other in (
+            ("network behind the plate over its capture", capture),
+            ("network behind the plate over the one behind a plain lens", plain),
+        )
+    }
 
 
 def written(found: dict[str, Any]) -> str:
@@ -151,11 +247,11 @@ def written(found: dict[str, Any]) -> str:
             lines.append(f"| {name} | {psnr} | {ssim} |")
         draws = "scenes and seeds" if table["seeds"] > 1 else "scenes"
         lines += ["", f"PSNR differences, dB, with 95 % intervals of the mean over {draws}:", ""]
-        for region in ("occluded", "full"):
-            for name, d in table[region]["psnr_differences"].items():
+        for part, where in PARTS.items():
+            for name, d in table[part]["psnr_differences"].items():
                 by_seed = ", ".join(f"{value:+.2f}" for value in d["by_seed"])
                 told = f"; by seed {by_seed}" if table["seeds"] > 1 else ""
-                lines.append(f"- {region}: {name}: {d['mean']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f}){told}")
+                lines.append(f"- {where}: {name}: {d['mean']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f}){told}")
         lines.append("")
     return "\n".join(lines)
 
@@ -166,7 +262,7 @@ def run(plan: Plan) -> dict[str, Any]:
     found = {}
     for model in plan.models:
         judged = {camera: [trained(plan, design, model, camera, seed) for seed in plan.seeds] for camera in CAMERAS}
-        found[model] = compared(judged)
+        found[model] = compared(judged, [surroundings(plan, model, seed) for seed in plan.seeds])
         write_atomic(plan.out / "table.json", canonical_json(found))
         write_atomic(plan.out / "table.md", written(found).encode())
         say(written({model: found[model]}))
@@ -176,8 +272,8 @@ def run(plan: Plan) -> dict[str, Any]:
 def main() -> int:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--images", type=Path, help="pictures to train on")
-    parser.add_argument("--test", type=Path, help="pictures to judge by")
+    parser.add_argument("--images", type=Path, help="pictures to train on; with --test")
+    parser.add_argument("--test", type=Path, help="pictures to judge by; with --images")
     parser.add_argument("--models", nargs="+", default=["paper", "radiometric"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int, help="steps of every training")

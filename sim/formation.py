@@ -166,7 +166,7 @@ def capture(
     check_layers(scene, *plain.psf.shape[:2])
     window = shadow_px(scene, plain) if follows_light(model) else 1
     y, x = scene.background.shape[1:]
-    margin = (window - 1) * (2 if model == "reciprocal" else 1) if border == "own" else 0
+    margin = own_margin_px(1, window, model) if border == "own" else 0
     lit = (y - margin, x - margin)
     if isinstance(optics, Prepared) and (optics.otf.shape, optics.otf.border) != (lit, border):
         wanted, got = f"{lit} and {border!r}", f"{optics.otf.shape} and {optics.otf.border!r}"
@@ -179,6 +179,18 @@ def capture(
         scene.background, tuple(o.mask for o in scene.obstructions), tuple(o.radiance for o in scene.obstructions)
     )
     return _formed(layers, discs, kernels, model, outside, lit, border)
+
+
+def own_margin_px(psf_px: int, shadow_px: int, model: Model) -> int:
+    """Pixels per axis by which a scene that brings its margin along (`border="own"`) is larger than its capture.
+
+    Args:
+        psf_px: window of the PSFs.
+        shadow_px: window of the shadow discs.
+        model: how layers are put together; the paper's models cast no shadow, `reciprocal` casts it twice.
+    """
+    shadows = 2 if model == "reciprocal" else int(follows_light(model))
+    return psf_px - 1 + shadows * (shadow_px - 1)
 
 
 def lost_share(scene: Scene, optics: Optics, model: Model) -> Float[Array, "c v u"]:

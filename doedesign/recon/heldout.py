@@ -2,8 +2,8 @@
 
 Without a folder of their own they are the last of the training folder in an order shuffled by the seed; whatever has
 the same bytes as one of them under another name is not trained on either. (Neighbouring frames of a film are almost the
-same picture: hold out another film, in a folder of its own.) Their scenes are the same at every look, and for every
-seed of the training: one crop, one obstruction and one noise each.
+same picture: hold out another film, in a folder of its own.) Their scenes are the same at every look: one crop, one
+obstruction and one noise each. Another seed of the training deals the same obstructions out to other pictures.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

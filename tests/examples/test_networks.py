@@ -80,6 +80,10 @@ def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
     folders = [plan.out / f"paper_doe_{seed}" for seed in plan.seeds]
     scores = [read_json(folder / "metrics.json")["reconstruction"]["full"]["psnr"] for folder in folders]
     assert table["full"]["rows"]["doe: network"]["psnr"] == pytest.approx(np.mean(scores))
+    assert {len(table[part]["psnr_differences"]) for part in train_demo.PARTS} == {2}
+    # What is beyond an edge changes what is seen of the same scene.
+    own, mirrored = (table[border]["psnr_differences"] for border in ("own", "reflect"))
+    assert own != mirrored
     assert "## Occlusion model `paper`, 2 scenes, 2 seeds" in (plan.out / "table.md").read_text()
     with pytest.raises(InputError, match="must be a finished training behind a plate"):
         release_model.release(plan.out / "paper_conventional_0", None, tmp_path / "released")
