@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
 FORMATTED := doedesign fab sim tests bench examples
 
-.PHONY: demo train-demo test lint bench clean
+.PHONY: demo train-demo test test-slow lint bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
@@ -20,7 +20,10 @@ train-demo: $(VENV)/.base
 	$(BIN)/python examples/train_demo.py
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+test-slow: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n 2 -m slow
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check $(FORMATTED)

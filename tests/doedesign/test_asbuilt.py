@@ -244,6 +244,7 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
     assert found.value("depth_scale[0]") == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, drawn, tmp_path):
     wanted = predict(drawn, IDEAL, PLATE)
     before = [seen._asdict() for seen in seen_of(predict(drawn, IDEAL, Variation()).rows)]

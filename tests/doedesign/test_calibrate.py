@@ -117,6 +117,7 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
     assert loop.process.spreads["common_depth_scale"].sigma < 0.001
 
 
+@pytest.mark.slow
 def test_without_relief_nothing_is_claimed(tmp_path: Path):
     """A flat plate has no etched edge: what is known afterwards is what was believed before."""
     result = measured(tmp_path, *small(relief=0.0), {})

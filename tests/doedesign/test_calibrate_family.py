@@ -12,6 +12,8 @@ from fab.process import Process, variation_of
 from sim.camera import Colour
 from tests.doedesign.calibration_fakes import PROBE_M, plate_drawn, usual_process
 
+pytestmark = pytest.mark.slow
+
 NEAR_M = 6e-3
 ERRORS = ("common_depth_scale", "overlay_x", "common_cd_bias", "etch_lag")
 

@@ -105,6 +105,7 @@ def draw(plate: Path, out: Path, *more: str) -> list[str]:
     return ["masks", str(plate), "--levels", "2", "--step", "0.5 um", "--pitch-um", "9", "--out", str(out), *more]
 
 
+@pytest.mark.slow
 def test_json_is_one_line(plate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(draw(plate, tmp_path / "a", "--json")) == 0
     (line,) = capsys.readouterr().out.splitlines()
@@ -132,6 +133,7 @@ def test_names_the_terminal_cannot_show(plate: Path, tmp_path: Path, encoding: s
     assert first == str(tmp_path / ("Größe" if encoding == "utf-8" else "Gr\\xf6\\xdfe"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("target", "code"), [("pipe", 0), ("/dev/full", 2)])
 def test_stdout_that_takes_nothing(plate: Path, tmp_path: Path, target: str, code: int):
     """`doedesign masks ... | head` is no error, a full disk is; neither ends in a traceback."""

@@ -134,6 +134,7 @@ def test_the_loop_takes_the_levels_that_are_drawn(levels: Levels) -> None:
         np.testing.assert_allclose(height, meant, atol=1e-6 * levels.period_m)
 
 
+@pytest.mark.slow
 def test_depths_given_as_2_to_the_k_steps_change_no_bit() -> None:
     plain = load_spec(QUICK, [*SMALL, *FOUR])
     told = load_spec(QUICK, [*SMALL, *FOUR, 'process.etch_depths=["300 nm", "600 nm"]'])
@@ -189,6 +190,7 @@ def test_gradient_of_the_whole_chain_by_the_depths() -> None:
         assert abs(slopes[mask]) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -233,6 +235,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
     assert light_cost(seen, design.levels) < light_cost(seen, Levels(4, 300e-9))
 
 
+@pytest.mark.slow
 def test_chosen_depths_serve_the_objective_better_than_even_steps() -> None:
     # Two levels have one depth, and half a wave of the design is wrong for most colours and both parts of the loss.
     few = ["process.levels=2", "process.level_step=600 nm", "optimize.steps=30"]

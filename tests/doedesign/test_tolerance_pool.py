@@ -89,6 +89,7 @@ def test_a_worker_that_dies_loses_no_plate(ask: Callable[..., Study], fakes: Mod
     assert 13 <= len((tmp_path / "plates").read_text().splitlines()) <= 15
 
 
+@pytest.mark.slow
 def test_a_plate_that_kills_its_worker_again_and_again_is_named(
     ask: Callable[..., Study], fakes: ModuleType, monkeypatch: pytest.MonkeyPatch
 ):

@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from compare_occlusion import SHARES, compare, draw, main  # pyright: ignore[reportMissingImports]
 
+pytestmark = pytest.mark.slow
+
 # Fresnel number 76: a tenth of the automotive camera's, so fringes are three times as wide against the aperture.
 CAMERA = make_camera(300, 1.5e-3, 8e-3, 3.7e-6, 255)
 NEAR_M = 0.05

@@ -14,6 +14,8 @@ from doedesign.cli import main
 from doedesign.spec import load_spec, spec_warnings
 from fab.files import write_atomic
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SMALL = ("doe.samples=64", "sensor.window=48", "optimize.steps=3")
 

@@ -14,6 +14,8 @@ import pytest
 import doedesign.commands.optimize
 from fab.files import write_atomic
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LIFTS = (0, 8)
 

@@ -42,6 +42,7 @@ def test_the_released_model_is_what_its_manifest_says():
     assert masks["source"]["height_sha256"] == said["sha256"]["height.exr"]
 
 
+@pytest.mark.slow
 def test_reconstruct_works_out_of_the_box(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -59,6 +60,7 @@ def test_reconstruct_works_out_of_the_box(
     assert psnr(images[1], chain.scene) > psnr(images[0], chain.scene) + 4
 
 
+@pytest.mark.slow
 def test_the_chain_in_one_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "argv", ["see_through.py", "--out", str(tmp_path / "chain.png")])
     assert see_through.main() == 0

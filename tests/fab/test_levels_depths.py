@@ -155,6 +155,7 @@ def test_etches_go_from_shallow_to_deep():
     assert codes_by_depth(SWAPPED, (0, 1)) == [0, 2, 1, 3]
 
 
+@pytest.mark.slow
 def test_a_repair_weighs_light_by_heights_not_by_numbers_of_levels():
     # Levels 1 and 2 are 50 nm apart, 0 and 1 are 500 nm; one pixel of level 1 or 0 lies in a field of level 2.
     levels = Levels(4, STEP_M, (500 * NM, 550 * NM))

@@ -67,6 +67,7 @@ def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
         report.require()
 
 
+@pytest.mark.slow
 def test_every_single_byte_of_a_mask_file_counts(order_folder):
     path = order_folder / MASKS[3]
     whole = path.read_bytes()

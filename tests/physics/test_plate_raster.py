@@ -211,6 +211,7 @@ def test_corners_change_what_they_change_on_a_raster(levels: Levels, others: dic
     assert found[1] < blue
 
 
+@pytest.mark.slow
 def test_masks_half_a_cell_apart_share_no_corner():
     """One square opening in two masks, the second displaced along the diagonal: every corner counts alone.
 
@@ -235,6 +236,7 @@ def test_masks_half_a_cell_apart_share_no_corner():
         assert (round_ - square).sum() == pytest.approx((1 - np.pi / 4) * (12 / 32) ** 2 * gains, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_walls_change_what_they_change_on_a_raster():
     """0.17 cells wide at most; the next term goes with the square of that, and along a wall the cell is taken to be as
     in its longest segment."""

@@ -18,6 +18,8 @@ from sim.psf import plan_propagation
 from sim.pupil import SurfaceRows, surface_pupil
 from sim.surface import as_fabricated
 
+pytestmark = pytest.mark.slow
+
 UM = 1e-6
 PITCH_M = 1.85 * UM
 CELLS = 48

@@ -113,6 +113,7 @@ def test_what_cannot_be_is_refused():
         pupil_shadow(dataclasses.replace(SMALL, window=64), np.zeros((300, 300)), strip(3), 1, [], np.empty((0, 1)), 2)
 
 
+@pytest.mark.slow
 def test_an_even_light_behind_a_bar_is_what_the_bar_would_have_sent():
     """Reciprocity: a world of one radiance stays even whatever the plate does, so bar and background add up to it.
 

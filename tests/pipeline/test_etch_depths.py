@@ -79,6 +79,7 @@ def test_a_finished_run_is_opened_with_the_depths_it_chose(chosen):
     assert levels_of_run(opened, 8).levels == Levels(8, 150e-9)
 
 
+@pytest.mark.slow
 def test_light_and_tolerances_are_those_of_the_chosen_depths(chosen, cli, tmp_path):
     import shutil
 

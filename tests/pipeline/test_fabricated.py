@@ -112,6 +112,7 @@ common_cd_bias = { mean = "0.2 um" }
 """
 
 
+@pytest.mark.slow
 def test_masks_drawn_against_the_bias_of_the_process_give_the_design(copy_of_run, cli, tmp_path):
     """A bias of 0.2 um that the masks foresee is not seen in the light; one that nobody foresaw is."""
     run = open_run(copy_of_run)

@@ -14,6 +14,7 @@ def models(order):
     return {entry["file"].split("_", 2)[2]: entry for entry in listed}
 
 
+@pytest.mark.slow
 def test_a_radial_design_is_ordered_with_its_rings_as_circles(tiny, cli, tmp_path):
     options = ["--set", 'optimize.parametrization="radial"', "--set", "optimize.steps=1"]
     done = cli("optimize", tiny, "--out", tmp_path / "run", *options)

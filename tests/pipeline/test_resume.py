@@ -65,6 +65,7 @@ def finished_files(finished, content):
     return {name: data for name, data in content(finished.run).items() if not name.startswith("psf/")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "name"),
     [
@@ -90,6 +91,7 @@ def test_stopped_in_between(tiny, cli, content, finished_files, tmp_path, monkey
     assert content(tmp_path / "run") == finished_files
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("every", [2, 5, 7])
 def test_stopped_at_every_few_writes(tiny, cli, content, tmp_path, monkeypatch, every):

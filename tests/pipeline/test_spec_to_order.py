@@ -186,6 +186,7 @@ def test_paths_may_lead_through_links_and_upwards(finished, cli, tmp_path, monke
     assert cli("verify", tmp_path / "new" / "order").code == 0
 
 
+@pytest.mark.slow
 def test_an_order_can_be_sent_away(finished, tmp_path, start_process):
     # Only the folder is needed: another place, another process, no run, no spec.
     shutil.copytree(finished.order, tmp_path / "Auftrag für das Labor")

@@ -51,6 +51,7 @@ def write_map(path: Path, height_m: np.ndarray, kind: str) -> tuple[str, ...]:
 KINDS = ["npy", "npy counts", "npy float32, columns first", "exr", "tif", "tif metres", "png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(21, 15), (16, 23)])
 def test_a_marked_place_stays_where_it_is(cli, tmp_path, kind, shape):

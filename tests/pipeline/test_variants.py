@@ -16,6 +16,7 @@ def overrides(*pairs):
     return [part for pair in pairs for part in ("--set", pair)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

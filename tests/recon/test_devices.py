@@ -62,6 +62,7 @@ print(json.dumps({{"alone": alone[0], "shared": shared[0], "off": off, "places":
 """
 
 
+@pytest.mark.slow
 def test_two_devices_take_the_step_of_one() -> None:
     settings = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(

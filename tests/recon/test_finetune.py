@@ -239,6 +239,7 @@ def ask() -> None:
     signal.raise_signal(signal.SIGTERM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "stop", "done"), [(0, interrupt, 0), (4, interrupt, 4), (2, ask, 3), (5, ask, 6)])
 def test_stopped_between_steps(
     model: Path,

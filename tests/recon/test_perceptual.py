@@ -221,6 +221,7 @@ def test_the_map_says_where(made, rng):
     assert where.mean() == pytest.approx(float(lpips(model, a, b)[0]), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["alex", "ms_ssim"])
 def test_gradients_are_finite_differences(made, rng, name: str):
     """In double precision, so that a step may be small enough to cross hardly any kink."""
@@ -242,6 +243,7 @@ def test_gradients_are_finite_differences(made, rng, name: str):
             assert abs(slope) > 1e-5  # a difference resolves 1e-10
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_where_nothing_is_seen(made):
     """All features zero, equal pictures, black and white, inverted structure: no place for 0/0."""
     seeing, _ = made["squeeze"]

@@ -145,6 +145,7 @@ def test_plans_that_cannot_be_are_refused():
             plan_tiles((100, 100), tile, overlap, 16)
 
 
+@pytest.mark.slow
 def test_a_real_network_takes_tiles():
     """One tile is the network's own result; several agree with it but for what a tile has as a whole."""
     layout = Layout(width=3, depth=1)

@@ -59,6 +59,7 @@ def test_optics_and_network_learn_together(joint: Trainer) -> None:
     assert not alike(numbers(state.free), free)
 
 
+@pytest.mark.slow
 def test_in_turns_one_moves_and_the_other_stays_to_the_bit() -> None:
     """The network alone lowers the loss, and so does the optics alone."""
     made = trainer(*PLAIN, *LEARNING, 'train.mode="alternating"', "train.period=3")
@@ -74,6 +75,7 @@ def test_in_turns_one_moves_and_the_other_stays_to_the_bit() -> None:
         assert alike(numbers(state.optics_moments if at == 0 else state.network_moments), moments)
 
 
+@pytest.mark.slow
 def test_a_plate_at_rest_is_not_in_the_state() -> None:
     made = trainer(*PLAIN, *LEARNING, 'train.freeze="optics"')
     plate = numbers(made.plate)
@@ -144,6 +146,7 @@ class Distance(eqx.Module):
         return self.value + 0 * jnp.mean(picture - reference, axis=(1, 2, 3))
 
 
+@pytest.mark.slow
 def test_errors_of_a_process_and_the_perceptual_term() -> None:
     changes = ("train.fabricated=true", "process.errors.overlay_y={sigma='0.5 um'}", "train.perceptual=0.5")
     made = trainer(*PLAIN, *changes, perceptual=Distance(jnp.float32(3)))

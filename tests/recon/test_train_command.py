@@ -237,6 +237,7 @@ def test_the_trained_plate_can_be_drawn(whole: Path, tmp_path: Path, capsys: pyt
     assert source["height_sha256"] == sha256_file(whole / "height.exr")
 
 
+@pytest.mark.slow
 def test_a_training_without_a_plate_has_no_masks(
     run: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -366,9 +367,8 @@ sys.exit(exit_code(lambda: command.train(run, out, command.Request(images=images
 """
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"), [(signal.SIGTERM, 130), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 130), (signal.SIGKILL, -9)])
 def test_a_process_that_is_told_to_end(
     run: Path, images: Path, whole: Path, tmp_path: Path, compiled_once: Path, kind: signal.Signals, code: int
 ):
@@ -492,6 +492,7 @@ def test_a_folder_of_their_own(images: Path, tmp_path: Path):
         split_pictures(own, own, 2, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "height", "continuous", "network"),
     [

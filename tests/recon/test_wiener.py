@@ -80,6 +80,7 @@ def test_a_coarse_psf_is_that_of_the_fine_one() -> None:
     np.testing.assert_allclose(coarse.transfer, wanted.transfer, atol=0.01)
 
 
+@pytest.mark.slow
 def test_one_transfer_function_per_colour_serves_all_features() -> None:
     rng = np.random.default_rng(0)
     psf = np.stack([gaussian(9, s) for s in (0.5, 1.0, 2.0)])[None]

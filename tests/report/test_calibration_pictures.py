@@ -13,6 +13,8 @@ from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Calibration:

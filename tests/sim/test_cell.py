@@ -47,6 +47,7 @@ def is_open(pixels: np.ndarray, x: float, shift: float, bias: float) -> bool:
     return bool(reached.any() if bias >= 0 else reached.all())
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(shifts, biases), min_size=1, max_size=3), st.integers(0, 2**20 - 1))
 def test_pieces_are_open_where_a_pixel_within_the_bias_is(errors: list[tuple[float, float]], bits: int):
     """Random masks of 20 pixels around the cell, looked at a point at a time."""

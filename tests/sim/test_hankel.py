@@ -27,6 +27,7 @@ def image_on_the_axis(profile_m: np.ndarray, radius_m: np.ndarray) -> np.ndarray
     return np.abs(field) ** 2 / (np.pi * CAMERA.aperture_m**2 / 4)
 
 
+@pytest.mark.slow
 def test_pixels_against_the_integral():
     """Thirty pixels, each by 12 x 12 points of the directly summed Hankel integral."""
     profile = noise_profile(ring_count(CAMERA))

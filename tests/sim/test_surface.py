@@ -299,6 +299,7 @@ def test_the_chrome_opening_moves_and_grows(level: np.ndarray):
 # --- how finely the plate is cut --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_wider_sensor_is_served_in_half_cells(level: np.ndarray):
     """At 0.46 waves per cell the second moments give out; a plate as drawn needs no moments."""
     # Without a chrome edge, whose cells would be cut otherwise when they are halved.
