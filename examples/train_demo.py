@@ -6,10 +6,10 @@
 For each occlusion model that is asked for, two trainings with the same pictures, scenes, steps and seed: the plate of
 `examples/automotive_cpu.toml`, learnt together with its network, and a conventional camera, which is the same one with
 a flat plate. Both are judged on the same dirty scenes, made from pictures that neither was trained on. The table gives
-means and, because scenes are the same, the interval of the mean difference scene by scene (and seed by seed, where
-there are several); beside it stand the rows of the paper's Table 1 that need no training. Trainings let a scene go on
-beyond its edges as its mirror image, and filters know that: the last lines tell what is left of the differences where
-it goes on as the picture does. Written to OUT:
+means and, because scenes are the same, the interval of the mean difference picture by picture (and seed by seed, where
+there are several, each of which puts the pictures behind other dirt); beside it stand the rows of the paper's Table 1
+that need no training. Trainings let a scene go on beyond its edges as its mirror image, and filters know that: the last
+lines tell what is left of the differences where it goes on as the picture does. Written to OUT:
 
     design/, MODEL_CAMERA_SEED/     the design to begin with, and a training for each
     table.json, table.md            what came out
@@ -194,7 +194,7 @@ def scores_of(found: Sequence[dict[str, Any]], row: str, region: str, score: str
 
 
 def compared(judged: dict[str, list[dict[str, Any]]], beyond: Sequence[dict[str, dict[str, list[float]]]]) -> Any:
-    """Means, and differences scene by scene with their 95 % intervals.
+    """Means, and differences picture by picture with their 95 % intervals.
 
     Args:
         judged: by camera, the metrics of every seed's training.
@@ -245,7 +245,7 @@ def written(found: dict[str, Any]) -> str:
             full = table["full"]["rows"][name]
             psnr, ssim = (f"{hidden[s]:.{n}f} ({full[s]:.{n}f})" for s, n in (("psnr", 2), ("ssim", 3)))
             lines.append(f"| {name} | {psnr} | {ssim} |")
-        draws = "scenes and seeds" if table["seeds"] > 1 else "scenes"
+        draws = "pictures and seeds" if table["seeds"] > 1 else "pictures"
         lines += ["", f"PSNR differences, dB, with 95 % intervals of the mean over {draws}:", ""]
         for part, where in PARTS.items():
             for name, d in table[part]["psnr_differences"].items():
