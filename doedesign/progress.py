@@ -35,10 +35,19 @@ class _PlainMeter:
         if now - self._told < self._INTERVAL_S and done < self._total:
             return
         self._told = now
-        rate = (done - self._start) / max(now - self._begun, 1e-9)
-        left = (self._total - done) / rate if rate > 0 else float("inf")
-        text = f"{self._title}: {done}/{self._total}, {rate:.2f}/s, {left:.0f} s left"
-        print(f"{text}, {note}" if note else text, file=sys.stderr, flush=True)
+        parts = [f"{self._title}: {done}/{self._total}"]
+        if done > self._start and now > self._begun:
+            rate = (done - self._start) / (now - self._begun)
+            parts += [f"{rate:.2f}/s", f"{_told((self._total - done) / rate)} left"]
+        print(", ".join(parts + [note] * bool(note)), file=sys.stderr, flush=True)
+
+
+def _told(seconds: float) -> str:
+    """A time as people say it: 40 s, 12 min, 2 h 5 min."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
 class _BarMeter:
