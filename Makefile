@@ -15,7 +15,7 @@ FORMATTED := doedesign fab sim tests bench examples
 demo: $(VENV)/.base
 	$(DEMO)
 
-# About an hour on two cores.
+# About 65 minutes on two cores.
 train-demo: $(VENV)/.base
 	$(BIN)/python examples/train_demo.py
 

@@ -1,6 +1,6 @@
 """What a learnt plate is worth: the same network trained behind it and behind a plain lens, on the same scenes.
 
-    make train-demo                     about an hour on two cores
+    make train-demo                     about 65 minutes on two cores
     python examples/train_demo.py --images DIR --test DIR [--steps N] [--seeds 0 1 2] [--out runs/train_demo]
 
 For each occlusion model that is asked for, two trainings with the same pictures, scenes, steps and seed: the plate of

@@ -86,7 +86,10 @@ def draw_training(path: str | Path, records: Sequence[Mapping[str, Any]], title:
         _plot_losses(left, steps, series)
         right = place(figure, 4.75, 0.5, 3.3, 2.65)
         _plot_scores(right, looks)
+        margin = 0.03 * len(steps)
         for axes in (left, right):
+            # The same steps in both, however few looks there were.
+            axes.set_xlim(steps[0] - margin, steps[-1] + 1 + margin)
             axes.grid(color=FAINT, lw=0.4, alpha=0.5)
             axes.set_xlabel("step", labelpad=2)
 
