@@ -11,18 +11,21 @@ import time
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from doedesign.images import decoded, sample_files
+from doedesign.recon import train
 from doedesign.recon.history import read_history
 from doedesign.recon.hosts import join_hosts
 from doedesign.recon.weights import read_network
 from fab.errors import InputError
 from fab.files import read_json
 from tests.doedesign.small_runs import finished_run
-from tests.recon.small_training import PLAIN, SPEC
+from tests.recon.small_training import PLAIN, SPEC, batch, heights, trainer
 
 ROOT = Path(__file__).parents[2]
 
@@ -200,3 +203,33 @@ def test_a_host_that_finds_nobody() -> None:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(InputError, match=r"all hosts must find each other within 0 s.*refused"):
             join_hosts(address, 2, 1, wait_s=0)
+
+
+# --- a device that is not here ---------------------------------------------------------------------------------------
+
+
+class _TakenError(Exception):
+    """The step would begin now."""
+
+
+@pytest.mark.parametrize("changes", [(), ('train.precision="mixed"', "train.checkpointing=true")])
+def test_a_step_is_lowered_for_a_gpu(monkeypatch: pytest.MonkeyPatch, changes: tuple[str, ...]) -> None:
+    # Nothing in it may be a processor's own: XLA would find out on the machine that has the GPU, and not before.
+    given: list[Any] = []
+
+    def stopped(*arguments: Any) -> Any:
+        given.extend(arguments)
+        raise _TakenError
+
+    made = trainer("train.learning_rate=1e-4", *changes)
+    state = made.initial(heights())
+    monkeypatch.setattr(train, "_update", lambda: stopped)
+    with pytest.raises(_TakenError):
+        made.step(state, batch())
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # where the code asks, it asks for this
+    arrays, rest = eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+    step = jax.jit(lambda moving: eqx.filter(train._take(*eqx.combine(moving, rest)), eqx.is_array))
+    text = step.trace(arrays).lower(lowering_platforms=("cuda",)).as_text()
+    assert "stablehlo.fft" in text
+    assert "stablehlo.convolution" in text
+    assert not {line for line in text.splitlines() if "custom_call" in line and "Sharding" not in line}
