@@ -185,9 +185,9 @@ def time_rounds(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, N
 
 
 def high_water_mb() -> float:
-    """Return the peak resident memory of this process; `getrusage` would start from its parent's."""
+    """Return the peak resident memory of this process, in 10^6 bytes; `getrusage` would start from its parent's."""
     line = next(text for text in Path("/proc/self/status").read_text().splitlines() if text.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
+    return int(line.split()[1]) * 1024 / 1e6
 
 
 def report_peak(name: str, cells: int, folder: Path) -> None:

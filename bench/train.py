@@ -263,7 +263,7 @@ def one_step(name: str, rounds: int = 3) -> None:
     """Print seconds and gigabytes of steps."""
     step = stepping(spec_of(name))
     step()
-    print(np.median([clocked(step)[0] for _ in range(rounds)]), high_water_mb() * 2**20 / 1e9)
+    print(np.median([clocked(step)[0] for _ in range(rounds)]), high_water_mb() / 1000)
 
 
 def one_frame() -> None:
@@ -272,7 +272,7 @@ def one_frame() -> None:
     frame = np.random.default_rng(0).random((3, *FRAME), np.float32)
     far, near = make_psf(0, (2, 3, 513, 513))
     took, _ = clocked(lambda: reconstruct_tiled(network, frame, far, near))
-    print(took, high_water_mb() * 2**20 / 1e9)
+    print(took, high_water_mb() / 1000)
 
 
 def report_lpips(rounds: int = 9) -> None:

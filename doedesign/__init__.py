@@ -10,6 +10,7 @@ Reading order, from the user's words to the result:
     patterns        target images: spots, areas, pictures
     objectives      what a design is judged by
     problem         spec -> loss of one step, ready to differentiate
+    compiling       steps that take little memory
     optimize        the loop
     evaluate        the table of numbers every design gets
     predict         what a drawn design will do once it is made
@@ -18,7 +19,7 @@ Reading order, from the user's words to the result:
     images          pictures of a folder as scenes
     capture         a spec's obstruction, sensor and colours
     simulated       one scene through a plate onto a sensor; capturefiles writes it
-    recon           the reconstruction: its training scenes
+    recon           the reconstruction network and its training, with the plate or alone
     runs            run folders: manifest, checkpoint, resume
     report          pictures
     commands        the work behind each command

@@ -14,16 +14,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from doedesign.compiling import compiled_step
 from doedesign.etches import choose_depths, heights_of, held
 from doedesign.parametrize import softness_at
-from doedesign.problem import Look, Problem, Scene, compiler_options, judge_height, losses, view_of
+from doedesign.problem import Look, Problem, Scene, judge_height, losses, view_of
 from doedesign.spec import START_NAMES, Spec
 from doedesign.starts import start_heights
 from fab.errors import InputError
@@ -166,8 +166,7 @@ def make_update(spec: Spec) -> Update:
         updates, adam = optimiser.update(gradient, adam)
         return (optax.apply_updates(free, updates), adam), loss, terms
 
-    # The overloads do not list jit's own options, which are passed on.
-    return eqx.filter_jit(update, donate="all-except-first", compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+    return compiled_step(update)
 
 
 def constants_at(spec: Spec, problem: Problem, scene: Scene, step: int) -> Constants:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -228,14 +227,3 @@ def _judge(problem: Problem, height_m: Array, look: Look) -> Array:
 def judge_height(problem: Problem, scene: Scene, height_m: Float[np.ndarray, "*s"]) -> float:
     """Loss of given heights at the first near and far depth, without gradient (for searches over few parameters)."""
     return float(_judge(problem, jnp.asarray(height_m, jnp.float32), scene.first_look()))
-
-
-def compiler_options() -> dict[str, str]:
-    """Options for the step's compilation: on a processor, schedule for memory.
-
-    The default schedule keeps the buffers of all PSFs alive at once; first touching that much memory costs as much
-    time as the transforms themselves.
-    """
-    if jax.default_backend() != "cpu":
-        return {}
-    return {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}

@@ -39,7 +39,9 @@ class _PlainMeter:
         if done > self._start and now > self._begun:
             rate = (done - self._start) / (now - self._begun)
             parts += [f"{rate:.2f}/s", f"{_told((self._total - done) / rate)} left"]
-        print(", ".join(parts + [note] * bool(note)), file=sys.stderr, flush=True)
+        if note:
+            parts.append(note)
+        print(", ".join(parts), file=sys.stderr, flush=True)
 
 
 def _told(seconds: float) -> str:

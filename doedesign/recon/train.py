@@ -24,10 +24,10 @@ from jaxtyping import Array, Float, Key
 
 from doedesign.build import camera_of, process_of
 from doedesign.capture import outside_of, seen_in, sensor_of
-from doedesign.memory import trim_after_compiling
+from doedesign.compiling import compiled_step
 from doedesign.optimize import Free
 from doedesign.parametrize import softness_at
-from doedesign.problem import compiler_options, plans_of
+from doedesign.problem import plans_of
 from doedesign.recon.chain import Bench, LivePlate, Plate, RingPlate, Seen, Shot, StoredPlate, shots
 from doedesign.recon.data import Batch
 from doedesign.recon.hosts import on_all, own_copy, parts_of
@@ -428,9 +428,7 @@ def _moved(part: Any, slope: Any, moment: optax.OptState, rate: Array) -> tuple[
 @cache
 def _update() -> Callable[[Constants, tuple[Learnt, tuple[Any, Any]]], Any]:
     """The compiled step. Made on first use: several hosts have to find each other first."""
-    trim_after_compiling()
-    # The overloads do not list jit's own options, which are passed on.
-    return eqx.filter_jit(_take, donate="all-except-first", compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+    return compiled_step(_take)
 
 
 @eqx.filter_jit

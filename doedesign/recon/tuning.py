@@ -15,8 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from doedesign.memory import trim_after_compiling
-from doedesign.problem import compiler_options
+from doedesign.compiling import compiled_step
 from doedesign.recon.crops import PairBatch
 from doedesign.recon.loss import TERMS, Weights, losses
 from doedesign.recon.model import Psfs
@@ -140,9 +139,7 @@ def _take(constants: tuple[Tuner, Given, Array], learnt: Learnt) -> tuple[Learnt
 @cache
 def _update() -> Callable[[tuple[Tuner, Given, Array], Learnt], Any]:
     """The compiled step."""
-    trim_after_compiling()
-    # The overloads do not list jit's own options, which are passed on.
-    return eqx.filter_jit(_take, donate="all-except-first", compiler_options=compiler_options())  # pyright: ignore[reportCallIssue]
+    return compiled_step(_take)
 
 
 @eqx.filter_jit

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from doedesign import memory
+from doedesign import compiling
 
 glibc = pytest.mark.skipif(
     sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="only glibc can be asked"
@@ -21,9 +21,9 @@ def trims(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Counts how often memory is given back; listeners are cleared away afterwards."""
     counted: list[int] = []
     found: list[Any] = []
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=counted.append))
+    monkeypatch.setattr(compiling.ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=counted.append))
     monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", found.append)
-    memory.trim_after_compiling.__wrapped__()
+    compiling._trim_after_compiling.__wrapped__()
     monkeypatch.undo()
     for listener in found:
         jax.monitoring.register_event_duration_secs_listener(listener)
@@ -38,16 +38,16 @@ def compile_something_new(width: int) -> None:
 
 @glibc
 def test_a_long_compilation_is_cleared_away_after(trims: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_LEAST_S", 0.0)
+    monkeypatch.setattr(compiling, "_LEAST_S", 0.0)
     compile_something_new(1237)  # jax itself says when it has compiled
     assert trims
 
 
 @glibc
 def test_short_ones_and_other_events_are_not(trims: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_LEAST_S", 1e9)
+    monkeypatch.setattr(compiling, "_LEAST_S", 1e9)
     compile_something_new(1249)
-    monkeypatch.setattr(memory, "_LEAST_S", 0.0)
+    monkeypatch.setattr(compiling, "_LEAST_S", 0.0)
     jax.monitoring.record_event_duration_secs("/jax/core/compile/jaxpr_trace_duration", 5.0)
     assert not trims
 
