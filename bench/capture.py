@@ -28,11 +28,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from bench.psf import time_rounds
-from sim.convolve import fast_length
-from sim.formation import Optics, Prepared, capture, shadow_px
+from sim.imaging.convolve import fast_length
+from sim.imaging.formation import Optics, Prepared, capture, shadow_px
+from sim.imaging.occlusion import Model
+from sim.imaging.scene import Obstruction, Scene
 from sim.noise import photon_noise
-from sim.occlusion import Model
-from sim.scene import Obstruction, Scene
 
 TARGET_RATIO, TARGET_S, TARGET_GB = 1.5, 60.0, 8.0
 PIXELS, WINDOW, COLOURS, ROUNDS = 512, 512, 3, 31
@@ -117,7 +117,7 @@ def report_capture() -> None:
 
 def one_frame(model: Model) -> None:
     """Form one frame, and print seconds and gigabytes."""
-    from sim.field import FieldOptics, capture_frame
+    from sim.imaging.field import FieldOptics, capture_frame
 
     psf = make_psf(0, (NODES, NODES, 2, COLOURS, WINDOW, WINDOW))
     y, x = (np.linspace(-n / 2, n / 2, NODES) * 1.85e-6 for n in FRAME)

@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from fab.doe import mask_layout
+from fab.gds.writer import write_gds, write_oasis
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
+from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
-from fab.polygons import rectangles
-from fab.stream import write_gds, write_oasis
+from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verify import read_level_map
+from fab.verification.verify import read_level_map
 
 LEVELS = Levels(16, 75 * NM)
 _CHUNK = bytes(1 << 22)

@@ -22,8 +22,8 @@ from bench.reference import wrapped_map
 from doedesign.build import process_of
 from doedesign.spec.process import ProcessSpec
 from fab.grid import Grid
-from fab.job import write_order
 from fab.levels import Levels, quantise
+from fab.order.write import write_order
 
 PITCH_M, LEVELS = 1.85e-6, Levels(16, 75e-9)
 AUTOMOTIVE = 2400

@@ -4,8 +4,8 @@
     python -m bench.pipeline --quick    fewer items
 
 An item is a decoded or kept picture, its crop in linear light, and an obstruction drawn before it; see
-`doedesign.recon.data`. Nothing here needs jax to compute, so a training step has both cores for most of the time, or
-the threads have them while it waits for an accelerator.
+`doedesign.capture.scenes`. Nothing here needs jax to compute, so a training step has both cores for most of the time,
+or the threads have them while it waits for an accelerator.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from doedesign.images import Pictures, crop, decoded, linear_light, sample_files
-from doedesign.recon.data import SceneData
+from doedesign.capture.images import Pictures, crop, decoded, linear_light, sample_files
+from doedesign.capture.scenes import SceneData
 from sim.obstruction import Dirt, Fence, Kind, Raindrop, View
 
 SHAPE = (512, 512)

@@ -17,14 +17,14 @@ import numpy as np
 
 from bench.reference import wrapped_map
 from doedesign.build import camera_of, process_of
-from doedesign.predict import Drawn, predict
+from doedesign.prediction import Drawn, predict
 from doedesign.spec import load_spec
-from doedesign.tolerance.pool import Work, evaluate_here, predicted_rows
+from doedesign.tolerancing.pool import Work, evaluate_here, predicted_rows
 from fab.levels import Levels, height_of, quantise
 from fab.masks import unetched_outside
 from fab.process import Process
 from fab.sampling import normal_draw
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
 TARGET_RATIO, TARGET_PEAK_GB, TARGET_SPEEDUP = 6.0, 4.0, 1.7

@@ -65,8 +65,8 @@ def ours(task: Task) -> Method:
     import jax
     import jax.numpy as jnp
 
-    from sim.farfield import plan_far_field
-    from sim.pupil import PhaseRows, phase_pupil
+    from sim.propagation.farfield import plan_far_field
+    from sim.propagation.pupil import PhaseRows, phase_pupil
 
     plan = plan_far_field(task.camera, YELLOW_M)
     rate = jnp.float32(task.camera.waves_per_metre(YELLOW_M))

@@ -1,7 +1,8 @@
 """What PSFs are judged by: a plain float64 evaluation with sixteen samples per pixel and axis, and the maps to try.
 
-Nothing here shares code with `sim.farfield` or `sim.pixel`: the field is summed at the sample positions themselves
-and the pixel integral is the midpoint rule, whose own error at sixteen samples is up to 1e-3 (at thirty-two, a fourth).
+Nothing here shares code with `sim.propagation.farfield` or `sim.propagation.pixel`: the field is summed at the sample
+positions themselves and the pixel integral is the midpoint rule, whose own error at sixteen samples is up to 1e-3 (at
+thirty-two, a fourth).
 """
 
 import numpy as np

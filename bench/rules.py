@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.masks import LEVELS, MAPS, ratio, row, timed
-from fab.compensation import grown, read_back
-from fab.doe import mask_layout
 from fab.grid import Grid
-from fab.layout import pixel_edges
+from fab.layout.compensation import grown, read_back
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import pixel_edges
+from fab.layout.polygons import rectangles
 from fab.masks import planes, unetched_outside
-from fab.polygons import rectangles
-from fab.repair import repaired
-from fab.rules import Rules, check
+from fab.rules.check import Rules, check
+from fab.rules.repair import repaired
 from fab.units import NM, UM
 
 RULES = Rules(2 * UM, 2 * UM)

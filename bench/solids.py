@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from bench.masks import field_map, ring_map
-from fab.cells import Cells, reduced_cells, whole, window_cells
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.mesh import closed_volume_m3, relief_mesh
-from fab.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solid import ChromeRing, Rings, Substrate, substrate_step, substrate_volumes_m3
-from fab.step import step_volumes_m3
+from fab.solids.columns import Cells, reduced_cells, whole, window_cells
+from fab.solids.mesh import closed_volume_m3, relief_mesh
+from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
+from fab.solids.step import step_volumes_m3
+from fab.solids.substrate import ChromeRing, Rings, Substrate, substrate_step, substrate_volumes_m3
 from fab.units import MM, NM, UM
 
 LEVELS = Levels(16, 75 * NM)

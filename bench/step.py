@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.optimize import constants_at, initial_state, make_update
-from doedesign.problem import problem_of
+from doedesign.design.optimize import constants_at, initial_state, make_update
+from doedesign.design.problem import problem_of
 from doedesign.spec import load_spec
 
 SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"

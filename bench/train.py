@@ -39,17 +39,17 @@ import numpy as np
 import doedesign.recon.network as layers
 from bench.capture import make_psf, verdict
 from bench.psf import high_water_mb
-from doedesign.capture import obstruction_of, occlusion_of
-from doedesign.recon.backbones import convolutions, weight_shapes
-from doedesign.recon.checkpoint import settled
+from doedesign.capture.from_spec import obstruction_of, occlusion_of
+from doedesign.capture.scenes import Batch
 from doedesign.recon.conv import convolution
-from doedesign.recon.data import Batch
 from doedesign.recon.network import Layout, Network
-from doedesign.recon.perceptual import Lpips
 from doedesign.recon.tiles import reconstruct_tiled
-from doedesign.recon.train import State, Trainer
 from doedesign.spec import Spec, load_spec
-from sim.convolve import fast_length
+from doedesign.training.backbones import convolutions, weight_shapes
+from doedesign.training.checkpoint import settled
+from doedesign.training.joint import State, Trainer
+from doedesign.training.perceptual import Lpips
+from sim.imaging.convolve import fast_length
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SPECS = {"automotive": 512, "automotive_cpu": 256}

@@ -8,9 +8,9 @@ from doedesign.spec import DefectsSpec, ProcessSpec, Spec, WaferSpec, load_proce
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME
 from fab.grid import Grid
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.process import ERRORS, Defects, Process, Spread, error_names
-from fab.wafer import Wafer
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.

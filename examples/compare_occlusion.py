@@ -4,9 +4,9 @@
 
 A dark bar stands upright before the middle of the lens, at the nearest depth of the spec; it is a quarter to twice as
 wide as the aperture (1 to 10 mm for the automotive plate). Behind it, bright lines at equal distances fill the view.
-The reference (`sim.shadow`) sends the light of every line past the bar to the aperture, wave by wave, and through the
-partly shaded plate; the models of `sim.occlusion` mix the PSFs of the open plate. Written beside the
-run, in `occlusion/`:
+The reference (`sim.imaging.shadow`) sends the light of every line past the bar to the aperture, wave by wave, and
+through the partly shaded plate; the models of `sim.imaging.occlusion` mix the PSFs of the open plate. Written beside
+the run, in `occlusion/`:
 
     occlusion.json    for every width: the light that passes on the axis, and the error of every model
     occlusion.png     the same as a picture
@@ -27,17 +27,17 @@ import numpy as np
 
 from doedesign.build import camera_of
 from doedesign.cli import exit_code
-from doedesign.progress import meter
 from doedesign.report.canvas import INK, SERIES, picture, place
-from doedesign.runs import open_run
+from doedesign.runs.folder import open_run
+from doedesign.runtime.progress import meter
 from fab.files import canonical_json, write_atomic
 from fab.units import MM, format_length
 from sim.camera import Camera
-from sim.formation import Optics, capture
-from sim.occlusion import Model, Outside
-from sim.psf import psf_bank
-from sim.scene import Obstruction, Scene
-from sim.shadow import shadowed_psf
+from sim.imaging.formation import Optics, capture
+from sim.imaging.occlusion import Model, Outside
+from sim.imaging.scene import Obstruction, Scene
+from sim.imaging.shadow import shadowed_psf
+from sim.psf_bank import psf_bank
 from sim.store import read_height
 
 # Widths of the bar over the diameter of the aperture: 1, 2, 3, 4, 6, 8 and 10 mm for 4.44 mm.

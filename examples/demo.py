@@ -19,7 +19,7 @@ from doedesign.cli import exit_code
 from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
-from doedesign.drawing import level_map_from
+from doedesign.runs.level_maps import level_map_from
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length

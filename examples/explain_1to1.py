@@ -54,7 +54,7 @@ from explain_plates import (
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.report.canvas import length_text
-from doedesign.runs import Run
+from doedesign.runs.folder import Run
 from fab.files import canonical_json, write_atomic
 from fab.units import UM
 

@@ -26,7 +26,7 @@ from fab.units import UM
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from doedesign.predict import Prediction
+    from doedesign.prediction import Prediction
 
 _TICKS = (0.5, 1, 2, 3, 5, 10, 20)
 _ORANGE, _GREEN = "#e69f00", "#009e73"

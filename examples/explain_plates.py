@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from doedesign.build import camera_of
-from doedesign.calibrate import Family, Targets, explanations
-from doedesign.drawing import LevelMap, levels_of_run
-from doedesign.predict import Drawn, Prediction, predict
-from doedesign.runs import Run
+from doedesign.calibration import Family, Targets, explanations
+from doedesign.prediction import Drawn, Prediction, predict
+from doedesign.runs.folder import Run
+from doedesign.runs.level_maps import LevelMap, levels_of_run
 from fab.masks import unetched_outside
 from fab.process import Process, Spread, Variation
 from fab.units import NM, UM
@@ -102,7 +102,7 @@ class Plate:
 
 
 class Seen(NamedTuple):
-    """A plate and the numbers of its near PSF by wavelength (`doedesign.predict.plate_rows`)."""
+    """A plate and the numbers of its near PSF by wavelength (`doedesign.prediction.plate_rows`)."""
 
     plate: Plate
     light: dict[str, dict[str, Any]]

@@ -20,8 +20,8 @@ from pathlib import Path
 
 from see_through import photographed
 
+from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code
-from doedesign.images import sample_files
 from doedesign.recon.model import RELEASED, open_model
 from doedesign.recon.photos import write_reconstruction
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network

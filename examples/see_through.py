@@ -21,18 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from doedesign.build import camera_of
-from doedesign.capture import obstruction_of, occlusion_of, outside_of, sensor_of, shown_as
+from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, sensor_of, shown_as
+from doedesign.capture.images import Pictures, sample_files
+from doedesign.capture.scenes import SceneData
+from doedesign.capture.simulate import Bench, captured, flat_psfs, shadow_window
 from doedesign.cli import exit_code
-from doedesign.images import Pictures, sample_files
-from doedesign.recon.data import SceneData
 from doedesign.recon.model import Model, open_model, released_model
-from doedesign.recon.scores import scores
 from doedesign.report.canvas import note, picture, place, scale_bar
-from doedesign.simulated import Bench, captured, flat_psfs, shadow_window
 from doedesign.spec import load_spec
+from doedesign.training.scores import scores
 from fab.units import format_length
 from sim.camera import Camera
-from sim.formation import psf_at
+from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
 from sim.obstruction import Kind, View
 from sim.store import read_height

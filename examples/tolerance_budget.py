@@ -18,7 +18,7 @@ from pathlib import Path
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.report.pictures import draw_budget
-from doedesign.tolerance import Budget, study
+from doedesign.tolerancing import Budget, study
 from fab.units import format_length
 
 HERE = Path(__file__).parent

@@ -18,7 +18,7 @@ from pathlib import Path
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.report.pictures import draw_changes, draw_histograms
-from doedesign.tolerance import Change, Plates, Study, study
+from doedesign.tolerancing import Change, Plates, Study, study
 
 HERE = Path(__file__).parent
 

@@ -31,20 +31,20 @@ import jax
 import numpy as np
 import see_through
 
+from doedesign.capture.images import PICTURE_FILES, Pictures, picture_files, sample_files
+from doedesign.capture.scenes import SceneData
+from doedesign.capture.simulate import captured, within
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.commands.train import Request, train
-from doedesign.images import PICTURE_FILES, Pictures, picture_files, sample_files
-from doedesign.progress import meter
-from doedesign.recon.data import SceneData
-from doedesign.recon.heldout import SCENE_SEED
 from doedesign.recon.model import open_model
-from doedesign.recon.scores import mean_and_interval, paired_difference, scores
-from doedesign.simulated import captured, within
+from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec
+from doedesign.training.scores import mean_and_interval, paired_difference, scores
+from doedesign.training.validation import SCENE_SEED
 from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
-from sim.formation import psf_at
+from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
 from sim.obstruction import View
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.psf import pixel_energy, plan_propagation, surface_energy
-from sim.pupil import SurfaceRows, surface_pupil
+from sim.propagation.pupil import SurfaceRows, surface_pupil
+from sim.psf_bank import pixel_energy, plan_propagation, surface_energy
 from sim.surface import Surface
 
 

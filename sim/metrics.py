@@ -11,7 +11,7 @@ from scipy.fft import fft2
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
-from sim.psf import pupil_field
+from sim.psf_bank import pupil_field
 
 
 def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y x"]:

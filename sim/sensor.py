@@ -2,11 +2,11 @@
 
     light ──> electrons ──> counted, with shot noise ──> full well ──> + read noise ──> raw numbers, rounded
 
-Light is relative to a white of the scene through a lossless lens of the same aperture (`sim.formation`); a plate that
-loses light makes a darker and noisier capture at the same exposure. Electrons are those behind the quantum efficiency:
-the full well holds `full_well_e` of them, and the exposure is such that white fills the share `exposure` of it in the
-colour that the sensor sees best; other colours fill it less, as their quantum efficiency is less. A raw number is the
-black level and a number of steps of full well / (2^bits - 1 - black level) electrons.
+Light is relative to a white of the scene through a lossless lens of the same aperture (`sim.imaging.formation`); a
+plate that loses light makes a darker and noisier capture at the same exposure. Electrons are those behind the quantum
+efficiency: the full well holds `full_well_e` of them, and the exposure is such that white fills the share `exposure` of
+it in the colour that the sensor sees best; other colours fill it less, as their quantum efficiency is less. A raw
+number is the black level and a number of steps of full well / (2^bits - 1 - black level) electrons.
 
 Noise models by name:
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from sim.camera import Camera, direction_sines, wrapped_waves
-from sim.pupil import cis
+from sim.propagation.pupil import cis
 
 
 class Source(NamedTuple):
@@ -112,7 +112,7 @@ def remainder_m(rows_y_m: Array, columns: SourceColumns) -> Float[Array, "y x"]:
 
 
 def source_pupil(rows: SourceRows, columns: SourceColumns) -> Complex[Array, "y x"]:
-    """Field coverage * exp(2 pi i (height * rate + source)) of rows (`sim.pupil.phase_pupil`)."""
+    """Field coverage * exp(2 pi i (height * rate + source)) of rows (`sim.propagation.pupil.phase_pupil`)."""
     waves = rows.height_m * columns.rate + rows.waves_y[:, None] + columns.waves_x[None, :]
     waves = waves + remainder_m(rows.y_m, columns) * columns.inverse_wavelength
     field = rows.coverage * cis(waves)

@@ -32,7 +32,7 @@ from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, write_atomic
 
 if TYPE_CHECKING:
-    import sim.psf
+    import sim.psf_bank
 
 _BANK = "psf_bank"
 _DIGEST = "sha256"
@@ -119,7 +119,7 @@ def read_height(path: str | Path) -> StoredHeight:
     return StoredHeight(height, pitch, aperture, texts)
 
 
-def write_bank(path: str | Path, bank: "sim.psf.PsfBank", extra: Mapping[str, str] | None = None) -> None:
+def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[str, str] | None = None) -> None:
     """Write a PSF bank, one channel per depth and colour.
 
     Args:
@@ -147,7 +147,7 @@ def write_bank(path: str | Path, bank: "sim.psf.PsfBank", extra: Mapping[str, st
     _write(Path(path), channels, {_BANK: canonical_json(description).decode()}, extra)
 
 
-def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = np.inf) -> "sim.psf.PsfBank":
+def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = np.inf) -> "sim.psf_bank.PsfBank":
     """Read a PSF bank, or a measured PSF written by another program.
 
     Args:
@@ -162,7 +162,7 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         InputError: the file is missing, no whole EXR file, holds neither a bank nor a PSF, or holds values
             that are not finite; or a pixel pitch is missing or contradicts the file.
     """
-    from sim.psf import PsfBank
+    from sim.psf_bank import PsfBank
 
     picture = _read(Path(path))
     for name, pixels in picture.channels.items():

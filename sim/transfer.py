@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.pupil import PhaseRows, block_size, in_blocks, phase_pupil
+from sim.propagation.pupil import PhaseRows, block_size, in_blocks, phase_pupil
 
 
 class TransferBank(NamedTuple):

@@ -78,8 +78,8 @@ def masks(
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
     from doedesign.commands.masks import write_masks
-    from doedesign.drawing import level_map_from
-    from doedesign.outlook import PROBE_M
+    from doedesign.lab.predictions import PROBE_M
+    from doedesign.runs.level_maps import level_map_from
 
     drawing = level_map_from(
         source,
@@ -130,7 +130,7 @@ def _patch(step: str | None, mesh: str | None) -> Any:
     option, text = ("--mesh-patch", mesh) if step is None else ("--patch", step)
     if text is None:
         return None
-    from fab.patch import Patch
+    from fab.solids.patch import Patch
 
     lengths = [length_of(option, part.strip()) or 0.0 for part in text.split(",")]
     if len(lengths) != 3:

@@ -115,7 +115,7 @@ def calibrate(
         estimate = str(folder / "process-estimate.toml")
         print_paths([folder, *sorted(folder.iterdir())], json_, estimate=estimate, explained=result.explained)
         return
-    from doedesign.calibrate import Targets
+    from doedesign.calibration import Targets
     from doedesign.commands.calibrate import explain
 
     lengths = {}

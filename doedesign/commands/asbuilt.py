@@ -4,17 +4,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from doedesign.asbuilt import Plate, compared, gratings_compared, plate_of
 from doedesign.build import process_for
 from doedesign.commands.psf import Say, require_own
-from doedesign.predict import Drawn, drawn_of, predict
+from doedesign.lab.as_built import Plate, compared, gratings_compared, plate_of
+from doedesign.prediction import Drawn, drawn_of, predict
 from doedesign.report.pictures import draw_psfs
-from doedesign.runs import alone_in, open_run
+from doedesign.runs.folder import alone_in, open_run
 from doedesign.spec import variation_to_toml
-from fab.asbuilt import AsBuilt, read_as_built
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import ERRORS, Process
+from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.store import write_bank
 
 FORMAT = "doedesign as-built 1"

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from doedesign.build import process_for, process_spec_of
-from doedesign.calibrate import Calibration, Explanation, Family, Measurement, Targets, explanations, load_shots
-from doedesign.calibrate import calibrate as fitted
-from doedesign.calibrate.unknowns import unknowns_of
+from doedesign.calibration import Calibration, Explanation, Family, Measurement, Targets, explanations, load_shots
+from doedesign.calibration import calibrate as fitted
+from doedesign.calibration.unknowns import unknowns_of
 from doedesign.commands.psf import require_own
-from doedesign.predict import Drawn, drawn_of, process_with_moves
-from doedesign.progress import meter
+from doedesign.prediction import Drawn, drawn_of, process_with_moves
 from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
 from doedesign.report.tolerance import error_label
-from doedesign.runs import Run, alone_in, open_run
+from doedesign.runs.folder import Run, alone_in, open_run
+from doedesign.runtime.progress import meter
 from doedesign.spec import ProcessSpec, load_process, process_to_toml, variation_to_toml
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process

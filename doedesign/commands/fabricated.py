@@ -7,17 +7,17 @@ import numpy as np
 
 from doedesign.build import process_for
 from doedesign.commands.psf import Say, require_own
-from doedesign.predict import Drawn, drawn_of, plate_rows, process_with_moves
-from doedesign.progress import meter
+from doedesign.prediction import Drawn, drawn_of, plate_rows, process_with_moves
 from doedesign.report.pictures import draw_psfs, draw_split
-from doedesign.runs import alone_in, open_run
+from doedesign.runs.folder import alone_in, open_run
+from doedesign.runtime.progress import meter
 from doedesign.spec import load_variation, variation_to_toml
-from doedesign.tolerance.draws import EXPECTED, variation_at
+from doedesign.tolerancing.draws import EXPECTED, variation_at
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process, Variation
 from sim.leakage import SplitPsf, split_psf
-from sim.psf import PsfBank, surface_bank
+from sim.psf_bank import PsfBank, surface_bank
 from sim.store import write_bank
 from sim.surface import as_fabricated
 

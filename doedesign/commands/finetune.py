@@ -4,7 +4,7 @@
         manifest.json       what this was made with, and the digests of all results when done
         pairs.json          names of all pairs, trained on and held out
         checkpoint.npz      everything a step changes; only while it is unfinished
-        history.jsonl       one line per step (`doedesign.recon.history`)
+        history.jsonl       one line per step (`doedesign.training.history`)
         validation/         step_000000.png (before) ...: held-out pairs as captured, as reconstructed, as they are
         network.npz         the network (`doedesign.recon.weights`)
         psf.exr             the PSFs that it was told of
@@ -30,22 +30,22 @@ from jaxtyping import Float
 
 from doedesign import __version__
 from doedesign.commands.psf import Say
-from doedesign.recon.checkpoint import settled, write_checkpoint
-from doedesign.recon.crops import PairBatch, PairData, Pairs, crop_shape, cut
-from doedesign.recon.heldout import Look
-from doedesign.recon.history import HISTORY_NAME, read_history
-from doedesign.recon.judged import Found, judge
-from doedesign.recon.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
 from doedesign.recon.model import Model, PsfChoice, Psfs, open_model, psfs_of, shown
-from doedesign.recon.pairs import PairSplit, find_pairs, pairs_digest, split_pairs
-from doedesign.recon.perceptual import Lpips
-from doedesign.recon.tuning import State, Tuner
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.report.training import draw_training, draw_validation
-from doedesign.runs import CHECKPOINT, alone_in
+from doedesign.runs.folder import CHECKPOINT, alone_in
+from doedesign.runtime.stopping import Stop, stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
-from doedesign.stopping import Stop, stoppable
+from doedesign.training.checkpoint import settled, write_checkpoint
+from doedesign.training.crops import PairBatch, PairData, Pairs, crop_shape, cut
+from doedesign.training.evaluation import Found, judge
+from doedesign.training.finetune import State, Tuner
+from doedesign.training.history import HISTORY_NAME, read_history
+from doedesign.training.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
+from doedesign.training.pairs import PairSplit, find_pairs, pairs_digest, split_pairs
+from doedesign.training.perceptual import Lpips
+from doedesign.training.validation import Look
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, write_atomic
 from sim.light import srgb_from_linear
@@ -129,7 +129,7 @@ def finetune(
 
     Args:
         model_folder: a run with a training, RUN/trained, or a released model.
-        pairs: folder of pairs, see `doedesign.recon.pairs`.
+        pairs: folder of pairs, see `doedesign.training.pairs`.
         out: folder; RUN/finetuned by default.
         request: how.
         say: told what is going on.

@@ -9,30 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from doedesign.build import camera_of, matching, process_of, wafer_of
-from doedesign.drawing import LevelMap
-from doedesign.outlook import PROBE_M, Foretold, foretold
+from doedesign.lab.predictions import PROBE_M, Foretold, foretold
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
-from doedesign.runs import open_run
+from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import LevelMap
 from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.files import sha256_file
-from fab.frame import Frame
-from fab.job import write_order
-from fab.layout import Chrome, pixel_edges
+from fab.layout.frame import Frame
+from fab.layout.geometry import Chrome, pixel_edges
+from fab.layout.marks import alignment_site
 from fab.levels import Levels
-from fab.manifest import map_digest
-from fab.marks import alignment_site
+from fab.manifest.records import map_digest
 from fab.masks import unetched_outside
-from fab.order import Order
-from fab.patch import Patch
+from fab.order.order import Order
+from fab.order.write import write_order
 from fab.process import Process, Variation
-from fab.repair import repaired
-from fab.rules import Rules, check
-from fab.runsheet import write_run_sheet
-from fab.sheet import Die, PlateFile, RunSheet
-from fab.verify import Report, verify_order
+from fab.rules.check import Rules, check
+from fab.rules.repair import repaired
+from fab.runsheet.tables import Die, PlateFile, RunSheet
+from fab.runsheet.write import write_run_sheet
+from fab.solids.patch import Patch
+from fab.verification.verify import Report, verify_order
 
 Say = Callable[[str], None]
 
@@ -175,7 +175,7 @@ def _run_sheet(
 
 
 def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, say: Say) -> Foretold | None:
-    from doedesign.predict import Drawn
+    from doedesign.prediction import Drawn
 
     camera, scene = camera_of(spec), spec.scene
     drawn = Drawn(spec.name, order.level_map, order.levels, camera, scene.near_m, scene.far_m)
@@ -224,7 +224,7 @@ def _psf_cost(
     spec: Spec, levels: Levels, before: NDArray[np.uint8], after: NDArray[np.uint8], say: Say
 ) -> list[dict[str, Any]]:
     """What light does with the map before and after a repair, colour by colour and depth by depth."""
-    from doedesign.predict import Drawn, predict
+    from doedesign.prediction import Drawn, predict
 
     camera, scene = camera_of(spec), spec.scene
     rows = [
@@ -242,5 +242,5 @@ def _psf_cost(
 
 
 def verify(folder: Path) -> Report:
-    """Prove a mask order from its files alone; see `fab.verify.verify_order`."""
+    """Prove a mask order from its files alone; see `fab.verification.verify.verify_order`."""
     return verify_order(folder)

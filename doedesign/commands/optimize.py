@@ -7,13 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from doedesign.etches import heights_of, light_cost
-from doedesign.evaluate import design_metrics, pattern_metrics
-from doedesign.optimize import Design, State, finished_design, initial_state, learns_depths, optimiser_of, steps
-from doedesign.problem import Problem, Scene, problem_of
-from doedesign.progress import meter
+from doedesign.design.etch_depths import heights_of, light_cost
+from doedesign.design.metrics import design_metrics, pattern_metrics
+from doedesign.design.optimize import Design, State, finished_design, initial_state, learns_depths, optimiser_of, steps
+from doedesign.design.problem import Problem, Scene, problem_of
 from doedesign.report.pictures import draw_encircled, draw_height, draw_history, draw_mtf, draw_pattern, draw_psfs
-from doedesign.runs import (
+from doedesign.runs.folder import (
     Run,
     begin_run,
     claim_run,
@@ -24,12 +23,13 @@ from doedesign.runs import (
     save_checkpoint,
     write_history,
 )
+from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files, load_spec
 from fab.files import canonical_json, write_atomic
 from fab.levels import Levels
 from fab.units import NM
 from sim.aperture import circle_coverage
-from sim.psf import PsfBank, psf_bank
+from sim.psf_bank import PsfBank, psf_bank
 from sim.store import write_height
 from sim.transfer import transfer_bank
 
@@ -75,7 +75,7 @@ def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), s
 def _resume(
     run: Run, problem: Problem, scene: Scene, files: dict[str, Path], say: Say
 ) -> tuple[State, list[dict[str, Any]]]:
-    from doedesign.drawing import read_any_height
+    from doedesign.runs.level_maps import read_any_height
 
     optimiser = optimiser_of(run.spec)
     size = len(problem.camera.grid.axis_m("x"))
@@ -99,7 +99,7 @@ def _resume(
 
 def ring_shape(problem: Problem) -> int:
     """Number of parameters of a radial problem."""
-    from sim.hankel import ring_count
+    from sim.propagation.hankel import ring_count
 
     return ring_count(problem.camera)
 
@@ -126,7 +126,7 @@ def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray) -> PsfBank:
 
 
 def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
-    """The depths that were chosen, and what rounding to them costs, beside 2^k steps (`doedesign.etches`)."""
+    """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
     camera, binary = problem.camera, Levels(design.levels.count, design.levels.step_m)
     area = circle_coverage(camera.grid, camera.aperture_m)
     heights = heights_of(design.continuous_m, area, binary.period_m, camera)

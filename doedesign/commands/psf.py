@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 
 from doedesign.build import camera_of
-from doedesign.drawing import drawn_in_masks, levels_of_run, read_any_height
-from doedesign.evaluate import design_metrics
-from doedesign.progress import meter
+from doedesign.design.metrics import design_metrics
 from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
-from doedesign.runs import Run, alone_in, open_run
+from doedesign.runs.folder import Run, alone_in, open_run
+from doedesign.runs.level_maps import drawn_in_masks, levels_of_run, read_any_height
+from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
 from fab.levels import height_of
 from fab.masks import unetched_outside
 from sim.camera import Camera
-from sim.hankel import radial_profile, ring_count
-from sim.psf import PsfBank, psf_bank, radial_psf_bank
+from sim.propagation.hankel import radial_profile, ring_count
+from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
 from sim.store import write_bank
 from sim.transfer import transfer_bank
 

@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.commands.psf import Say
-from doedesign.progress import meter
 from doedesign.recon.model import Model, PsfChoice, Psfs, in_camera, open_model, psfs_of, released_model, shown
 from doedesign.recon.photos import PHOTO_FILES, WRITTEN_FILES, Photo, read_capture, write_reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles, reconstruct_tiled
-from doedesign.runs import alone_in
+from doedesign.runs.folder import alone_in
+from doedesign.runtime.progress import meter
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
 from sim.light import srgb_from_linear

@@ -25,25 +25,25 @@ import jax
 import numpy as np
 
 from doedesign.build import process_for
-from doedesign.capture import obstruction_of, occlusion_of, outside_of, plain_parameters, sensor_of, shown_as
-from doedesign.capturefiles import Stored, read_image, write_image
+from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, plain_parameters, sensor_of, shown_as
+from doedesign.capture.image_files import Stored, read_image, write_image
+from doedesign.capture.images import Pictures, picture_files, told_skips
+from doedesign.capture.scenes import Item, SceneData
+from doedesign.capture.simulate import Bench, Captured, captured, flat_psfs, plate_psfs, shadow_window
 from doedesign.commands.fabricated import errors_of_plate
 from doedesign.commands.psf import Say
-from doedesign.images import Pictures, picture_files, told_skips
-from doedesign.predict import Drawn, drawn_of, process_with_moves
-from doedesign.progress import meter
-from doedesign.recon.data import Item, SceneData
+from doedesign.prediction import Drawn, drawn_of, process_with_moves
 from doedesign.report.contact import ContactRow
 from doedesign.report.pictures import draw_contact
-from doedesign.runs import Run, alone_in, open_run, spec_with
-from doedesign.simulated import Bench, Captured, captured, flat_psfs, plate_psfs, shadow_window
+from doedesign.runs.folder import Run, alone_in, open_run, spec_with
+from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_digest, variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process, Variation
 from sim.camera import Camera
+from sim.imaging.occlusion import follows_light
 from sim.obstruction import Kind, View
-from sim.occlusion import follows_light
 
 FORMAT = "doedesign simulation 1"
 

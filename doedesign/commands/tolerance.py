@@ -16,14 +16,14 @@ from doedesign.report.pictures import (
     draw_shares,
     draw_yield,
 )
-from doedesign.runs import open_run
+from doedesign.runs.folder import open_run
 from doedesign.spec import variation_to_toml
-from doedesign.tolerance.analysis import QUANTITIES, limit_text, obeys, yield_of
-from doedesign.tolerance.budget import Budget
-from doedesign.tolerance.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
-from doedesign.tolerance.pool import Beyond, Work, evaluate_here, predicted_bank
-from doedesign.tolerance.sensitivity import Change, Share, as_records, source_shares
-from doedesign.tolerance.studies import FORMAT, Plates, Study, study
+from doedesign.tolerancing.analysis import QUANTITIES, limit_text, obeys, yield_of
+from doedesign.tolerancing.budget import Budget
+from doedesign.tolerancing.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
+from doedesign.tolerancing.pool import Beyond, Work, evaluate_here, predicted_bank
+from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_shares
+from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
 from fab.process import ERRORS, error_names
@@ -108,7 +108,7 @@ def tolerance(
         plan: what is asked.
         out: the folder; RUN/tolerance by default.
         say: told what was found.
-        settings: `process`, `limits`, `seed`, `masks`, `workers`, `scheduler` of `doedesign.tolerance.study`.
+        settings: `process`, `limits`, `seed`, `masks`, `workers`, `scheduler` of `doedesign.tolerancing.study`.
 
     Returns:
         the folder.

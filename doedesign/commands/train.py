@@ -5,7 +5,7 @@
         spec.toml           the spec with every default and override filled in
         pictures.json       names of all pictures, trained on and held out, and their licence
         checkpoint.npz      everything a step changes; only while the training is unfinished
-        history.jsonl       one line per step (`doedesign.recon.history`)
+        history.jsonl       one line per step (`doedesign.training.history`)
         validation/         step_000500.png ...: held-out scenes as captured, as reconstructed, as they are
         network.npz         the trained network (`doedesign.recon.weights`)
         psf.exr             PSFs of the trained plate at the depths of the spec and at infinity
@@ -30,21 +30,21 @@ import jax
 
 from doedesign import __version__
 from doedesign.build import camera_of
-from doedesign.capture import obstruction_of, occlusion_of, plain_parameters
+from doedesign.capture.from_spec import obstruction_of, occlusion_of, plain_parameters
+from doedesign.capture.images import Pictures, told_skips
+from doedesign.capture.scenes import Batch, SceneData
 from doedesign.commands.psf import Say
-from doedesign.images import Pictures, told_skips
-from doedesign.recon.checkpoint import settled, write_checkpoint
-from doedesign.recon.data import Batch, SceneData
-from doedesign.recon.heldout import SCENE_SEED, split_pictures
-from doedesign.recon.history import HISTORY_NAME, read_history, require_tensorboard
-from doedesign.recon.hosts import gathered, join_hosts
-from doedesign.recon.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
-from doedesign.recon.train import State, Trainer, devices_mesh, layout_of, rates_at
 from doedesign.report.training import draw_training, draw_validation
-from doedesign.runs import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
+from doedesign.runs.folder import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
+from doedesign.runtime.stopping import Stop, stoppable
 from doedesign.spec import Spec, spec_digest, spec_to_toml
-from doedesign.stopping import Stop, stoppable
-from doedesign.trained import HeldOut, height_at_rest_m, heights_before, validate, write_results
+from doedesign.training.checkpoint import settled, write_checkpoint
+from doedesign.training.history import HISTORY_NAME, read_history, require_tensorboard
+from doedesign.training.hosts import gathered, join_hosts
+from doedesign.training.joint import State, Trainer, devices_mesh, layout_of, rates_at
+from doedesign.training.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
+from doedesign.training.results import HeldOut, height_at_rest_m, heights_before, validate, write_results
+from doedesign.training.validation import SCENE_SEED, split_pictures
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
 from sim.obstruction import Kind, View
@@ -67,7 +67,7 @@ class Request:
         devices: number of devices; all if None.
         occlusion: occlusion model; that of the spec if None.
         obstruction: kind, or folder of masks; that of the spec if None.
-        coordinator: with several hosts, see `doedesign.recon.hosts.join_hosts`, like the next two.
+        coordinator: with several hosts, see `doedesign.training.hosts.join_hosts`, like the next two.
         hosts: their number.
         host: number of this one.
     """

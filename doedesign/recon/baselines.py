@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from doedesign.recon.wiener import sharpened
-from sim.convolve import convolve, plan_otf
+from sim.imaging.convolve import convolve, plan_otf
 from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
 from sim.sensor import Sensor
 

@@ -22,8 +22,8 @@ from doedesign.recon.photos import Photo
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
 from fab.files import sha256_file
-from sim.formation import psf_at
-from sim.psf import PsfBank
+from sim.imaging.formation import psf_at
+from sim.psf_bank import PsfBank
 from sim.store import read_bank
 
 __all__ = ["Model", "PsfChoice", "Psfs", "in_camera", "open_model", "psfs_of", "released_model", "shown"]

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt
 
-from doedesign.capturefiles import read_image
+from doedesign.capture.image_files import read_image
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, explain_os_error, read_json, sha256_file, write_atomic
 from sim.frames import RAW_FILES

@@ -122,8 +122,8 @@ def sharpened(
 
     A tapered edge is lost as far as the PSF reaches, and a plate that spreads light reaches half across a training
     picture. Light goes on beyond a frame, and its mirror image is the best guess at how; training scenes go on so, too
-    (`sim.convolve`, border "reflect", which has the outermost samples once; here they stand twice, for transforms of
-    even lengths). Four times the samples: for pictures, not for features.
+    (`sim.imaging.convolve`, border "reflect", which has the outermost samples once; here they stand twice, for
+    transforms of even lengths). Four times the samples: for pictures, not for features.
 
     Args:
         image: `[b, y, x, c]` a picture, one channel for every colour.

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from doedesign.calibrate import Calibration
+    from doedesign.calibration import Calibration
 
 _SIDE = 2.6  # inches of an image
 _ABOVE, _BELOW, _LEFT, _GAP, _BAR = 0.3, 0.4, 0.15, 0.12, 0.6

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sim.psf import PsfBank
+    from sim.psf_bank import PsfBank
     from sim.transfer import TransferBank
 
 _MOST_DEPTHS = 3

@@ -13,7 +13,7 @@ from doedesign.report.tolerance import error_label
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from doedesign.calibrate import Explanation, Family
+    from doedesign.calibration import Explanation, Family
 
 _ROW = 0.27  # inches of one explanation's row
 _MOST_EXPLANATIONS = 14

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from doedesign.report.canvas import CHROME, INK, SERIES, picture
-from fab.layout import Layer
-from fab.part import Part, Plate
+from fab.layout.geometry import Layer
+from fab.layout.part import Part, Plate
 from fab.units import UM
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from sim.camera import Camera
 
 if TYPE_CHECKING:
     from sim.leakage import SplitPsf
-    from sim.psf import PsfBank
+    from sim.psf_bank import PsfBank
 
 _SIDE, _GAP, _LEFT, _MOST_ROWS = 2.2, 0.08, 0.35, 4
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    from sim.psf import PsfBank
+    from sim.psf_bank import PsfBank
 
 _MOST_COLUMNS = 6
 _MOST_ROWS = 6

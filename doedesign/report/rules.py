@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from doedesign.report.canvas import MARK, length_text, note, picture, place, scale_bar, wrapped
 from fab.grid import Grid
+from fab.layout.polygons import run_lengths
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
-from fab.polygons import run_lengths
-from fab.rules import PlaneRules, Rules, RulesReport, shortest_run
+from fab.rules.check import PlaneRules, Rules, RulesReport, shortest_run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +49,7 @@ def draw_rules(
 
     Args:
         path: the PNG file.
-        report: what `fab.rules.check` said of the map.
+        report: what `fab.rules.check.check` said of the map.
         level_map: `[y, x]` the levels that were checked.
         levels: the staircase.
         grid: the raster of the map.

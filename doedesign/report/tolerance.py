@@ -27,9 +27,9 @@ from doedesign.report.canvas import (
     place,
     wrapped,
 )
-from doedesign.tolerance.analysis import QUANTITIES, Table, Yield, good_plates, yield_of
-from doedesign.tolerance.budget import Budget
-from doedesign.tolerance.sensitivity import Change, Share
+from doedesign.tolerancing.analysis import QUANTITIES, Table, Yield, good_plates, yield_of
+from doedesign.tolerancing.budget import Budget
+from doedesign.tolerancing.sensitivity import Change, Share
 from fab.process import ERRORS
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def draw_changes(path: str | Path, changes: Sequence[Change]) -> None:
 
     Args:
         path: the PNG file.
-        changes: as `doedesign.tolerance.sensitivity.one_at_a_time` gives them.
+        changes: as `doedesign.tolerancing.sensitivity.one_at_a_time` gives them.
 
     Raises:
         InputError: the system refuses the path.
@@ -284,7 +284,7 @@ def draw_shares(path: str | Path, camera: "Camera", shares: Sequence[Share]) -> 
     Args:
         path: the PNG file.
         camera: the colours.
-        shares: as `doedesign.tolerance.sensitivity.sobol` gives them.
+        shares: as `doedesign.tolerancing.sensitivity.sobol` gives them.
 
     Raises:
         InputError: the system refuses the path.

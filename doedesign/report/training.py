@@ -64,7 +64,7 @@ def draw_training(path: str | Path, records: Sequence[Mapping[str, Any]], title:
 
     Args:
         path: the PNG file.
-        records: lines of the history (`doedesign.recon.history`) with "step", "loss", "parts" and, at some,
+        records: lines of the history (`doedesign.training.history`) with "step", "loss", "parts" and, at some,
             "validation".
         title: what stands above.
 

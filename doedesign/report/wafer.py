@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from doedesign.report.canvas import CHROME, FAINT, INK, LINE, MARK, SMALL, note, picture, place
-from fab.frame import Frame
-from fab.layout import Cell, Reference
+from fab.layout.frame import Frame
+from fab.layout.geometry import Cell, Reference
+from fab.layout.wafer import READING, Wafer
 from fab.units import MM, format_length
-from fab.wafer import READING, Wafer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,8 @@ def draw_wafer(path: Path, wafer: Wafer, frame: Frame, aperture_m: float, dbu_m:
     Args:
         path: the PNG file.
         wafer: the wafer.
-        frame: the cells around the DOE (`fab.frame.draw_frame`); dies that draw it differently bear their number.
+        frame: the cells around the DOE (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
+            number.
         aperture_m: diameter of the clear aperture, metres.
         dbu_m: database unit of the frame, metres.
         title: what stands above.

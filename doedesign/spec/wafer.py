@@ -6,8 +6,8 @@ from pydantic import Field
 
 from doedesign.spec.table import Table, unsaid
 from doedesign.spec.values import length
+from fab.layout.wafer import Wafer
 from fab.units import MM, UM
-from fab.wafer import Wafer
 
 __all__ = ["WaferFile", "WaferSpec"]
 
@@ -20,7 +20,7 @@ _USUAL = Wafer()
 
 
 class WaferSpec(Table, frozen=True):
-    """The wafer, its mask blanks, and how it is filled; see `fab.wafer.Wafer`.
+    """The wafer, its mask blanks, and how it is filled; see `fab.layout.wafer.Wafer`.
 
     Attributes:
         diameter_m: diameter of the wafer.

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
+from sim.imaging.scene import Obstruction
 from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["Fence", "Pattern"]
 

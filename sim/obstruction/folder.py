@@ -21,10 +21,10 @@ from jaxtyping import Float
 from fab.errors import InputError
 from fab.files import explain_os_error, read_json
 from fab.units import UM
+from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["MASK_FILES", "MaskFolder", "Picture", "read_mask"]
 

@@ -6,11 +6,11 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from sim.imaging.scene import Obstruction
 from sim.obstruction.dirt import Dirt
 from sim.obstruction.parameters import require_number
 from sim.obstruction.raindrop import Raindrop
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["DirtRaindrop"]
 

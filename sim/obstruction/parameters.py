@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
+from sim.imaging.scene import Obstruction
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["Kind", "Range", "draw_from", "require_depth", "require_number", "require_range"]
 

@@ -28,9 +28,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
+from sim.imaging.scene import Obstruction
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["Drop", "Raindrop"]
 

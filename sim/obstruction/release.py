@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
+from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.obstruction.fence import Fence
 from sim.obstruction.noise import gradients, perlin
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_range
 from sim.obstruction.view import View
-from sim.scene import Obstruction
 
 __all__ = ["ReleaseDirt", "ReleaseFence", "ReleaseRaindrop"]
 

@@ -62,8 +62,8 @@ def mask_states(
 def light_of(height: Float[Array, "p c"], rates: Float[Array, " w"]) -> Float[Array, "p 2 w c"]:
     """Transmission of every piece, real and imaginary part apart, so that all sums over pieces are real products.
 
-    One sine of the phase and of the phase plus a quarter, to 4e-6 like `sim.pupil.cis`: a single expression without
-    complex numbers compiles to a loop several times faster.
+    One sine of the phase and of the phase plus a quarter, to 4e-6 like `sim.propagation.pupil.cis`: a single expression
+    without complex numbers compiles to a loop several times faster.
     """
     waves = height[:, None] * rates[None, :, None]
     waves = jnp.stack([waves + 0.25, waves], axis=1)

@@ -8,13 +8,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Complex, Float, UInt8
 
 from fab.grid import Grid
+from fab.layout.polygons import run_lengths
 from fab.levels import height_of
 from fab.masks import planes
-from fab.polygons import run_lengths
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera
-from sim.pupil import cis
+from sim.propagation.pupil import cis
 from sim.surface.relief import plan_of, relief_of, require_possible
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fab.grid import Grid
-from sim.pupil import block_size, in_blocks
+from sim.propagation.pupil import block_size, in_blocks
 
 
 def _covariance(length: Array, lags: Float[Array, " lag"]) -> Float[Array, " lag"]:

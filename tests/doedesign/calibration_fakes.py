@@ -12,15 +12,15 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from doedesign.calibrate.bench import Bench
-from doedesign.calibrate.unknowns import unknowns_of
-from doedesign.predict import Drawn
+from doedesign.calibration.forward_model import Bench
+from doedesign.calibration.unknowns import unknowns_of
+from doedesign.prediction import Drawn
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside
 from fab.process import Process, Spread, error_names
 from sim.camera import Camera, Colour
-from sim.psf import PsfBank
+from sim.psf_bank import PsfBank
 from sim.store import write_bank
 
 PIXEL_M, PITCH_M, PROBE_M = 1.85e-6, 1.85e-6, 520e-9

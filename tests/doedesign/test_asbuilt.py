@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from doedesign.asbuilt import compared, gratings_compared, plate_of
 from doedesign.commands.asbuilt import as_built
-from doedesign.outlook import seen_of
-from doedesign.predict import Drawn, drawn_of, predict
-from doedesign.runs import open_run
+from doedesign.lab.as_built import compared, gratings_compared, plate_of
+from doedesign.lab.predictions import seen_of
+from doedesign.prediction import Drawn, drawn_of, predict
+from doedesign.runs.folder import open_run
 from doedesign.spec import load_variation
-from fab.asbuilt import AsBuilt, ChromeMeasured, MaskMeasured
 from fab.errors import InputError
+from fab.layout.structures import PAD_SIDES_UM
 from fab.levels import Levels
 from fab.process import Process, Spread, Variation
-from fab.runsheet import record
-from fab.structures import PAD_SIDES_UM
+from fab.runsheet.as_built import AsBuilt, ChromeMeasured, MaskMeasured
+from fab.runsheet.write import record
 from fab.units import NM, UM
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from doedesign.calibrate import Calibration, calibrate, load_shots, unknowns_of
-from doedesign.calibrate.bench import Bench
-from doedesign.calibrate.fit import search
-from doedesign.calibrate.question import Question, linearised, look, look_and_gradient, slopes_at
-from doedesign.calibrate.target import measured_weights
-from doedesign.calibrate.uncertainty import posterior
-from doedesign.predict import Drawn
+from doedesign.calibration import Calibration, calibrate, load_shots, unknowns_of
+from doedesign.calibration.fit import search
+from doedesign.calibration.forward_model import Bench
+from doedesign.calibration.objective import Question, linearised, look, look_and_gradient, slopes_at
+from doedesign.calibration.target import measured_weights
+from doedesign.calibration.uncertainty import posterior
+from doedesign.prediction import Drawn
 from fab.errors import InputError
 from fab.process import Process, Spread
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from doedesign.build import process_of
-from doedesign.predict import drawn_of
-from doedesign.runs import open_run
+from doedesign.prediction import drawn_of
+from doedesign.runs.folder import open_run
 from doedesign.spec import load_process, load_variation
 from fab.files import sha256_file
 from tests.doedesign.calibration_fakes import light_of, photograph, usual_process

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from doedesign.calibrate import Family, Targets, explanations
-from doedesign.predict import Drawn, predict
+from doedesign.calibration import Family, Targets, explanations
+from doedesign.prediction import Drawn, predict
 from fab.errors import InputError
 from fab.process import Process, variation_of
 from sim.camera import Colour

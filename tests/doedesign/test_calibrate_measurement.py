@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from doedesign.calibrate import load_measurement, load_shots
+from doedesign.calibration import load_measurement, load_shots
 from fab.errors import InputError
 from tests.doedesign.calibration_fakes import (
     PIXEL_M,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from doedesign.build import camera_of
-from doedesign.capture import obstruction_of, occlusion_of, outside_of, seen_in, sensor_of, shown_as
-from doedesign.capturefiles import read_image, write_image
+from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, seen_in, sensor_of, shown_as
+from doedesign.capture.image_files import read_image, write_image
 from doedesign.spec import load_spec, scene, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import canonical_json
+from sim.imaging.occlusion import Model
 from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, Fence, MaskFolder
-from sim.occlusion import Model
 from sim.sensor import NoiseModel, Pattern, Sensor
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

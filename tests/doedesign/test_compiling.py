@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from doedesign import compiling
+from doedesign.runtime import compiling
 
 glibc = pytest.mark.skipif(
     sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="only glibc can be asked"

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.drawing import level_map_from, levels_of_run, read_any_height
-from doedesign.runs import Run, begin_run, claim_run, finish_run
+from doedesign.runs.folder import Run, begin_run, claim_run, finish_run
+from doedesign.runs.level_maps import level_map_from, levels_of_run, read_any_height
 from doedesign.spec import load_spec
 from fab.errors import InputError
 from fab.levels import Levels, height_of

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.etches import choose_depths, heights_of, held, light_cost
-from doedesign.optimize import State, finished_design, initial_state, steps
-from doedesign.parametrize import PACE, Staircase
-from doedesign.problem import losses, problem_of, view_of
+from doedesign.design.etch_depths import choose_depths, heights_of, held, light_cost
+from doedesign.design.optimize import State, finished_design, initial_state, steps
+from doedesign.design.parametrize import PACE, Staircase
+from doedesign.design.problem import losses, problem_of, view_of
 from doedesign.spec import Spec, load_spec
 from fab.grid import Grid
 from fab.levels import Levels, height_of, quantise, quantise_wrapped

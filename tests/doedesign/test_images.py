@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.images import (
+from doedesign.capture.images import (
     SAMPLES,
     Pictures,
     crop,

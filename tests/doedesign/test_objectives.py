@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.objectives import View, far_spot, handcrafted, near_spread, terms_of, window_loss
-from doedesign.patterns import target_pattern_image
+from doedesign.design.objectives import View, far_spot, handcrafted, near_spread, terms_of, window_loss
+from doedesign.design.patterns import target_pattern_image
 from doedesign.spec import load_spec
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.metrics import participation
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CAMERA = Camera(Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64)
@@ -60,7 +60,7 @@ def test_window_loss_counts_what_is_not_there() -> None:
 
 
 def test_handcrafted_is_zero_at_its_targets() -> None:
-    from doedesign.objectives import spot_weights
+    from doedesign.design.objectives import spot_weights
 
     spots = spot_weights(CAMERA)[0]
     assert float(handcrafted(view(even(), spots / spots.sum()))) == pytest.approx(0.0, abs=1e-5)

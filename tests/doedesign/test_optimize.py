@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.optimize import State, finished_design, initial_state, steps
-from doedesign.problem import losses, problem_of, view_of
+from doedesign.design.optimize import State, finished_design, initial_state, steps
+from doedesign.design.problem import losses, problem_of, view_of
 from doedesign.spec import Spec, load_spec
 from fab.levels import quantise
-from sim.hankel import radial_profile
+from sim.propagation.hankel import radial_profile
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SMALL = ["doe.samples=128", "doe.aperture=0.2368 mm", "sensor.window=96", "optimize.steps=12"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.outlook import foretold, grating_orders, matters_of
-from doedesign.predict import Drawn, predict, process_with_moves
+from doedesign.lab.predictions import foretold, grating_orders, matters_of
+from doedesign.prediction import Drawn, predict, process_with_moves
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside

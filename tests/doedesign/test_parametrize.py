@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from doedesign.parametrize import Staircase, softness_at
+from doedesign.design.parametrize import Staircase, softness_at
 from fab.levels import Levels, height_of, quantise
 
 SIXTEEN = Staircase.at("fused_silica", 550e-9, Levels(16, 75e-9))

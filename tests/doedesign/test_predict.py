@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from doedesign.predict import Drawn, Prediction, plate_rows, predict
+from doedesign.prediction import Drawn, Prediction, plate_rows, predict
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
@@ -13,7 +13,7 @@ from fab.masks import unetched_outside
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.metrics import energy_budget, energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m, zeroth_order
-from sim.psf import psf_bank, surface_bank
+from sim.psf_bank import psf_bank, surface_bank
 from sim.surface import as_fabricated
 
 PITCH_M = 1.85e-6

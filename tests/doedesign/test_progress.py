@@ -2,7 +2,7 @@
 
 import pytest
 
-from doedesign import progress
+from doedesign.runtime import progress
 
 
 @pytest.fixture

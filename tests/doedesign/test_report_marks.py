@@ -5,10 +5,10 @@ import pytest
 from matplotlib.image import imread
 
 from doedesign.report.marks import draw_part, draw_view
+from fab.layout.marks import alignment_site
+from fab.layout.part import plates_of
+from fab.layout.structures import process_monitor
 from fab.levels import Levels
-from fab.marks import alignment_site
-from fab.part import plates_of
-from fab.structures import process_monitor
 from fab.units import NM, UM
 
 LEVELS = Levels(4, 300 * NM)

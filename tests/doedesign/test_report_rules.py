@@ -6,7 +6,7 @@ from doedesign.report import rules as picture
 from doedesign.report.rules import draw_rules
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.rules import Rules, check
+from fab.rules.check import Rules, check
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)

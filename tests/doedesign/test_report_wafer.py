@@ -4,11 +4,11 @@ import numpy as np
 from PIL import Image
 
 from doedesign.report.wafer import draw_wafer
-from fab.frame import draw_frame
+from fab.layout.frame import draw_frame
+from fab.layout.part import plates_of
+from fab.layout.split import splits_of
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.part import plates_of
-from fab.split import splits_of
-from fab.wafer import Wafer
 
 
 def drawn(path, wafer):

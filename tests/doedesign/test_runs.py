@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.runs import (
+from doedesign.runs.folder import (
     CHECKPOINT,
     Run,
     alone_in,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.images import Pictures, picture_files
-from doedesign.recon.data import Batch, SceneData
+from doedesign.capture.images import Pictures, picture_files
+from doedesign.capture.scenes import Batch, SceneData
 from fab.errors import InputError
+from sim.imaging.scene import Obstruction
 from sim.obstruction import Dirt, View
-from sim.scene import Obstruction
 
 VIEW = View((24, 32), 3.7e-6, 8e-3)
 

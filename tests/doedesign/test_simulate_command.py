@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import doedesign.commands.simulate as command
-from doedesign.capturefiles import read_image
+from doedesign.capture.image_files import read_image
 from fab.files import read_json
 from tests.doedesign.small_runs import call, finished_run
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from doedesign.build import camera_of
-from doedesign.recon.data import Item
-from doedesign.simulated import Bench, captured, flat_psfs, within
+from doedesign.capture.scenes import Item
+from doedesign.capture.simulate import Bench, captured, flat_psfs, within
 from doedesign.spec import load_spec
-from sim.occlusion import Model
+from sim.imaging.occlusion import Model
 from sim.sensor import Sensor
 from tests.doedesign.test_simulate_command import SPEC
 

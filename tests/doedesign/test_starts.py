@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from doedesign.starts import flat, lens, random, ring, ring_period_m, start_heights
+from doedesign.design.starts import flat, lens, random, ring, ring_period_m, start_heights
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.camera import Camera, Colour
-from sim.hankel import ring_count
 from sim.material import full_wave_height_m
 from sim.metrics import energy_within, radius_map_m, spot_radius_m, zeroth_order
-from sim.psf import psf_bank
+from sim.propagation.hankel import ring_count
+from sim.psf_bank import psf_bank
 
 GREEN = 550e-9
 CAMERA = Camera(Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201)

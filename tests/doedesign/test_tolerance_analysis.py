@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from doedesign.spec import LimitSpec
-from doedesign.tolerance import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
-from doedesign.tolerance.analysis import good_plates, obeys, statistics, table_of, worst_plate, yield_of
-from doedesign.tolerance.budget import budget_of
-from doedesign.tolerance.pool import Beyond, Rows, Work
+from doedesign.tolerancing import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
+from doedesign.tolerancing.analysis import good_plates, obeys, statistics, table_of, worst_plate, yield_of
+from doedesign.tolerancing.budget import budget_of
+from doedesign.tolerancing.pool import Beyond, Rows, Work
 from fab.errors import InputError
 from fab.process import Process, Spread, Variation
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from doedesign.tolerance import Study, study
-from doedesign.tolerance.draws import normal_keys
-from doedesign.tolerance.pool import Rows, Work
+from doedesign.tolerancing import Study, study
+from doedesign.tolerancing.draws import normal_keys
+from doedesign.tolerancing.pool import Rows, Work
 from fab.errors import InputError
 from fab.process import Variation, variation_of
 
@@ -150,7 +150,7 @@ def test_workers_are_set_up_and_mistakes_are_told(
     assert set(refusing.beyond(normal_keys(20)).values()) == {"overlay_x: must stay below 0.5 um, but got more"}
     with pytest.raises(ZeroDivisionError):
         ask(evaluate=fakes.broken).monte_carlo(1)
-    monkeypatch.setattr("doedesign.tolerance.cluster.__version__", "0.0.0")
+    monkeypatch.setattr("doedesign.tolerancing.cluster.__version__", "0.0.0")
     with pytest.raises(InputError, match=r"worker: must have doedesign 0\.0\.0"):
         ask().monte_carlo(1)
 
@@ -170,7 +170,7 @@ def test_a_plate_that_kills_its_workers_is_named(
 
 
 def test_nobody_there_is_told(ask: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("doedesign.tolerance.cluster._PATIENCE_S", 1.0)
+    monkeypatch.setattr("doedesign.tolerancing.cluster._PATIENCE_S", 1.0)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: a Dask scheduler must answer there.*dask scheduler"):
         ask(scheduler="tcp://127.0.0.1:9").monte_carlo(1)
     with pytest.raises(InputError, match="a Dask scheduler must answer there"):
@@ -189,7 +189,7 @@ import sys
 sys.modules["distributed"] = None
 sys.path.insert(0, {str(HERE)!r})
 import tolerance_fakes as fakes
-from doedesign.tolerance import study
+from doedesign.tolerancing import study
 study(fakes.drawn(), process=fakes.process(), evaluate=fakes.rows, scheduler="tcp://127.0.0.1:9").monte_carlo(1)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

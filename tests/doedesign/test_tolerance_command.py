@@ -12,7 +12,7 @@ import pytest
 import doedesign.commands.optimize
 import doedesign.commands.tolerance
 from doedesign.spec import load_variation
-from doedesign.tolerance import study
+from doedesign.tolerancing import study
 from fab.files import sha256_file, write_atomic
 from tests.doedesign.small_runs import call, finished_run
 

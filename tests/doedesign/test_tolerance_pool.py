@@ -20,9 +20,9 @@ from typing import Any
 
 import pytest
 
-from doedesign.tolerance import Study, study
-from doedesign.tolerance.draws import normal_keys
-from doedesign.tolerance.pool import default_workers
+from doedesign.tolerancing import Study, study
+from doedesign.tolerancing.draws import normal_keys
+from doedesign.tolerancing.pool import default_workers
 from fab.errors import InputError
 from fab.process import variation_of
 
@@ -181,7 +181,7 @@ SCRIPT = """
 import sys
 sys.path.insert(0, {here!r})
 import tolerance_fakes as fakes
-from doedesign.tolerance import study
+from doedesign.tolerancing import study
 asked = study(fakes.drawn({name!r}), process=fakes.process(), evaluate=fakes.marked_rows, workers=2, out={out!r})
 asked.monte_carlo(400)
 """
@@ -254,9 +254,9 @@ def test_a_run_that_is_stopped_keeps_its_plates_and_its_workers_end(
 
 def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest.MonkeyPatch):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 1e3)
+    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 1e3)
     assert default_workers(2400**2) == cores
-    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 2.5)
+    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 2.5)
     assert default_workers(2400**2) == 1
-    monkeypatch.setattr("doedesign.tolerance.pool._free_gib", lambda: 0.1)
+    monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 0.1)
     assert default_workers(100) == 1

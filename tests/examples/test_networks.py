@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from doedesign.capture.images import sample_files
 from doedesign.cli import main
-from doedesign.images import sample_files
 from doedesign.recon.model import RELEASED, open_model, released_model
 from doedesign.recon.photos import read_capture
 from fab.errors import InputError

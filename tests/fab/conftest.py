@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
-from fab.job import write_order
 from fab.levels import Levels
+from fab.order.write import write_order
 
 # Odd and even sides, and a pitch whose half is a whole number of nanometres, as in the automotive design.
 SHAPE = (21, 16)

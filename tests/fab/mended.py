@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from fab.files import sha256_file
-from fab.inventory import cell_entry
-from fab.manifest import FileEntry, Manifest, read_manifest
-from fab.verify import verify_order
-from fab.walker import read_gds
+from fab.gds.reader import read_gds
+from fab.manifest.cells import cell_entry
+from fab.manifest.records import FileEntry, Manifest, read_manifest
+from fab.verification.verify import verify_order
 
 
 def restate(folder: Path, change: Callable[[Manifest], Manifest]) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from fab.layout import Layer
-from fab.part import Part
+from fab.layout.geometry import Layer
+from fab.layout.part import Part
 
 
 def region(part: Part, *layers: Layer):

@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from fab.layout.marks import alignment_site, die_marks
+from fab.layout.part import moved, plates_of, prefixed
+from fab.layout.structures import process_monitor
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.marks import alignment_site, die_marks
-from fab.part import moved, plates_of, prefixed
 from fab.process import Process, Spread, error_names
-from fab.sheet import Die, Grating, Matter, Outlook, PlateFile, RunSheet, Seen
-from fab.structures import process_monitor
+from fab.runsheet.tables import Die, Grating, Matter, Outlook, PlateFile, RunSheet, Seen
 from fab.units import NM, UM
-from fab.wafer import Wafer
 
 DIGEST = "0123456789abcdef" * 4
 STEM = "DOE_TEST"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fab.asbuilt import AsBuilt, read_as_built
 from fab.errors import InputError
-from fab.runsheet import record
+from fab.runsheet.as_built import AsBuilt, read_as_built
+from fab.runsheet.write import record
 from fab.units import NM, UM
 from tests.fab.sheets import DIGEST, LEVELS, outlook, sheet
 

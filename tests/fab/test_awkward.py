@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Chrome, pixel_edges
+from fab.layout.geometry import Chrome, pixel_edges
 from fab.levels import Levels
-from fab.manifest import read_manifest
+from fab.manifest.records import read_manifest
 from fab.masks import planes, unetched_outside
+from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verify import read_level_map
+from fab.verification.verify import read_level_map
 
 BLANK = 15
 
@@ -68,7 +68,7 @@ MAPS = {
 @pytest.mark.parametrize(("level_map", "count"), MAPS.values(), ids=MAPS.keys())
 def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_path, monkeypatch, level_map, count):
     # The picture for people takes most of the time of an order this small.
-    monkeypatch.setattr("fab.job.preview_png", lambda *_: b"picture")
+    monkeypatch.setattr("fab.order.write.preview_png", lambda *_: b"picture")
     levels, grid = Levels(count, 1200 * NM / count), Grid(level_map.shape, 2 * UM)
     # A circle wide enough for every pixel is wider than the raster; the aperture may not be, so corners are blank.
     aperture_m, folder = min(grid.extent_m), tmp_path / "o"

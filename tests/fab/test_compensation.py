@@ -5,13 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.compensation import edge_moves, grown, read_back
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.layout import PixelEdges, Shapes, pixel_edges
+from fab.layout.compensation import edge_moves, grown, read_back
+from fab.layout.geometry import PixelEdges, Shapes, pixel_edges
+from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.masks import levels_of, planes
-from fab.polygons import rectangles
 
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 1))
 PIXEL = 1850

@@ -7,13 +7,13 @@ import klayout.db as kdb
 import numpy as np
 import pytest
 
-from fab.doe import mask_layout
+from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Chrome
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import Chrome
 from fab.levels import Levels, height_of, quantise
 from fab.masks import planes
-from fab.stream import write_gds
+from fab.order.write import write_order
 
 LEVELS = Levels(16, 75e-9)
 GRID = Grid((4, 4), 2e-6)

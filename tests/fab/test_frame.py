@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
-from fab.layout import Cell, Layer, Layout, Shapes
+from fab.gds.writer import write_gds
+from fab.layout.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
+from fab.layout.geometry import Cell, Layer, Layout, Shapes
+from fab.layout.part import plates_of
+from fab.layout.split import splits_of
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.part import plates_of
-from fab.split import splits_of
-from fab.stream import write_gds
-from fab.wafer import Wafer
 
 LEVELS = Levels(16, 75e-9)
 DOE = Cell("A_DOE", {Layer(1): Shapes(np.array([[-1000, -1000, 1000, 1000]], np.int32))})

@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fab.doe import mask_layout
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.layout import (
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import (
     Chrome,
     Layer,
     Shapes,

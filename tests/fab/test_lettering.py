@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.layout import Layer, Shapes
-from fab.lettering import HEIGHT, label_block, letter_boxes, lettering, mask_label, written
+from fab.layout.geometry import Layer, Shapes
+from fab.layout.lettering import HEIGHT, label_block, letter_boxes, lettering, mask_label, written
+from fab.layout.part import Part, plates_of
 from fab.levels import Levels
-from fab.part import Part, plates_of
 from fab.units import MM, NM, UM
 from tests.fab.parts import assert_sound, region
 

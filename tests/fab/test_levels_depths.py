@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.job import write_order
+from fab.layout.structures import codes_by_depth
 from fab.levels import Levels, height_of, quantise, quantise_wrapped, wrapped_cells
-from fab.manifest import read_manifest
+from fab.manifest.records import read_manifest
 from fab.masks import levels_of, planes
-from fab.preview import preview_png
+from fab.order.preview import preview_png
+from fab.order.write import write_order
 from fab.process import Process
-from fab.recipe import depths_m
-from fab.repair import repaired
-from fab.rules import Rules
-from fab.structures import codes_by_depth
-from fab.verify import verify_order
+from fab.rules.check import Rules
+from fab.rules.repair import repaired
+from fab.runsheet.recipe import depths_m
+from fab.verification.verify import verify_order
 
 NM = 1e-9
 STEP_M = 300 * NM

@@ -4,7 +4,7 @@ import pytest
 
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes
-from fab.manifest import read_manifest
+from fab.manifest.records import read_manifest
 
 
 def rewrite(folder, change):

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
+from fab.layout.marks import BOXES, VERNIER_STEP_M, alignment_notes, alignment_site, die_marks
+from fab.layout.part import Part, Plate, plates_of
 from fab.levels import Levels
-from fab.marks import BOXES, VERNIER_STEP_M, alignment_notes, alignment_site, die_marks
-from fab.part import Part, Plate, plates_of
 from fab.units import NM, UM
 from tests.fab.parts import assert_sound, layers_of, region
 

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.cells import Window, reduced_cells, whole, window_cells
 from fab.errors import CheckFailed, InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.mesh import Mesh, closed_volume_m3, relief_mesh
-from fab.meshfile import Unit, read_mesh, write_3mf, write_glb, write_stl
+from fab.solids.columns import Window, reduced_cells, whole, window_cells
+from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
+from fab.solids.meshfile import Unit, read_mesh, write_3mf, write_glb, write_stl
 from fab.units import NM, UM
 
 SIXTEEN = Levels(16, 75 * NM)

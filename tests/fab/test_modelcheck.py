@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from fab.manifest import read_manifest
-from fab.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solid import ChromeRing, Substrate, substrate_step
+from fab.manifest.records import read_manifest
+from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
+from fab.solids.substrate import ChromeRing, Substrate, substrate_step
 from fab.units import MM
 from tests.fab.mended import mend, restate, told
 

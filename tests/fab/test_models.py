@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fab.cells import Window
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Chrome
+from fab.layout.geometry import Chrome
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.manifest import read_manifest
-from fab.models import Relief, write_models
-from fab.patch import Patch
-from fab.step import step_bodies
+from fab.manifest.records import read_manifest
+from fab.order.write import write_order
+from fab.solids.columns import Window
+from fab.solids.patch import Patch
+from fab.solids.step import step_bodies
+from fab.solids.write import Relief, write_models
 from fab.units import MM, NM, UM
-from fab.verify import verify_order
-from fab.wafer import Wafer
+from fab.verification.verify import verify_order
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
 
@@ -108,7 +108,7 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
 
 def test_a_patch_of_another_place_is_told(patched):
     """The same files, but said to be a pixel farther: neither the centre of the boxes nor a column fits."""
-    from fab.modelcheck import model_problems
+    from fab.verification.models import model_problems
 
     manifest = read_manifest(patched)
     level_map = np.load(patched / manifest.level_map_file)

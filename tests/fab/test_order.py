@@ -5,15 +5,15 @@ import pytest
 
 from fab.errors import CheckFailed, InputError
 from fab.files import sha256_file
+from fab.gds.reader import read_gds
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Chrome, Layer, pixel_edges
+from fab.layout.geometry import Chrome, Layer, pixel_edges
 from fab.levels import Levels
-from fab.manifest import map_digest, read_manifest
+from fab.manifest.records import map_digest, read_manifest
 from fab.masks import unetched_outside
-from fab.order import order_id
-from fab.verify import read_level_map
-from fab.walker import read_gds
+from fab.order.order import order_id
+from fab.order.write import write_order
+from fab.verification.verify import read_level_map
 
 NAMES = [
     "DOE_SMALL_ALL.gds",
@@ -134,9 +134,9 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
         found = rectangles(bitmap, *edges)
         return found[:-1]
 
-    from fab.polygons import rectangles
+    from fab.layout.polygons import rectangles
 
-    monkeypatch.setattr("fab.compensation.rectangles", crooked)
+    monkeypatch.setattr("fab.layout.compensation.rectangles", crooked)
     with pytest.raises(CheckFailed, match=r"ALL\.gds: own reader, every pixel: layer 1/0: \d+ pixel"):
         write_order(tmp_path / "o", level_map, levels, grid, grid.extent_m[1], "bad", {})
     assert list(tmp_path.iterdir()) == []

@@ -7,16 +7,16 @@ import klayout.db as kdb
 import numpy as np
 import pytest
 
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Layer, Shapes, pixel_edges
+from fab.layout.geometry import Layer, Shapes, pixel_edges
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.manifest import read_manifest
+from fab.manifest.records import read_manifest
+from fab.order.write import write_order
 from fab.process import Process, Spread
-from fab.stream import write_gds
-from fab.verify import read_level_map, verify_order
-from fab.wafer import Wafer
-from fab.walker import read_gds
+from fab.verification.verify import read_level_map, verify_order
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fab.layout import Layer, Shapes
+from fab.layout.geometry import Layer, Shapes
+from fab.layout.part import Part, block, centred, column, joined, moved, plates_of, prefixed, row, turned, without
 from fab.levels import Levels
-from fab.part import Part, block, centred, column, joined, moved, plates_of, prefixed, row, turned, without
 from fab.units import MM, NM, UM
 from tests.fab.parts import kissing_corners
 

@@ -2,12 +2,12 @@ import cadquery
 import numpy as np
 import pytest
 
-from fab.cells import Window
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.patch import Patch, patch_body, patch_step
-from fab.step import step_bodies, step_volumes_m3
+from fab.solids.columns import Window
+from fab.solids.patch import Patch, patch_body, patch_step
+from fab.solids.step import step_bodies, step_volumes_m3
 from fab.units import NM, UM
 
 SIXTEEN = Levels(16, 75 * NM)

@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.polygons import MAX_VERTICES, annulus_sectors, doubled_area, paint, rectangles, run_lengths, smallest_runs
+from fab.layout.polygons import (
+    MAX_VERTICES,
+    annulus_sectors,
+    doubled_area,
+    paint,
+    rectangles,
+    run_lengths,
+    smallest_runs,
+)
 
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 1))
 

@@ -7,7 +7,7 @@ from PIL import Image
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import planes
-from fab.preview import _blocks, preview_png
+from fab.order.preview import _blocks, preview_png
 from fab.units import NM, UM
 
 

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.doe import mask_layout
+from fab.gds.gdstk_reader import Again
+from fab.gds.writer import write_gds, write_oasis
 from fab.grid import Grid
-from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
-from fab.polygons import rectangles
-from fab.readback import Again
-from fab.stream import write_gds, write_oasis
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
+from fab.layout.polygons import rectangles
 from fab.units import NM, UM
 
 TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
@@ -83,7 +83,7 @@ def test_layers_are_read_in_as_many_passes_as_memory_asks_for(tmp_path, monkeypa
         passes.append(options["filter"])
         return read(path, **options)
 
-    monkeypatch.setattr("fab.readback.gdstk.read_gds", counted)
+    monkeypatch.setattr("fab.gds.gdstk_reader.gdstk.read_gds", counted)
     edges = pixel_edges(grid)
 
     def windings(count: int, *others: Layer) -> list[np.ndarray]:

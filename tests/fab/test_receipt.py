@@ -13,15 +13,15 @@ import klayout.db as kdb
 import numpy as np
 import pytest
 
-from fab.compare import Expected
 from fab.errors import InputError
-from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
-from fab.manifest import Manifest, read_manifest
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
+from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
+from fab.manifest.records import Manifest, read_manifest
 from fab.masks import planes
-from fab.receipt import drawing_problems
-from fab.stream import write_gds
-from fab.verify import verify_order
-from fab.walker import read_gds
+from fab.verification.compare import Expected
+from fab.verification.shop_checks import drawing_problems
+from fab.verification.verify import verify_order
 from tests.fab.mended import mend, restate, told
 
 ALL, OASIS = "DOE_SMALL_ALL.gds", "DOE_SMALL_ALL.oas"

@@ -3,12 +3,12 @@ import pytest
 import tifffile
 from PIL import Image
 
-from fab.cells import Window, whole
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import read_height
 from fab.levels import Levels, height_of
-from fab.relief import write_greymap, write_npy, write_tiff, write_zemax_sag
+from fab.solids.columns import Window, whole
+from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_sag
 from fab.units import NM, UM
 
 # Odd and even sides, so that a swap of the axes shows.

@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
-from fab import repair
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.layout.polygons import smallest_runs
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
-from fab.polygons import smallest_runs
-from fab.repair import repaired
-from fab.rules import Rules, check
+from fab.rules.check import Rules, check, repair
+from fab.rules.repair import repaired
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)

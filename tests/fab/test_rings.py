@@ -6,7 +6,7 @@ import pytest
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside
-from fab.rings import pixel_share, ring_levels, rings_of
+from fab.solids.rings import pixel_share, ring_levels, rings_of
 from fab.units import NM, UM
 
 SIXTEEN = Levels(16, 75 * NM)

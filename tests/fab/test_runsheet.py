@@ -9,8 +9,8 @@ import pytest
 
 from fab.errors import InputError
 from fab.levels import Levels
-from fab.recipe import depths_m, etch_time_s, next_target_m, resist_thickness_m
-from fab.runsheet import BARS, PADS, html_page, record, write_run_sheet
+from fab.runsheet.recipe import depths_m, etch_time_s, next_target_m, resist_thickness_m
+from fab.runsheet.write import BARS, PADS, html_page, record, write_run_sheet
 from fab.units import NM, UM
 from tests.fab.sheets import DIGEST, STEM, outlook, sheet, spreads_of
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.solid import (
+from fab.solids.step import step_bodies, step_volumes_m3
+from fab.solids.substrate import (
     ChromeRing,
     Rings,
     Substrate,
@@ -15,7 +16,6 @@ from fab.solid import (
     wafer_bodies,
     wafer_step,
 )
-from fab.step import step_bodies, step_volumes_m3
 from fab.units import MM, NM, UM
 
 DIE = Substrate("die", 10 * MM, 0.5 * MM)

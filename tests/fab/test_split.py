@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.job import write_order
-from fab.layout import Layer, Shapes
+from fab.layout.geometry import Layer, Shapes
+from fab.layout.split import splits_of
+from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.manifest import read_manifest
+from fab.manifest.records import read_manifest
+from fab.order.write import write_order
 from fab.process import Process, Spread
-from fab.split import splits_of
-from fab.stream import write_gds
-from fab.verify import verify_order
-from fab.wafer import Wafer
-from fab.walker import read_gds
+from fab.verification.verify import verify_order
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
 

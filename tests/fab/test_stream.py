@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fab.doe import mask_layout
 from fab.errors import InputError
 from fab.files import sha256_file
+from fab.gds.reader import read_gds
+from fab.gds.writer import oasis_to_gds, write_gds, write_oasis
 from fab.grid import Grid
-from fab.layout import Cell, Chrome, Layer, Layout, Shapes
+from fab.layout.doe import mask_layout
+from fab.layout.geometry import Cell, Chrome, Layer, Layout, Shapes
+from fab.layout.polygons import rectangles
 from fab.levels import Levels
-from fab.polygons import rectangles
-from fab.stream import oasis_to_gds, write_gds, write_oasis
 from fab.units import NM, UM
-from fab.walker import read_gds
 
 FAR = 2**31 - 1
 TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)

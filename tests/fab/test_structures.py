@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.levels import Levels
-from fab.part import Part, Plate, plates_of
-from fab.structures import (
+from fab.layout.part import Part, Plate, plates_of
+from fab.layout.structures import (
     BAR_WIDTHS_UM,
     PAD_SIDES_UM,
     STEP_M,
@@ -21,6 +20,7 @@ from fab.structures import (
     process_monitor,
     staircase,
 )
+from fab.levels import Levels
 from fab.units import MM, NM, UM
 from tests.fab.parts import assert_sound, layers_of, region
 

@@ -6,13 +6,13 @@ import pytest
 
 from fab.errors import CheckFailed, InputError
 from fab.files import sha256_file
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.layout import Cell, Layer, Layout, Shapes, pixel_edges
+from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
-from fab.manifest import read_manifest
-from fab.stream import write_gds
-from fab.verify import read_level_map, verify_order
-from fab.walker import read_gds
+from fab.manifest.records import read_manifest
+from fab.verification.verify import read_level_map, verify_order
 
 MASKS = [
     "DOE_SMALL_ALL.gds",

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.layout import Cell, Layer, Layout, Reference, Shapes
-from fab.stream import write_gds
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
+from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes
 from fab.units import NM
-from fab.walker import read_gds
 
 TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
 

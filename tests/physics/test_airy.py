@@ -7,7 +7,7 @@ from scipy.special import j0, j1
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.camera import Camera
 from sim.metrics import encircled_energy
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 
 def flat_psf(camera: Camera) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera
 from sim.metrics import encircled_energy
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 
 def half_energy_radius(psf: np.ndarray, pixel_m: float, total: float) -> float:

@@ -10,9 +10,9 @@ from scipy.special import fresnel
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.fresnel import Kernel, plan_direct
-from sim.psf import psf_bank
-from sim.pupil import PhaseRows, phase_pupil
+from sim.propagation.fresnel import Kernel, plan_direct
+from sim.propagation.pupil import PhaseRows, phase_pupil
+from sim.psf_bank import psf_bank
 
 NO_LENS_M = 1e5  # focal length whose curvature over half a millimetre is 1e-6 of a wave
 

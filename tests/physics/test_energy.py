@@ -5,7 +5,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera, wrapped_map
 from sim.metrics import energy_budget
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 
 @pytest.mark.parametrize("plate", ["flat", "wrapped", "noise"])

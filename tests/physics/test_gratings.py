@@ -6,7 +6,7 @@ import pytest
 from bench.reference import YELLOW_M, make_camera
 from sim.camera import Camera
 from sim.metrics import zeroth_order
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 CELLS = 512
 PITCH = 1.85e-6

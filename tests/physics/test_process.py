@@ -14,7 +14,7 @@ from fab.masks import planes
 from fab.process import Process, Variation, variation_of
 from sim.camera import Camera, Colour
 from sim.leakage import mean_transmission, strehl, zeroth_order
-from sim.psf import PsfBank, surface_bank
+from sim.psf_bank import PsfBank, surface_bank
 from sim.surface import Surface, as_fabricated
 
 PITCH_M = 1.85e-6

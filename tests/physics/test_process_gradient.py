@@ -14,8 +14,8 @@ from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import ERRORS, Process, Variation, error_names, variation_of
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.psf import plan_propagation
-from sim.pupil import SurfaceRows, surface_pupil
+from sim.propagation.pupil import SurfaceRows, surface_pupil
+from sim.psf_bank import plan_propagation
 from sim.surface import as_fabricated
 
 pytestmark = pytest.mark.slow

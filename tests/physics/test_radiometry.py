@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from sim.disc import shadow_disc
-from sim.formation import Optics, capture, shadow_px
-from sim.occlusion import Model
-from sim.scene import Obstruction, Scene
+from sim.imaging.disc import shadow_disc
+from sim.imaging.formation import Optics, capture, shadow_px
+from sim.imaging.occlusion import Model
+from sim.imaging.scene import Obstruction, Scene
 
 # The paper's automotive camera with pixels of 3.7 um: the disc of a point at 5 cm is 192 pixels wide.
 APERTURE_M, FOCAL_M, PIXEL_M, DEPTH_M = 4.44e-3, 8e-3, 3.7e-6, 0.05

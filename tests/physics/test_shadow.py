@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera
-from sim.psf import psf_bank
-from sim.shadow import pupil_shadow, shadow, shadowed_psf
+from sim.imaging.shadow import pupil_shadow, shadow, shadowed_psf
+from sim.psf_bank import psf_bank
 
 NEAR_M = 0.05
 # Fresnel number D^2 / (lambda z) of 76, a tenth of the automotive camera's: fringes are wider, tests faster.
@@ -118,7 +118,7 @@ def test_an_even_light_behind_a_bar_is_what_the_bar_would_have_sent():
     """Reciprocity: a world of one radiance stays even whatever the plate does, so bar and background add up to it.
 
     The plate is a ring grating, whose zones send light outward along their own radius: here p_near is not the shadow
-    disc blurred by p_far, and the models of `sim.formation` differ.
+    disc blurred by p_far, and the models of `sim.imaging.formation` differ.
     """
     camera = dataclasses.replace(SMALL, window=255)
     y, x = np.meshgrid(camera.grid.axis_m("y"), camera.grid.axis_m("x"), indexing="ij")

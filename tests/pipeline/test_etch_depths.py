@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import doedesign.commands.optimize
-from doedesign.drawing import levels_of_run
-from doedesign.predict import drawn_of
-from doedesign.runs import open_run
-from fab.layout import pixel_edges
+from doedesign.prediction import drawn_of
+from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import levels_of_run
+from fab.layout.geometry import pixel_edges
 from fab.levels import Levels, height_of
-from fab.manifest import read_manifest
-from fab.verify import read_level_map
+from fab.manifest.records import read_manifest
+from fab.verification.verify import read_level_map
 from sim.store import read_bank, read_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")

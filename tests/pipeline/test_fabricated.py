@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from doedesign.drawing import levels_of_run
-from doedesign.runs import open_run
-from fab.job import write_order
-from fab.manifest import read_manifest
+from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import levels_of_run
+from fab.layout.wafer import Wafer
+from fab.manifest.records import read_manifest
+from fab.order.write import write_order
 from fab.process import Process, Spread
-from fab.wafer import Wafer
 from sim.store import read_bank
 
 PROCESS = """

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from fab.manifest import read_manifest
-from fab.rules import Rules, check
+from fab.manifest.records import read_manifest
+from fab.rules.check import Rules, check
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from doedesign.drawing import levels_of_run
-from doedesign.runs import open_run
-from fab.rings import ring_levels
+from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import levels_of_run
+from fab.solids.rings import ring_levels
 
 
 def models(order):

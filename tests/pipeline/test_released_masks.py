@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fab.verify import verify_order
+from fab.verification.verify import verify_order
 
 MASKS = Path(__file__).parents[2] / "masks"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import doedesign.commands.optimize
-import doedesign.runs
-from doedesign.runs import alone_in
+import doedesign.runs.folder
+from doedesign.runs.folder import alone_in
 
 # Long enough to be killed in the middle, with a checkpoint every few milliseconds.
 LONG = ("--set", "optimize.steps=400", "--set", "optimize.checkpoint_every=10")
@@ -69,7 +69,7 @@ def finished_files(finished, content):
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (doedesign.runs, "spec_to_toml"),  # between the manifest and the spec
+        (doedesign.runs.folder, "spec_to_toml"),  # between the manifest and the spec
         (doedesign.commands.optimize, "steps"),  # before the first step
         (doedesign.commands.optimize, "save_checkpoint"),  # before the first checkpoint
         (doedesign.commands.optimize, "write_history"),  # between the height maps and the rest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
-from sim.hankel import radial_profile
+from sim.propagation.hankel import radial_profile
 from sim.store import read_height, write_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")

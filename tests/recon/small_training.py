@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.capture import obstruction_of
-from doedesign.recon.data import Batch
-from doedesign.recon.train import Trainer
+from doedesign.capture.from_spec import obstruction_of
+from doedesign.capture.scenes import Batch
 from doedesign.spec import Spec, load_spec
-from sim.occlusion import Model
+from doedesign.training.joint import Trainer
+from sim.imaging.occlusion import Model
 
 PIXELS, CELLS = 32, 96
 # The least network, which compiles in the least time.

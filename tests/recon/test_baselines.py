@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from skimage.restoration import richardson_lucy as by_scikit_image
 
-from doedesign.images import crop, decoded, linear_light, sample_files
+from doedesign.capture.images import crop, decoded, linear_light, sample_files
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
-from sim.convolve import convolve, plan_otf
+from sim.imaging.convolve import convolve, plan_otf
 from sim.sensor import Sensor, developed, expose
 
 SENSOR = Sensor(full_well_e=20000, read_noise_e=4.0)

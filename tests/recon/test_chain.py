@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.recon.chain import LivePlate, RingPlate, StoredPlate, shots
-from doedesign.recon.train import Trainer
-from sim.hankel import revolve, ring_count
-from sim.psf import PsfBank, psf_bank, radial_psf_bank
+from doedesign.training.joint import Trainer
+from doedesign.training.optics import LivePlate, RingPlate, StoredPlate, shots
+from sim.propagation.hankel import revolve, ring_count
+from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
 from tests.recon.small_training import batch, heights, trainer
 
 AXIS, ASIDE = (0.0, 0.0), (0.2, -0.1)
@@ -49,7 +49,7 @@ def test_a_live_plate_has_the_psf_of_the_bank(depth_m: float, field_rad: tuple[f
     found = psf_of(plate, radians_of(plate, heights()), jnp.float32(1), plate.source(depth_m, field_rad))
     wanted = psf_bank(made.bench.camera, heights(), (depth_m,), field_rad=field_rad).energy[:, 0]
     # The bank's cells send light about the direction in which it leaves them, those of a step about the axis (see
-    # `sim.farfield`): so near 1 % of the PSF. Far away single precision is left, for waves up to a hundred.
+    # `sim.propagation.farfield`): so near 1 % of the PSF. Far away single precision is left, for waves up to a hundred.
     assert difference(found, wanted) < (0.012 if depth_m == NEAR_M else 2e-4)
 
 

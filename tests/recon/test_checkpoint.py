@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.recon.checkpoint import read_checkpoint, settled, write_checkpoint
+from doedesign.training.checkpoint import read_checkpoint, settled, write_checkpoint
 from fab.errors import InputError
 
 

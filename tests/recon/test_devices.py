@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.images import decoded, sample_files
-from doedesign.recon import train
-from doedesign.recon.history import read_history
-from doedesign.recon.hosts import join_hosts
+from doedesign.capture.images import decoded, sample_files
 from doedesign.recon.weights import read_network
+from doedesign.training import joint as train
+from doedesign.training.history import read_history
+from doedesign.training.hosts import join_hosts
 from fab.errors import InputError
 from fab.files import read_json
 from tests.doedesign.small_runs import finished_run
@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 DEVICES = f"""
 import json, logging
 import jax, numpy as np
-from doedesign.recon.train import devices_mesh
+from doedesign.training.joint import devices_mesh
 from tests.recon.small_training import batch, heights, trainer
 
 compiled = []

@@ -15,18 +15,18 @@ from scipy.signal import convolve2d
 import doedesign.commands.finetune as command
 from doedesign.cli import exit_code, main
 from doedesign.commands.finetune import Request, finetune
-from doedesign.recon.crops import PairData, Pairs
-from doedesign.recon.history import read_history
 from doedesign.recon.model import PsfChoice, open_model, psfs_of
 from doedesign.recon.network import Layout, Network
-from doedesign.recon.pairs import find_pairs, read_pair, split_pairs
 from doedesign.recon.photos import read_capture, write_reconstruction
-from doedesign.recon.tuning import Tuner, mirrored_as
 from doedesign.recon.weights import read_network, write_network
+from doedesign.training.crops import PairData, Pairs
+from doedesign.training.finetune import Tuner, mirrored_as
+from doedesign.training.history import read_history
+from doedesign.training.pairs import find_pairs, read_pair, split_pairs
 from fab.errors import InputError
 from fab.files import read_json, sha256_file, write_atomic
 from sim.light import linear_from_srgb, srgb_from_linear
-from sim.psf import PsfBank
+from sim.psf_bank import PsfBank
 from sim.store import read_bank, write_bank, write_picture
 
 PIXEL = 3.7e-6

@@ -17,10 +17,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from doedesign.cli import exit_code
-from doedesign.recon import perceptual, similarity
-from doedesign.recon.backbones import weight_shapes
-from doedesign.recon.perceptual import Lpips, read_lpips, weights_of
-from doedesign.recon.similarity import MsSsim
+from doedesign.training import perceptual, similarity
+from doedesign.training.backbones import weight_shapes
+from doedesign.training.perceptual import Lpips, read_lpips, weights_of
+from doedesign.training.similarity import MsSsim
 from fab.errors import InputError
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from doedesign.capturefiles import write_image
+from doedesign.capture.image_files import write_image
 from doedesign.recon.photos import read_capture, write_reconstruction
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_file

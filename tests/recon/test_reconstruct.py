@@ -20,7 +20,7 @@ from fab.files import canonical_json, read_json, sha256_file
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.light import srgb_from_linear
-from sim.psf import PsfBank
+from sim.psf_bank import PsfBank
 from sim.store import read_picture, write_bank, write_picture
 from tests.recon.drawn_networks import drawn
 

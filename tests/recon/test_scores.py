@@ -9,10 +9,10 @@ import pytest
 import scipy.stats
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from doedesign.recon import scores as scoring
-from doedesign.recon.backbones import weight_shapes
-from doedesign.recon.perceptual import Lpips, lpips, lpips_map, read_lpips
-from doedesign.recon.scores import mean_and_interval, paired_difference, scores
+from doedesign.training import scores as scoring
+from doedesign.training.backbones import weight_shapes
+from doedesign.training.perceptual import Lpips, lpips, lpips_map, read_lpips
+from doedesign.training.scores import mean_and_interval, paired_difference, scores
 
 psnr, ssim = eqx.filter_jit(scoring.psnr), eqx.filter_jit(scoring.ssim)
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.recon.chain import LivePlate
-from doedesign.recon.data import Batch
-from doedesign.recon.train import State, Trainer, devices_mesh, rates_at, resting_depths_m
+from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
+from doedesign.training.joint import State, Trainer, devices_mesh, rates_at, resting_depths_m
+from doedesign.training.optics import LivePlate
 from fab.errors import InputError
 from sim.obstruction import Dirt
 from tests.recon.small_training import PLAIN, batch, heights, small_spec, trainer

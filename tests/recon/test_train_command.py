@@ -20,23 +20,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import doedesign.archive
 import doedesign.commands.train as command
-import doedesign.trained
+import doedesign.runs.archive
+import doedesign.training.results
 from doedesign.build import camera_of
+from doedesign.capture.images import decoded, sample_files
 from doedesign.cli import exit_code, main
 from doedesign.commands.train import Request, train
-from doedesign.drawing import level_map_from
-from doedesign.images import decoded, sample_files
-from doedesign.recon.heldout import split_pictures
-from doedesign.recon.history import open_board, open_history, read_history
-from doedesign.recon.train import Trainer, layout_of
 from doedesign.recon.weights import read_network
 from doedesign.report.training import ValidationRow, draw_training, draw_validation
+from doedesign.runs.level_maps import level_map_from
 from doedesign.spec import load_spec
+from doedesign.training.history import open_board, open_history, read_history
+from doedesign.training.joint import Trainer, layout_of
+from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.files import read_json, sha256_file, write_atomic
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
 
@@ -306,7 +306,7 @@ def test_stopped_between_steps(
         (command, "write_checkpoint"),  # between a line of history and the checkpoint
         (command, "draw_validation"),
         (command, "write_results"),  # when all steps are done
-        (doedesign.trained, "write_network"),  # among the results
+        (doedesign.training.results, "write_network"),  # among the results
         (command, "draw_training"),
     ],
 )
@@ -350,7 +350,7 @@ from pathlib import Path
 from doedesign.build import camera_of
 from doedesign.cli import exit_code
 from doedesign.commands import train as command
-from doedesign.recon.train import Trainer
+from doedesign.training.joint import Trainer
 from fab.files import write_atomic
 
 step = Trainer.step
@@ -393,7 +393,7 @@ def test_a_process_that_is_told_to_end(
 
 def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The training stands at its last checkpoint, and goes on when there is room again."""
-    write, room = doedesign.archive.write_atomic, iter(range(2))
+    write, room = doedesign.runs.archive.write_atomic, iter(range(2))
 
     def filling(path: Path, data: bytes) -> None:
         if next(room, None) is None:
@@ -406,7 +406,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(doedesign.archive, "write_atomic", filling)
+        patch.setattr(doedesign.runs.archive, "write_atomic", filling)
         code, said = trained(run, tmp_path / "out", images)
     assert code == 2
     assert "checkpoint.npz: the disk must have room" in said
@@ -530,7 +530,7 @@ def _still(run: Path) -> Any:
         spec=spec,
         bench=bench,
         mesh=None,
-        plate=doedesign.trained.StoredPlate(jax.numpy.zeros((2, 1, 1, 1)), jax.numpy.zeros(2)),
+        plate=doedesign.training.results.StoredPlate(jax.numpy.zeros((2, 1, 1, 1)), jax.numpy.zeros(2)),
     )
 
 

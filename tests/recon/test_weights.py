@@ -10,9 +10,9 @@ import jax
 import numpy as np
 import pytest
 
-from doedesign.archive import read_archive, write_archive
 from doedesign.recon.network import Layout, Network, count_parameters
 from doedesign.recon.weights import FORMAT, read_network, write_network
+from doedesign.runs.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import canonical_json
 from tests.recon.drawn_networks import drawn

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from doedesign.calibrate import Calibration, Explanation, Family, Targets, calibrate, load_shots
-from doedesign.calibrate.family import Curve
+from doedesign.calibration import Calibration, Explanation, Family, Targets, calibrate, load_shots
+from doedesign.calibration.explanations import Curve
 from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process

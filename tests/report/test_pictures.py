@@ -25,7 +25,7 @@ from fab.grid import Grid
 from fab.levels import Levels
 from sim.camera import Camera, Colour
 from sim.material import full_wave_height_m
-from sim.psf import PsfBank, psf_bank
+from sim.psf_bank import PsfBank, psf_bank
 from sim.transfer import TransferBank
 
 RGB = (Colour("656nm", (656e-9,), (1.0,)), Colour("589nm", (589e-9,), (1.0,)), Colour("486nm", (486e-9,), (1.0,)))

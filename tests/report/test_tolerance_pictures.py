@@ -10,8 +10,8 @@ from matplotlib.image import imread
 
 from doedesign.report.pictures import draw_budget, draw_changes, draw_histograms, draw_shares, draw_yield
 from doedesign.report.tolerance import error_label
-from doedesign.tolerance import Budget, Change, Index, Share, Table, limit_from_text
-from doedesign.tolerance.analysis import yield_of
+from doedesign.tolerancing import Budget, Change, Index, Share, Table, limit_from_text
+from doedesign.tolerancing.analysis import yield_of
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 

@@ -8,7 +8,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera
 from sim.camera import Camera, path_at_m
-from sim.psf import psf_bank, pupil_field
+from sim.psf_bank import psf_bank, pupil_field
 
 
 def peak(image: np.ndarray) -> tuple[int, int]:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
-import sim.convolve
-from sim.convolve import Border, convolve_tiled, fast_length, margins, result_shape, tiles
+import sim.imaging.convolve
+from sim.imaging.convolve import Border, convolve_tiled, fast_length, margins, result_shape, tiles
 
-convolve, superpose = eqx.filter_jit(sim.convolve.convolve), eqx.filter_jit(sim.convolve.superpose)
-plan_otf = eqx.filter_jit(sim.convolve.plan_otf)
+convolve, superpose = eqx.filter_jit(sim.imaging.convolve.convolve), eqx.filter_jit(sim.imaging.convolve.superpose)
+plan_otf = eqx.filter_jit(sim.imaging.convolve.plan_otf)
 
 # Float32 transforms of a thousand samples round at some 1e-7 of the largest value; sums of a kernel are of order 1.
 ROUNDING = 2e-6

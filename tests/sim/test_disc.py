@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim.disc import disc_window, shadow_disc
+from sim.imaging.disc import disc_window, shadow_disc
 
 
 @pytest.mark.parametrize("diameter", [0.3, 1.0, 3.7, 20.0, 61.3])

@@ -9,9 +9,9 @@ from bench.reference import YELLOW_M, make_camera, relative_error, wrapped_map
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.farfield import TOLERANCE, FarField, displaced, plan_far_field
-from sim.pixel import Banded
-from sim.pupil import PhaseRows, phase_pupil
+from sim.propagation.farfield import TOLERANCE, FarField, displaced, plan_far_field
+from sim.propagation.pixel import Banded
+from sim.propagation.pupil import PhaseRows, phase_pupil
 
 # The airy disc is as wide against the pixel as in the paper's camera (f/1.8, 1.85 um).
 PLANS = {
@@ -81,7 +81,7 @@ def test_value_and_gradient(name: str, moved: bool, rng: np.random.Generator):
     run = jax.jit(jax.value_and_grad(objective, argnums=(0, 1), has_aux=True))
     (_, energy), (by_rows, by_rate) = run(rows, rate)
     inputs = inputs64(rows, rate)
-    # Float32 transforms of a few hundred samples and a pupil good to 4e-6 (`sim.pupil.cis`).
+    # Float32 transforms of a few hundred samples and a pupil good to 4e-6 (`sim.propagation.pupil.cis`).
     assert relative_error(np.asarray(energy), energy64(plan, field64(*inputs))) < 3e-5
 
     def loss64(leaf: int, change: np.ndarray | float) -> float:

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from bench.reference import make_camera
-from sim.field import FieldOptics, capture_frame, node_weights
-from sim.formation import Optics, capture
-from sim.occlusion import Model
-from sim.psf import PsfBank, psf_bank
-from sim.scene import Obstruction, Scene
+from sim.imaging.field import FieldOptics, capture_frame, node_weights
+from sim.imaging.formation import Optics, capture
+from sim.imaging.occlusion import Model
+from sim.imaging.scene import Obstruction, Scene
+from sim.psf_bank import PsfBank, psf_bank
 
 MODELS: tuple[Model, ...] = ("paper", "paper_release", "radiometric", "reciprocal")
 SHAPE, PIXEL_M, DEPTH_M = (70, 90), 2e-5, 0.1

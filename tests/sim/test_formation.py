@@ -8,10 +8,10 @@ import pytest
 
 from bench.reference import make_camera
 from fab.errors import InputError
-from sim.formation import Optics, capture, psf_at, shadow_px
-from sim.occlusion import Model, follows_light
-from sim.psf import PsfBank
-from sim.scene import Obstruction, Scene
+from sim.imaging.formation import Optics, capture, psf_at, shadow_px
+from sim.imaging.occlusion import Model, follows_light
+from sim.imaging.scene import Obstruction, Scene
+from sim.psf_bank import PsfBank
 
 MODELS: tuple[Model, ...] = ("paper", "paper_release", "radiometric", "reciprocal")
 SHAPE = (24, 30)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from fab.errors import InputError
 from sim.frames import read_frame
-from sim.psf import PsfBank
+from sim.psf_bank import PsfBank
 from sim.store import write_bank
 
 MEASURED = (

@@ -3,7 +3,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera
 from fab.errors import InputError
-from sim.fresnel import nyquist_focal_length_m, plan_direct
+from sim.propagation.fresnel import nyquist_focal_length_m, plan_direct
 
 
 def test_equation_six_at_the_papers_size():

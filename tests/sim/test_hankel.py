@@ -7,7 +7,7 @@ from scipy.special import j0, j1
 
 from bench.reference import YELLOW_M, make_camera, relative_error
 from fab.grid import Grid
-from sim.hankel import plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
+from sim.propagation.hankel import plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 
 CAMERA = make_camera(300, 0.6e-3, 1.08e-3, 1.85e-6, 49)
 

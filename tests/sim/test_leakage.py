@@ -13,7 +13,7 @@ from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.leakage import SplitPsf, mean_transmission, split_psf, strehl, zeroth_order
 from sim.metrics import zeroth_order as zeroth_order_of_heights
-from sim.psf import psf_bank, surface_bank
+from sim.psf_bank import psf_bank, surface_bank
 from sim.surface import Surface, as_fabricated
 
 PITCH_M = 2e-6

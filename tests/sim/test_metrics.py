@@ -19,7 +19,7 @@ from sim.metrics import (
     spot_radius_m,
     zeroth_order,
 )
-from sim.psf import psf_bank
+from sim.psf_bank import psf_bank
 
 CAMERA = make_camera(256, 0.6e-3, 1.08e-3, 1.85e-6, 64)
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.pixel import Banded, disc_autocorrelation, pixel_weights, sampling_for
+from sim.propagation.pixel import Banded, disc_autocorrelation, pixel_weights, sampling_for
 
 
 def test_disc_autocorrelation_by_counting():

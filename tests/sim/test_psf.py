@@ -5,9 +5,9 @@ import pytest
 
 from bench.reference import make_camera, relative_error, wrapped_map
 from sim.camera import Colour
-from sim.farfield import FarField
-from sim.fresnel import DirectPath
-from sim.psf import plan_propagation, psf_bank, pupil_field
+from sim.propagation.farfield import FarField
+from sim.propagation.fresnel import DirectPath
+from sim.psf_bank import plan_propagation, psf_bank, pupil_field
 
 ONE = make_camera(128, 0.3e-3, 0.54e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(128)

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim.pupil import PhaseRows, cis, phase_pupil
+from sim.propagation.pupil import PhaseRows, cis, phase_pupil
 
 
 @pytest.mark.parametrize("reach", [0.5, 3.0, 50.0])

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim.scene import Obstruction, Scene
+from sim.imaging.scene import Obstruction, Scene
 
 
 def scene(depth_m, value: float) -> Scene:

@@ -7,7 +7,7 @@ import pytest
 
 from fab.grid import Grid
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.pupil import PhaseRows, phase_pupil
+from sim.propagation.pupil import PhaseRows, phase_pupil
 from sim.source import SourceColumns, SourceRows, source_at, source_pupil
 
 LINES = (656e-9, 486e-9)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fab.errors import InputError
-from sim.psf import PsfBank
+from sim.psf_bank import PsfBank
 from sim.store import read_bank, read_height, read_picture, write_bank, write_height, write_picture
 
 ROOT = Path(__file__).parents[2]

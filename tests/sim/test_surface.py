@@ -15,8 +15,8 @@ from fab.masks import levels_of, planes
 from fab.process import Disc, MaskDisc, Process, Variation, error_names, variation_of
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
-from sim.psf import psf_bank, surface_bank
-from sim.pupil import cis
+from sim.propagation.pupil import cis
+from sim.psf_bank import psf_bank, surface_bank
 from sim.surface import Surface, as_fabricated
 
 PITCH_M = 1.85e-6

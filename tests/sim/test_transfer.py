@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera, wrapped_map
-from sim.pixel import disc_autocorrelation
-from sim.psf import psf_bank
+from sim.propagation.pixel import disc_autocorrelation
+from sim.psf_bank import psf_bank
 from sim.transfer import transfer_bank
 
 

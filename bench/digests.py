@@ -1,0 +1,87 @@
+"""SHA-256 of every file that a standard session writes, to prove that a change leaves results as they are.
+
+    python -m bench.digests before.json            # at the old state
+    python -m bench.digests after.json             # at the new one
+    python -m bench.digests --compare before.json after.json
+
+The session runs the command line only: the quick example, its mask order, PSFs, plates as fabricated, a tolerance
+study, captures and two training steps; and the small order of `masks/example`. Digests hold on one machine: another
+processor rounds differently.
+"""
+
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ["--set", "name=example", "--set", "doe.samples=96", "--set", "doe.aperture=0.1776 mm"]
+TRAINING = ["train.size=64", "train.steps=2", "train.perceptual=0.0", "network.width=3", "network.depth=1"]
+
+
+def session(folder: Path) -> None:
+    """Run every command that writes results into a folder."""
+    bare = str(ROOT / "masks" / "example" / "DOE_EXAMPLE_HEIGHT.npy")
+    quick = str(ROOT / "examples" / "quick.toml")
+    run, small = str(folder / "quick"), str(folder / "example")
+    stock = ["--set", "process.stock=contact_aligner"]
+    images = _pictures(folder / "pictures")
+    commands = [
+        ["optimize", quick, "--out", run, *stock],
+        ["masks", run, "--out", str(folder / "quick-masks")],
+        ["masks", run, "--levels", "8", "--out", str(folder / "quick-masks-8")],
+        ["psf", run, "--masks", str(folder / "quick-masks")],
+        ["psf", run, "--fabricated", "--seed", "0"],
+        ["tolerance", run, "--draws", "6", "--workers", "1"],
+        ["simulate", run, "--images", images, "--count", "2"],
+        ["train", run, "--images", images, *(word for change in TRAINING for word in ("--set", change))],
+        ["optimize", quick, "--out", small, *EXAMPLE, *stock],
+        ["masks", small, "--out", str(folder / "example-masks")],
+        ["masks", bare, "--levels", "16", "--step", "75 nm", "--pitch-um", "1.85", "--out", str(folder / "bare-masks")],
+        ["verify", str(folder / "quick-masks")],
+    ]
+    for command in commands:
+        done = subprocess.run(
+            [sys.executable, "-m", "doedesign.cli", *command], capture_output=True, text=True, check=False, cwd=ROOT
+        )
+        print(f"{done.returncode} doedesign {' '.join(command)}".replace(str(folder), "."), file=sys.stderr)
+        if done.returncode:
+            print(done.stderr, file=sys.stderr)
+
+
+def _pictures(folder: Path) -> str:
+    """Sample pictures of scikit-image, as a user's folder."""
+    from PIL import Image
+    from skimage import data
+
+    folder.mkdir()
+    for name in ("astronaut", "chelsea", "coffee", "rocket"):
+        picture = Image.fromarray(getattr(data, name)())
+        for part, box in enumerate([(0, 0, 300, 300), (100, 0, 400, 300), (50, 50, 350, 300)]):
+            picture.crop(box).save(folder / f"{name}{part}.png")
+    return str(folder)
+
+
+def digests() -> dict[str, str]:
+    """Digest of every file of the session by its path in it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "session"
+        folder.mkdir()
+        session(folder)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def compare(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """Every file that differs, is missing or is new."""
+    return [name for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--compare":
+        differences = compare(*(json.loads(Path(name).read_text()) for name in sys.argv[2:4]))
+        print("\n".join(differences) or "every file is the same")
+        sys.exit(bool(differences))
+    Path(sys.argv[1]).write_text(json.dumps(digests(), indent=1, sort_keys=True) + "\n")

@@ -1,0 +1,188 @@
+"""The model of a measurement: from errors of the process to the energies in the pixels of every image.
+
+The plate is `sim.surface.as_fabricated`'s, the light goes the far-field way. Every image has three numbers of its
+own besides: where its centre lies (a tilt across the pupil, so the model moves by any fraction of a pixel and the data
+never) and by how much its source lies off its depth (a curvature).
+
+A plate and its images can be differentiated backwards, from a gradient with respect to the pixels to one with respect
+to errors and motions; the light of all images goes back through one plate.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, UInt8
+
+from doedesign.calibration.unknowns import Unknowns
+from fab.grid import Grid
+from fab.process import Process
+from sim.camera import Camera, Colour, source_path_m, wrapped_waves
+from sim.propagation.farfield import FarField, plan_far_field
+from sim.propagation.pupil import cis
+from sim.surface import as_fabricated
+
+MOTIONS = ("shift_y", "shift_x", "defocus")  # pixels, pixels, 1/m
+
+
+class Plate(NamedTuple):
+    """What light meets.
+
+    Attributes:
+        transmission: `[y, x]` at the probe's wavelength.
+        coverage: `[y, x]` open share of every cell.
+    """
+
+    transmission: Complex[Array, "y x"]
+    coverage: Float[Array, "y x"]
+
+
+class _Rows(eqx.Module):
+    transmission: Complex[Array, "y x"]
+    coverage: Float[Array, "y x"]
+    source_waves: Float[Array, "y x"]
+    y: Float[Array, " y"]
+
+
+class _Optic(eqx.Module):
+    """One depth: its plan and source, and what a motion means in waves per cell.
+
+    Attributes:
+        plan: transform to the sensor.
+        source_waves: `[y, x]` wave of the source.
+        axis: cells from the middle.
+        rates: waves per cell and unit of motion (twice) and per cell² (defocus).
+        factor: Fresnel transmission.
+    """
+
+    plan: FarField
+    source_waves: Float[Array, "y x"]
+    axis: Float[Array, " x"]
+    rates: Float[Array, "3"]
+    factor: float = eqx.field(static=True)
+
+
+def _pupil(rows: _Rows, shared: tuple[Array, Array]) -> Complex[Array, "row x"]:
+    """The field behind the plate, tilted and bent."""
+    axis, motion = shared
+    y = rows.y[:, None]
+    waves = rows.source_waves + motion[0] * y + motion[1] * axis + motion[2] * (y * y + axis * axis)
+    return rows.coverage * rows.transmission * cis(waves)
+
+
+def _rows(optic: _Optic, plate: Plate) -> _Rows:
+    return _Rows(plate.transmission, plate.coverage, optic.source_waves, optic.axis)
+
+
+@eqx.filter_jit
+def _energy(optic: _Optic, plate: Plate, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
+    return optic.factor * optic.plan.energy(_pupil, _rows(optic, plate), (optic.axis, optic.rates * motion))
+
+
+def probe_camera(camera: Camera, wavelength_m: float, pixel_m: float, window: int, fill: float) -> Camera:
+    """The camera as the measurement used it: one colour, its own pixels."""
+    probe = Colour("probe", (wavelength_m,), (1.0,))
+    return replace(camera, colours=(probe,), pixel_m=pixel_m, window=window, fill=fill)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A plate in front of a camera, images of point sources at some depths.
+
+    Attributes:
+        level: `[y, x]` levels as drawn.
+        camera: optics and sensor, of one wavelength.
+        process: the process.
+        unknowns: which errors vary.
+        depths_m: depth of every image.
+    """
+
+    level: UInt8[np.ndarray, "y x"]
+    camera: Camera
+    process: Process
+    unknowns: Unknowns
+    depths_m: tuple[float, ...]
+    _optics: dict[Any, _Optic] = field(default_factory=dict)
+
+    @property
+    def wavelength_m(self) -> float:
+        """The probe's."""
+        return self.camera.colours[0].wavelengths_m[0]
+
+    def _surface(self, values: Any) -> tuple[Plate, Grid]:
+        variation = self.unknowns.variation(values)
+        surface = as_fabricated(self.level, self.camera, self.process, variation, (self.wavelength_m,))
+        return Plate(surface.transmission[0], surface.coverage), surface.grid
+
+    def plate(self, values: Float[np.ndarray, " p"]) -> "Seen":
+        """The plate with some errors."""
+        return Seen(self, *self._surface([float(v) for v in values]))
+
+    def plate_and_pull(
+        self, values: Float[np.ndarray, " p"]
+    ) -> tuple["Seen", Callable[[Plate], Float[np.ndarray, " p"]]]:
+        """The plate, and the function that turns a gradient with respect to it into one with respect to the errors."""
+        plate, pull, grid = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
+        return Seen(self, plate, grid), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
+
+    def optic(self, depth_m: float, grid: Grid) -> _Optic:
+        """Plan and source of a depth for a plate of some cells; made once."""
+        key = (depth_m, grid)
+        if key not in self._optics:
+            camera, wavelength = replace(self.camera, grid=grid), self.wavelength_m
+            scale = grid.pitch_m / wavelength
+            shift = scale * camera.pixel_m / camera.sensor_distance_m
+            self._optics[key] = _Optic(
+                plan_far_field(camera, wavelength, depth_m=depth_m),
+                jnp.asarray(wrapped_waves(source_path_m(camera, depth_m), wavelength)),
+                jnp.asarray(grid.axis_m("x") / grid.pitch_m, jnp.float32),
+                jnp.asarray([shift, shift, scale * grid.pitch_m / 2], jnp.float32),
+                camera.transmission(wavelength),
+            )
+        return self._optics[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A plate and the images of it."""
+
+    bench: Bench
+    plate: Plate
+    grid: Grid
+
+    def image(self, index: int, motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "y x"]:
+        """Energy in every pixel of an image, per unit power on the clear aperture, Fresnel loss included."""
+        return np.asarray(_energy(self._optic(index), self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
+
+    def image_and_pull(
+        self, index: int, motion: Float[np.ndarray, "3"]
+    ) -> tuple[Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[Plate, Float[np.ndarray, "3"]]]]:
+        """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
+        image, pull = jax.vjp(partial(_energy, self._optic(index)), self.plate, jnp.asarray(motion, jnp.float32))
+
+        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[Plate, Float[np.ndarray, "3"]]:
+            to_plate, to_motion = pull(jnp.asarray(gradient, jnp.float32))
+            return to_plate, np.asarray(to_motion, np.float64)
+
+        return np.asarray(image, np.float64), back
+
+    def expected_error(self, index: int) -> float:
+        """Relative error that the transform expects of itself."""
+        return self._optic(index).plan.expected_error
+
+    def zeroth_order(self) -> float:
+        """Share of the light that passes as if the plate were flat."""
+        return float(abs(self.mean(self.plate)) ** 2)
+
+    def mean(self, plate: Plate) -> complex:
+        """Mean transmission over the clear aperture."""
+        light = np.asarray(jnp.sum(plate.transmission * self.plate.coverage, axis=1), np.complex128).sum()
+        return complex(light) / (np.pi * (self.bench.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
+
+    def _optic(self, index: int) -> _Optic:
+        return self.bench.optic(self.bench.depths_m[index], self.grid)

@@ -1,0 +1,286 @@
+"""What was measured: a TOML file that names the images of a point source and says how they were taken.
+
+    probe = "520 nm"            # wavelength of the source
+    pixel = "1.85 um"           # pixel pitch of the images
+    gain = 2.1                  # electrons per count
+    read_noise = 2.5            # electrons
+
+    [[image]]
+    depth = "10 cm"             # of the source, from the plate; "inf" for a collimated beam
+    files = ["near_1ms.tiff", "near_10ms.tiff"]
+    exposures = ["1 ms", "10 ms"]
+    dark = ["dark_1ms.tiff", "dark_10ms.tiff"]
+
+    [[image]]
+    depth = "5 m"
+    files = ["far.exr"]
+
+Files are found relative to the folder of the TOML file. What a lab may say besides is in `MeasurementSpec` and
+`ImageSpec`. `load_shots` reads the files, merges the exposures and looks for the light.
+"""
+
+import math
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BeforeValidator, Field, ValidationError
+
+from doedesign.calibration.target import Shot
+from doedesign.spec import explain, spec_error
+from doedesign.spec.errors import Problem
+from doedesign.spec.table import Table
+from doedesign.spec.values import FROM_TOML, FarDepth, Pitch, Positive, Wavelength, broken, length
+from fab.errors import InputError
+from fab.files import explain_os_error, sha256_file
+from fab.units import MM
+from sim.camera import Camera
+from sim.frames import Channel, Frame, read_frame
+from sim.measured import (
+    MeasuredPsf,
+    Noise,
+    centre_of_light,
+    cut_window,
+    merge_exposures,
+    without_background,
+)
+
+_TIME = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*(s|ms|us|µs|ns)\s*")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+
+
+def _seconds(value: Any) -> float:
+    found = _TIME.fullmatch(value) if isinstance(value, str) else None
+    if found:
+        # 10 * 1e-3 is 0.01, 3 * 1e-3 is not quite 0.003; fifteen digits give back what was meant.
+        seconds = float(f"{float(found[1]) * _SECONDS[found[2]]:.15g}")
+        if seconds > 0:
+            return seconds
+    raise broken('must be a time with its unit, such as "10 ms"', "Write the unit inside the quotes.")
+
+
+Exposure = Annotated[float, BeforeValidator(_seconds)]
+Share = Annotated[float, Field(strict=True, gt=0, le=1)]
+
+
+class ImageSpec(Table, frozen=True):
+    """One image: a point source at one depth.
+
+    Attributes:
+        depth_m: distance of the source from the plate.
+        files: its exposures.
+        exposures: how long each was; may be left out where there is one.
+        name: what it is called; the first file's name by default.
+        dark: frames without light, one per exposure or one for all.
+        dark_frames: how many frames each dark file is the mean of.
+        black_level: counts without light where there is no dark frame; what the file says by default.
+        centre: row, counted from the top, and column of the chief ray where it is known; looked for by default.
+        depth_sigma_m: how well the depth is known.
+        incident: counts per second of all light on the clear aperture, where that was measured; without it only the
+            image's shape counts.
+        incident_sigma: its relative standard deviation.
+    """
+
+    depth_m: FarDepth = Field(examples=['"10 cm"'])
+    files: tuple[str, ...] = Field(min_length=1, examples=['["near_1ms.tiff", "near_10ms.tiff"]'])
+    exposures: tuple[Exposure, ...] = ()
+    name: str = ""
+    dark: tuple[str, ...] = ()
+    dark_frames: Annotated[int, Field(strict=True, ge=1)] = 1
+    black_level: Annotated[float, Field(strict=True, ge=0)] | None = None
+    centre: tuple[float, float] | None = None
+    depth_sigma_m: Annotated[float, length(0.0, 10.0)] = 0.0
+    incident: Positive | None = None
+    incident_sigma: Share = 0.02
+
+    @property
+    def called(self) -> str:
+        """Its name."""
+        return self.name or Path(self.files[0]).stem
+
+
+class MeasurementSpec(Table, frozen=True):
+    """How images were taken.
+
+    Attributes:
+        probe_m: vacuum wavelength of the source.
+        pixel_m: pixel pitch of the images.
+        gain: electrons per count.
+        read_noise: electrons, standard deviation of a reading.
+        image: the images, `[[image]]` in TOML.
+        window: pixels per side that are compared; by default what the design's window covers, or the images hold.
+        fill_factor: side of a pixel's light-sensitive square over its pitch; the design's by default.
+        saturation: counts from which a pixel is full; what the files say by default.
+        channel: colour to take of pictures in colour and of RAW mosaics.
+        allow_8bit: take files of 8 bits per pixel.
+        quarter_turns: quarter turns to the left that bring a picture to the plate's axes, +y up and +x to the right as
+            seen along the light.
+        mirrored: whether it has to be mirrored left to right before that.
+        defocus_sigma_m: how well the sensor's distance is known.
+    """
+
+    probe_m: Wavelength = Field(examples=['"520 nm"'])
+    pixel_m: Pitch = Field(examples=['"1.85 um"'])
+    gain: Positive = Field(examples=["2.1"])
+    read_noise: Annotated[float, Field(strict=True, ge=0)] = Field(examples=["2.5"])
+    image: tuple[ImageSpec, ...] = Field(min_length=1)
+    window: Annotated[int, Field(strict=True, ge=16, le=8192)] | None = None
+    fill_factor: Share | None = None
+    saturation: Positive | None = None
+    channel: Channel | None = None
+    allow_8bit: bool = False
+    quarter_turns: Literal[0, 1, 2, 3] = 0
+    mirrored: bool = False
+    defocus_sigma_m: Annotated[float, length(0.0, 10 * MM)] = 0.0
+
+
+class Measurement(NamedTuple):
+    """A measurement that was read.
+
+    Attributes:
+        spec: how it was taken.
+        shots: the images.
+        window: pixels per side to compare.
+        digests: SHA-256 of every file by its name in the TOML file, and of that.
+        full: pixels that say nothing, by image: full in every exposure, or of another colour.
+    """
+
+    spec: MeasurementSpec
+    shots: tuple[Shot, ...]
+    window: int
+    digests: dict[str, str]
+    full: dict[str, int]
+
+
+def load_measurement(path: Path) -> MeasurementSpec:
+    """Read the TOML file of a measurement; no image is opened.
+
+    Raises:
+        InputError: the file cannot be read, is no TOML, or breaks a rule.
+    """
+    try:
+        raw = tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        cure = "The start of doedesign/calibrate/measurement.py shows one."
+        raise InputError(str(path), "a measurement must be valid TOML", f'"{error}"', cure) from error
+    try:
+        spec = MeasurementSpec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
+    except ValidationError as error:
+        raise spec_error(str(path), explain(error, raw, MeasurementSpec)) from None
+    if problems := list(_problems(spec)):
+        raise spec_error(str(path), problems)
+    return spec
+
+
+def _problems(spec: MeasurementSpec) -> list[Problem]:
+    found, names = [], [image.called for image in spec.image]
+    for i, image in enumerate(spec.image):
+        key, count = f"image[{i}]", len(image.files)
+        if len(image.exposures) != count and not (count == 1 and not image.exposures):
+            rule = f"must have one entry per file, {count} here"
+            found.append(Problem(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
+        if len(image.dark) not in (0, 1, count):
+            rule = f"must name one dark frame per file, {count} here, or one for all"
+            found.append(Problem(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
+        if image.dark and image.black_level is not None:
+            found.append(Problem(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
+        if names.index(image.called) != i:
+            cure = "Add `name` to one of them."
+            found.append(Problem(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure))
+        if image.incident is not None and not image.exposures:
+            rule = "counts per second mean nothing without an exposure"
+            found.append(Problem(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
+    return found
+
+
+def load_shots(path: Path, camera: Camera, on_file: Callable[[str], None] = lambda _: None) -> Measurement:
+    """Read a measurement with all its images.
+
+    Args:
+        path: the TOML file.
+        camera: the design's, for the window.
+        on_file: told of every file that is read.
+
+    Raises:
+        InputError: a mistake in the file, or an image that cannot be used.
+    """
+    spec = load_measurement(path)
+    digests = {path.name: sha256_file(path)}
+
+    def read(name: str) -> Frame:
+        on_file(name)
+        file = path.parent / name
+        digests[name] = sha256_file(file)
+        frame = read_frame(file, channel=spec.channel, pixel_m=spec.pixel_m, allow_8bit=spec.allow_8bit)
+        return frame._replace(counts=_turned(spec, frame.counts), valid=_turned(spec, frame.valid))
+
+    merged = [_merged(spec, image, read) for image in spec.image]
+    smallest = min(min(psf.rate.shape) for psf in merged)
+    window = spec.window or min(round(camera.window * camera.pixel_m / spec.pixel_m), smallest)
+    shots = []
+    for image, psf in zip(spec.image, merged, strict=True):
+        try:
+            shots.append(_shot(spec, image, psf, camera, window))
+        except InputError as error:
+            raise InputError(f"{path}: image {image.called}", error.rule, error.got, error.cure) from error
+    full = {image.called: int((~psf.valid).sum()) for image, psf in zip(spec.image, merged, strict=True)}
+    return Measurement(spec, tuple(shots), window, digests, full)
+
+
+def _turned(spec: MeasurementSpec, picture: np.ndarray) -> np.ndarray:
+    """A picture on the plate's axes. Rows count upwards here, so numpy's turn to the left is one to the right."""
+    return np.ascontiguousarray(np.rot90(picture[:, ::-1] if spec.mirrored else picture, -spec.quarter_turns))
+
+
+def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], Frame]) -> MeasuredPsf:
+    frames = [read(name) for name in image.files]
+    files = [read(name) for name in image.dark]
+    black = image.black_level
+    darks = files * (len(frames) if len(files) == 1 else 1) or [f.black if black is None else black for f in frames]
+    return merge_exposures(
+        frames,
+        image.exposures or (1.0,),
+        darks,
+        Noise(spec.gain, spec.read_noise),
+        clipped_at=spec.saturation,
+        dark_count=image.dark_frames,
+        names=image.files,
+    )
+
+
+def _shot(spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int) -> Shot:
+    if min(psf.rate.shape) < window:
+        rule = f"an image must have at least the window's {window} pixels per side"
+        raise InputError(image.called, rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
+    clean, _ = without_background(psf)
+    centre = _stated_centre(spec, image, psf.rate.shape) or centre_of_light(clean)
+    # The rest of the frame has served; half a window to either side is kept for a better centre.
+    size = min(2 * window, *psf.rate.shape)
+    cut, rest = cut_window(clean, centre, size)
+    bend = image.depth_sigma_m / image.depth_m**2 if math.isfinite(image.depth_m) else 0.0
+    return Shot(
+        name=image.called,
+        depth_m=image.depth_m,
+        psf=cut,
+        centre=((size - 1) / 2 + rest[0], (size - 1) / 2 + rest[1]),
+        brightness=(image.incident, image.incident_sigma) if image.incident else None,
+        defocus_sigma=math.hypot(bend, spec.defocus_sigma_m / camera.sensor_distance_m**2),
+    )
+
+
+def _stated_centre(spec: MeasurementSpec, image: ImageSpec, shape: tuple[int, ...]) -> tuple[float, float] | None:
+    """Row, counted upwards, and column of the chief ray on the plate's axes."""
+    if image.centre is None:
+        return None
+    # As the picture lies in its file; a quarter turn exchanges rows and columns.
+    rows, columns = shape if spec.quarter_turns % 2 == 0 else shape[::-1]
+    y, x = (rows - 1) / 2 - image.centre[0], image.centre[1] - (columns - 1) / 2
+    x = -x if spec.mirrored else x
+    for _ in range(spec.quarter_turns):
+        y, x = x, -y
+    return y + (shape[0] - 1) / 2, x + (shape[1] - 1) / 2

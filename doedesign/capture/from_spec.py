@@ -1,0 +1,196 @@
+"""From a spec to what `simulate` and `train` put before the camera and behind it: obstruction, sensor, colours.
+
+A spec may leave all of it out but the occlusion model, which has no default: the models differ most where it matters
+(`sim.imaging.occlusion`), and a result has to say which one it was made with.
+"""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.spec import Spec
+from doedesign.spec.scene import OCCLUSION_MODELS
+from doedesign.spec.values import nearest
+from fab.errors import InputError
+from fab.units import parse_angle, parse_length
+from sim.camera import Camera
+from sim.imaging.occlusion import Model, Outside
+from sim.metrics import mean_wavelength_m
+from sim.obstruction import OBSTRUCTIONS, Kind
+from sim.sensor import Sensor
+
+# Luminance of linear sRGB (IEC 61966-2-1).
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+def occlusion_of(spec: Spec, source: str, given: str | None = None) -> Model:
+    """The occlusion model to use.
+
+    Args:
+        spec: the spec.
+        source: the spec's file, for the message.
+        given: what the command line says, which comes first.
+
+    Raises:
+        InputError: neither names one, or the command line names none that there is.
+    """
+    if given is not None and given not in OCCLUSION_MODELS:
+        rule = f"must be one of {', '.join(OCCLUSION_MODELS)}"
+        raise InputError("--occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
+    model = given or spec.scene.occlusion
+    if model is None:
+        cure = (
+            'Add occlusion = "reciprocal" to [scene], which is nearest to wave optics, "radiometric", or "paper" for '
+            "eq. 10; or give --occlusion."
+        )
+        raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
+    return cast("Model", model)
+
+
+def outside_of(kind: Kind) -> Outside:
+    """What eq. 10 takes for an obstruction's picture where there is none: for drops nothing, as in the public code."""
+    return "nothing" if "raindrop" in str(getattr(kind, "name", "")) else "scene"
+
+
+def sensor_of(spec: Spec) -> Sensor:
+    """The sensor of a spec, with the usual values of `sim.sensor` where the spec says nothing."""
+    given = spec.sensor
+    said = {
+        "full_well_e": given.full_well_e,
+        "exposure": given.exposure,
+        "quantum_efficiency": given.quantum_efficiency or None,
+        "read_noise_e": given.read_noise_e,
+        "dark_e": given.dark_e,
+        "black_level": given.black_level,
+        "bits": given.bits,
+        "pattern": given.bayer,
+        "noise": given.noise,
+    }
+    try:
+        return Sensor(**{name: value for name, value in said.items() if value is not None})
+    except ValueError as error:
+        rule, _, got = str(error).partition(", but got ")
+        raise InputError("sensor", rule.replace("`", ""), got, "Change it in [sensor].") from error
+
+
+def obstruction_of(spec: Spec, source: str, given: str | None = None) -> Kind:
+    """What stands before the scene.
+
+    Its distance is that of the options; otherwise it lies between the nearest and the farthest of `scene.near`, for
+    which the plate was designed; otherwise it is what the kind is usually drawn at.
+
+    Args:
+        spec: the spec; its options hold for its own kind.
+        source: the spec's file, beside which a folder of masks lies.
+        given: a kind, or a folder of masks, that the command line names instead.
+
+    Raises:
+        InputError: no kind, an unknown one, or options that are not the kind's.
+    """
+    own = spec.obstruction
+    options: dict[str, Any] = dict(own.options) if own and given in (None, own.kind) else {}
+    name = given or (own.kind if own else None)
+    if name is None:
+        cure = f'Add [obstruction] with kind = "dirt", or give --obstruction. There are {", ".join(OBSTRUCTIONS)}.'
+        raise InputError(f"{source}: obstruction.kind", "an obstruction must be named", "nothing", cure)
+    if name not in OBSTRUCTIONS:
+        if not Path(name).is_dir():
+            rule = "must be a kind of obstruction, or a folder of masks"
+            raise InputError("--obstruction", rule, f'"{name}"', nearest(name, tuple(OBSTRUCTIONS)))
+        name, options = "folder", {"folder": str(Path(name).resolve())}
+    kind = OBSTRUCTIONS[name]
+    where = f"{source}: obstruction.options" if own and options == dict(own.options) else "--obstruction"
+    parameters = _parameters(kind, options, where)
+    if "folder" in parameters:
+        parameters["folder"] = _beside(source, str(parameters["folder"]))
+    try:
+        made = kind(**parameters)
+    except InputError as error:
+        raise InputError(f"{where}: {error.where}", error.rule, error.got, error.cure) from error
+    except TypeError as error:  # a parameter without which there is nothing
+        raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
+    near = spec.scene.near_m
+    return _at(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
+
+
+def _beside(source: str, folder: str) -> str:
+    beside = Path(source).parent / folder
+    return str(beside if beside.is_dir() else folder)
+
+
+def _at(kind: Any, depth_m: tuple[float, float]) -> Any:
+    """The same kind, or both that it is mixed of, at another distance."""
+    names = {field.name for field in fields(kind)}
+    if "depth_m" in names:
+        return replace(kind, depth_m=depth_m)
+    inner = {name: _at(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
+    return replace(kind, **inner)
+
+
+def _parameters(kind: type[Kind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Options of a spec as parameters in SI."""
+    known = {f.name.removesuffix("_m").removesuffix("_rad"): f for f in fields(cast("Any", kind)) if f.init}
+    found = {}
+    for key, value in options.items():
+        if key not in known:
+            raise InputError(where, "must be parameters of this kind", f"`{key}`", nearest(key, tuple(known)))
+        found[known[key].name] = _parameter(known[key], value, f"{where}.{key}")
+    return found
+
+
+def _parameter(field: Field[Any], value: Any, where: str) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_parameter_item(field, item, where) for item in value)
+    item = _parameter_item(field, value, where)
+    # A range is two numbers; one stands for both.
+    usual = field.default
+    is_range = usual is not MISSING and isinstance(usual, tuple) and len(usual) == 2
+    return (item, item) if is_range and isinstance(item, float | int) else item
+
+
+def _parameter_item(field: Field[Any], value: Any, where: str) -> Any:
+    for ending, parse in (("_m", parse_length), ("_rad", parse_angle)):
+        if field.name.endswith(ending):
+            try:
+                return parse(value)
+            except ValueError as error:
+                rule, _, got = str(error).partition(", but got ")
+                raise InputError(where, rule, got, "Write the unit inside the quotes.") from error
+    return value
+
+
+def plain_parameters(kind: Any) -> dict[str, Any]:
+    """Parameters of a kind for JSON."""
+    return {
+        key: str(value) if isinstance(value, Path) else [str(v) for v in value] if key == "files" else value
+        for key, value in asdict(kind).items()
+        if not callable(value)
+    }
+
+
+def seen_in(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarray, "c y x"]:
+    """Light of red, green and blue in the colours of a camera: by wavelength, or its luminance where there is one.
+
+    Raises:
+        InputError: a camera of neither one colour nor three.
+    """
+    count = len(camera.colours)
+    if count == 1:
+        return np.tensordot(_LUMINANCE, light, 1)[None].astype(np.float32)
+    if count != 3:
+        rule = "pictures in red, green and blue need a camera of three colours, or of one"
+        raise InputError("optics.colours", rule, f"{count} colours", "Merge colours into channels.")
+    longest_first = sorted(range(3), key=lambda c: -mean_wavelength_m(camera.colours[c]))
+    return np.ascontiguousarray(light[np.argsort(longest_first)])
+
+
+def shown_as(light: Float[np.ndarray, "c y x"], camera: Camera) -> Float[np.ndarray, "3 y x"]:
+    """Inverse of `seen_in`, for pictures: the longest wavelength is red; one colour becomes grey."""
+    if len(camera.colours) == 1:
+        return np.repeat(light, 3, axis=0)
+    longest_first = sorted(range(3), key=lambda c: -mean_wavelength_m(camera.colours[c]))
+    return np.ascontiguousarray(light[longest_first])

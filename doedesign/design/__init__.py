@@ -1,0 +1,11 @@
+"""Design of a height map: parameters, objectives, optimisation.
+
+parametrize   free parameters -> heights the process can make
+patterns      target images: spots, areas, pictures
+starts        baseline designs by name: flat, random, fresnel, ring
+objectives    what a design is judged by
+etch_depths   etch depths that suit a design
+problem       spec -> loss of one step, ready to differentiate
+optimize      the loop
+metrics       the table of numbers every design gets
+"""

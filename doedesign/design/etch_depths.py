@@ -1,0 +1,148 @@
+"""Which depths the etches should have: the set that rounds a design's heights at the least cost in light.
+
+A height h that is rounded to q(h) turns the light of wavelength lambda by 2 pi (n - 1) (h - q(h)) / lambda. The cost of
+a set of depths is what that takes from the amplitude, averaged over the plate and the colours c with their weights:
+
+    cost = sum_c w_c mean_h [1 - cos(2 pi (n_c - 1) (h - q(h)) / lambda_c)],    sum_c w_c = 1.
+
+q is the nearest level where heights repeat after one wave of the design (`fab.levels.quantise_wrapped`). Between two
+neighbouring edges of q all heights go to one level H, so with the plate's heights in a histogram and its running sums
+C_c(x) = sum over h < x of exp(2 pi i (n_c - 1) h / lambda_c) the cost is
+
+    1 - sum_c w_c Re sum_levels [C_c(upper edge) - C_c(lower edge)] exp(-2 pi i (n_c - 1) H / lambda_c),
+
+whatever the size of the plate. NLopt searches it without gradient: DIRECT-L (D. R. Jones et al. 1993) over all sets,
+then Sbplx from the best of them and from 2^k steps. The result is what a recipe can hold, whole tenths of a nanometre.
+
+This serves designs that are optimised without rounding. With rounding in the loop the depths are parameters like the
+others (`doedesign.design.optimize`): a set that is best for the heights of the moment, put in between steps, upsets
+what they have settled to, and ends worse than 2^k steps where levels are few.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.levels import Levels, wrapped_cells
+from fab.units import NM
+from sim.camera import Camera
+
+__all__ = ["Heights", "choose_depths", "heights_of", "held", "light_cost"]
+
+_BINS = 4096
+_GLOBAL, _LOCAL = 3000, 1500
+_WORST = 2.0
+# Depths in steps: an etch that is shallower is hard to hold. Levels that are closer than that are one level made twice.
+_SHALLOWEST, _CLOSEST = 0.25, 0.05
+
+
+class Heights(NamedTuple):
+    """How much of a plate stands at which height, as the light of every line sees it.
+
+    Attributes:
+        running: `[line, edge]` sum of share times exp(2 pi i rate h) below each edge of the histogram, whose bins
+            divide one wave of the design evenly.
+        rates: `[line]` waves per metre of height.
+        weights: `[line]` weight of each line; they sum to 1.
+        period_m: height of one wave of the design.
+    """
+
+    running: NDArray[np.complex128]
+    rates: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    period_m: float
+
+
+def heights_of(
+    height_m: Float[np.ndarray, "*s"], area: Float[np.ndarray, "*s"], period_m: float, camera: Camera
+) -> Heights:
+    """Count the heights of a design before rounding.
+
+    Args:
+        height_m: heights, taken modulo one wave.
+        area: how much each of them counts, such as the open share of its cell.
+        period_m: height of one wave of the design.
+        camera: its colours weigh alike, the lines of a colour by their weights.
+    """
+    lines = [(w, share) for c in camera.colours for w, share in zip(c.wavelengths_m, c.weights, strict=True)]
+    rates = np.array([camera.waves_per_metre(wavelength) for wavelength, _ in lines])
+    weights = np.array([share for _, share in lines]) / len(camera.colours)
+    place = (np.mod(np.asarray(height_m, np.float32), np.float32(period_m)) * np.float32(_BINS / period_m)).astype(int)
+    counts = np.bincount(np.minimum(place, _BINS - 1).ravel(), np.asarray(area, np.float64).ravel(), _BINS)
+    middles = (np.arange(_BINS) + 0.5) * period_m / _BINS
+    seen = counts / counts.sum() * np.exp(2j * np.pi * rates[:, None] * middles)
+    running = np.zeros((len(lines), _BINS + 1), np.complex128)
+    np.cumsum(seen, axis=1, out=running[:, 1:])
+    return Heights(running, rates, weights / weights.sum(), period_m)
+
+
+def light_cost(heights: Heights, levels: Levels) -> float:
+    """Return what rounding to a staircase costs, 0 to 2; the formula stands at the head of this file."""
+    edges, cells = wrapped_cells(levels)
+    places = np.clip(np.concatenate([[0.0], edges / heights.period_m, [1.0]]), 0, 1) * _BINS
+    below = np.minimum(places.astype(int), _BINS - 1)
+    part = places - below
+    sums = heights.running[:, below] * (1 - part) + heights.running[:, below + 1] * part
+    turned = np.exp(-2j * np.pi * heights.rates[:, None] * levels.heights_m()[cells])
+    kept = np.sum(np.diff(sums, axis=1) * turned, axis=1).real
+    return float(1 - heights.weights @ kept)
+
+
+def held(depths_m: Sequence[float] | NDArray[np.floating]) -> tuple[float, ...]:
+    """Return depths as a recipe holds them: shallow to deep, whole tenths of a nanometre."""
+    # By way of text, so that 80.1 nm is the same number as in a spec.
+    return tuple(float(f"{round(float(depth) / NM, 1)!r}e-9") for depth in sorted(depths_m))
+
+
+def choose_depths(heights: Heights, start: Levels) -> Levels:
+    """Choose the depths that round a design's heights at the least cost in light.
+
+    Args:
+        heights: the design.
+        start: the staircase to begin with; its own depths stay if none are better.
+
+    Returns:
+        The staircase; its depths rise from mask to mask.
+    """
+    import nlopt
+
+    step = start.step_m
+    tried: list[tuple[float, NDArray[np.float64]]] = []
+
+    def cost(depths: NDArray[np.floating], _gradient: object) -> float:
+        try:
+            levels = Levels(start.count, step, tuple(float(depth) * step for depth in depths))
+        except InputError:
+            return _WORST
+        gap = float(np.diff(levels.by_height()[1]).min()) / step
+        found = light_cost(heights, levels) + max(0.0, _CLOSEST - gap)
+        tried.append((found, np.array(depths, np.float64)))
+        return found
+
+    begun = np.array(start.depths_m) / step
+    for algorithm, count, local in (
+        (nlopt.GN_DIRECT_L, _GLOBAL, False),
+        (nlopt.LN_SBPLX, _LOCAL, True),
+        (nlopt.LN_SBPLX, _LOCAL, False),
+    ):
+        search = nlopt.opt(algorithm, start.bits)
+        search.set_min_objective(cost)
+        search.set_lower_bounds(_SHALLOWEST)
+        search.set_upper_bounds(max(start.count, *begun))
+        search.set_initial_step(0.1)
+        search.set_xtol_abs(1e-4)
+        search.set_maxeval(count)
+        with contextlib.suppress(nlopt.RoundoffLimited):
+            search.optimize(min(tried, key=lambda one: one[0])[1] if local and tried else begun)
+    if not tried:
+        return start
+    try:
+        best = Levels(start.count, step, held(min(tried, key=lambda one: one[0])[1] * step))
+    except InputError:
+        return start
+    return best if light_cost(heights, best) < light_cost(heights, start) else start

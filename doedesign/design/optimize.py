@@ -1,0 +1,227 @@
+"""Optimisation of a height map: Adam on the parameters, quantisation in the loop, resumable at any moment.
+
+A step looks at every colour, one near and one far depth (shuffled rounds), and a random displacement of the image by a
+fraction of a pixel; all follow from the seed and the step number, so a run that was killed and resumed ends
+with the same bytes as one that was not.
+
+Where the depths of the etches are to be chosen, they are further parameters of the same optimisation
+(`doedesign.design.parametrize.Staircase.depths_m`): which level a cell takes is straight-through as ever, and how high
+that level stands has a true gradient.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from doedesign.design.etch_depths import choose_depths, heights_of, held
+from doedesign.design.parametrize import softness_at
+from doedesign.design.problem import Look, Problem, Scene, judge_height, losses, view_of
+from doedesign.design.starts import start_heights
+from doedesign.runtime.compiling import compiled_step
+from doedesign.spec import START_NAMES, Spec
+from fab.errors import InputError
+from fab.levels import Levels, height_of
+from sim.aperture import circle_coverage
+from sim.propagation.hankel import radial_profile, revolve, ring_count
+
+Start = Callable[[Path], Float[np.ndarray, "y x"]]
+
+
+Free = Array | tuple[Array, Array]
+
+
+class State(NamedTuple):
+    """Everything a step changes.
+
+    Attributes:
+        radians: parameters in radians.
+        adam: Adam's moments of all that is free.
+        step: number of steps done.
+        stretch: `[mask]` logarithm of every etch's depth over its first one, in units of
+            `doedesign.design.parametrize.PACE`; None where the depths are given.
+    """
+
+    radians: Array
+    adam: optax.OptState
+    step: int
+    stretch: Array | None = None
+
+    @property
+    def free(self) -> Free:
+        """What Adam moves: the parameters, and the depths if they are free."""
+        return self.radians if self.stretch is None else (self.radians, self.stretch)
+
+
+class Record(NamedTuple):
+    """One line of the history: the loss of a step before its update, and every term's value."""
+
+    step: int
+    loss: float
+    terms: tuple[float, ...]
+
+
+class Design(NamedTuple):
+    """A finished design on the DOE grid, metres, float32 `[y, x]`.
+
+    Attributes:
+        drawn_m: what will be made: quantised, unless the spec says `quantisation = "none"`.
+        continuous_m: the same parameters before rounding.
+        levels: the staircase that is drawn.
+    """
+
+    drawn_m: Float[np.ndarray, "y x"]
+    continuous_m: Float[np.ndarray, "y x"]
+    levels: Levels
+
+
+def optimiser_of(spec: Spec) -> optax.GradientTransformation:
+    """Adam whose step size falls to a tenth along a cosine, so that levels settle."""
+    schedule = optax.cosine_decay_schedule(spec.optimize.learning_rate, max(spec.optimize.steps, 1), alpha=0.1)
+    return optax.adam(schedule)
+
+
+def initial_state(spec: Spec, problem: Problem, scene: Scene, files: Mapping[str, Path], read_start: Start) -> State:
+    """Parameters and moments before the first step.
+
+    Args:
+        spec: the spec.
+        problem: its problem.
+        scene: its sources.
+        files: input files by key.
+        read_start: reads a height map in metres when the spec's start is a file.
+
+    Raises:
+        InputError: a start that does not fit the grid or is no raster of rings where rings are optimised.
+    """
+    camera = problem.camera
+    if spec.optimize.start in START_NAMES:
+        heights = start_heights(
+            spec.optimize.start,
+            spec.optimize.start_options,
+            camera,
+            radial=problem.radial,
+            wavelength_m=spec.optics.design_wavelength_m,
+            seed=spec.optimize.seed,
+            judge=lambda h: judge_height(problem, scene, h),
+        )
+    else:
+        path = files["optimize.start"]
+        heights = read_start(path)
+        if heights.shape != camera.grid.shape:
+            raise InputError(
+                str(path), f"a start must have the grid's shape {camera.grid.shape}", heights.shape, "Resample it."
+            )
+        if problem.radial:
+            profile = radial_profile(heights, camera.grid)
+            if profile is None:
+                raise InputError(
+                    str(path),
+                    "the start of a radial design must be a raster of rings one cell wide",
+                    "a map with other structure",
+                    'Use parametrization = "freeform", or another start.',
+                )
+            heights = profile[: ring_count(camera)]
+    radians = jnp.asarray(problem.staircase.radians_of(heights))
+    stretch = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
+    free = radians if stretch is None else (radians, stretch)
+    return State(radians, optimiser_of(spec).init(free), 0, stretch)
+
+
+def learns_depths(spec: Spec) -> bool:
+    """Whether depths are parameters of the optimisation; without rounding nothing depends on them."""
+    return spec.process.chooses_depths and spec.optimize.quantisation != "none"
+
+
+def _loss(free: Free, problem: Problem, look: Look, softness: Array) -> tuple[Array, Array]:
+    staircase = problem.staircase
+    if isinstance(free, tuple):
+        radians, stretch = free
+        height = staircase.height_m(radians, softness, staircase.depths_m(stretch))
+    else:
+        height = staircase.height_m(free, softness)
+    return losses(problem, view_of(problem, height, look))
+
+
+Constants = tuple[Problem, Look, Array]
+Update = Callable[[Constants, tuple[Free, optax.OptState]], tuple[tuple[Free, optax.OptState], Array, Array]]
+
+
+def make_update(spec: Spec) -> Update:
+    """The compiled update (constants, (free, adam)) -> ((free, adam), loss, terms); see `State.free`.
+
+    It reuses the memory of the state it is given.
+    """
+    optimiser = optimiser_of(spec)
+
+    def update(constants: Constants, state: tuple[Free, optax.OptState]) -> Any:
+        free, adam = state
+        (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(free, *constants)
+        updates, adam = optimiser.update(gradient, adam)
+        return (optax.apply_updates(free, updates), adam), loss, terms
+
+    return compiled_step(update)
+
+
+def constants_at(spec: Spec, problem: Problem, scene: Scene, step: int) -> Constants:
+    """What the update of step number `step` is given besides the state."""
+    softness = softness_at(spec.optimize.quantisation, step, spec.optimize.steps)
+    return problem, scene.look(spec.optimize.seed, step), jnp.float32(softness)
+
+
+def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[tuple[State, Record]]:
+    """Run the remaining steps one by one.
+
+    Yields:
+        the state after each step and its record. A state is valid until the next one is asked for.
+
+    Raises:
+        InputError: the loss is no longer finite.
+    """
+    update = make_update(spec)
+    for step in range(state.step, spec.optimize.steps):
+        constants = constants_at(spec, problem, scene, step)
+        (free, adam), loss, terms = update(constants, (state.free, state.adam))
+        radians, stretch = free if isinstance(free, tuple) else (free, None)
+        state = State(radians, adam, step + 1, stretch)
+        record = Record(step, float(loss), tuple(float(t) for t in terms))
+        if not np.isfinite(record.loss):
+            raise InputError(
+                f"optimize, step {step}", "the loss must stay finite", record.loss, "Lower optimize.learning_rate."
+            )
+        yield state, record
+
+
+def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
+    """Height maps of the parameters."""
+    staircase, grid = problem.staircase, problem.camera.grid
+    continuous = np.asarray(staircase.continuous_m(state.radians))
+    if problem.radial:
+        continuous = revolve(continuous, grid)
+    levels = _levels_of(spec, problem, state, continuous) if spec.process.chooses_depths else staircase.levels
+    if spec.optimize.quantisation == "none":
+        drawn = continuous
+    else:
+        # By way of whole levels, so that the heights are the ones a mask file gives back, to the last bit.
+        level = np.asarray(replace(staircase, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
+        drawn = height_of(level, levels).astype(np.float32)
+    return Design(drawn, continuous, levels)
+
+
+def _levels_of(spec: Spec, problem: Problem, state: State, continuous_m: Float[np.ndarray, "y x"]) -> Levels:
+    """The staircase that was chosen, as a recipe holds it: the one learnt, or that which suits the heights best."""
+    start = problem.staircase.levels
+    if state.stretch is not None:
+        try:
+            return Levels(start.count, start.step_m, held(np.asarray(problem.staircase.depths_m(state.stretch))))
+        except InputError:
+            pass  # two levels met
+    camera = problem.camera
+    area = circle_coverage(camera.grid, camera.aperture_m)
+    return choose_depths(heights_of(continuous_m, area, start.period_m, camera), start)

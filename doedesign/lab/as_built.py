@@ -1,0 +1,240 @@
+"""From what a lab measured to the errors of its plate, and how the plate compares with what the run sheet foretold.
+
+Whatever was not measured is taken at the mean that the process states, which is 0 if it states none. An error that was
+measured replaces the common part, too: a depth of a mask is all that happened to it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from doedesign.lab.predictions import grating_orders, seen_of
+from fab.process import Process, Variation, error_names, variation_of
+from fab.runsheet.as_built import AsBuilt, MaskMeasured
+from fab.units import NM
+
+__all__ = ["Plate", "Taken", "compared", "gratings_compared", "plate_of"]
+
+_ROUNDS = 20
+_PARTS = {"depth_scale": "common_depth_scale", "cd_bias_m": "common_cd_bias_m"}
+_COMPARED = ("strehl", "zeroth_order", "throughput", "ring_to_disc", "far_spot")
+
+
+class Taken(NamedTuple):
+    """One error of the plate and where its value comes from.
+
+    Attributes:
+        error: flat name, as in `fab.process.error_names`.
+        value: SI.
+        source: "measured", "process mean", or "not measured, taken as 0".
+    """
+
+    error: str
+    value: float
+    source: str
+
+
+class Plate(NamedTuple):
+    """A plate as it was built.
+
+    Attributes:
+        variation: its errors.
+        taken: every error and where it comes from.
+        lag_per_nm: by how much the etch lag changes for 1 nm of error in one depth; None if it was not measured.
+    """
+
+    variation: Variation
+    taken: tuple[Taken, ...]
+    lag_per_nm: float | None
+
+
+class _Lag(NamedTuple):
+    """Etch lag, the depths of wide openings by mask, and how fast the lag follows an error of a depth, 1 / m."""
+
+    lag: float
+    depths_m: dict[int, float]
+    per_m: float | None
+
+
+def _fitted(masks: Sequence[MaskMeasured], lag: float) -> _Lag:
+    """Find depths and etch lag: a pad of width w is D (1 - lag D / w) deep, with a depth D of each mask.
+
+    Args:
+        masks: the masks.
+        lag: what is taken where no mask has pads of two widths.
+
+    Returns:
+        The least squares over all pads of all masks; a lag is never negative.
+    """
+    pads = {k: [(1 / w, depth) for w, depth in mask.depths_m] for k, mask in enumerate(masks) if mask.depths_m}
+    depths = {k: max(depth for _, depth in found) for k, found in pads.items()}
+    per_m = None
+    # Linear in the depths and the lag but for the square of the depth, which hardly changes.
+    for _ in range(_ROUNDS):
+        slopes = {k: [depths[k] ** 2 * narrow for narrow, _ in found] for k, found in pads.items()}
+        around = {k: [x - math.fsum(xs) / len(xs) for x in xs] for k, xs in slopes.items()}
+        square = math.fsum(x * x for xs in around.values() for x in xs)
+        if square > 0:
+            fall = math.fsum(-x * depth for k, xs in around.items() for x, (_, depth) in zip(xs, pads[k], strict=True))
+            lag, per_m = max(0.0, fall / square), 1 / math.sqrt(square)
+        for k, found in pads.items():
+            depths[k] = math.fsum(d + lag * x for (_, d), x in zip(found, slopes[k], strict=True)) / len(found)
+    return _Lag(lag, depths, per_m)
+
+
+def _mean(process: Process, name: str) -> float:
+    spread = process.spreads.get(name)
+    return 0.0 if spread is None else spread.mean
+
+
+def _assumed(process: Process) -> dict[str, float]:
+    """Return every error at its mean, the common parts counted with the mask's own."""
+    found = {name: _mean(process, name) for name in error_names(process.masks)}
+    for mask in range(process.masks):
+        scale, bias = f"depth_scale[{mask}]", f"cd_bias_m[{mask}]"
+        found[scale] = (1 + found["common_depth_scale"]) * (1 + found[scale]) - 1
+        found[bias] += found["common_cd_bias_m"]
+    return found | dict.fromkeys(_PARTS.values(), 0.0)
+
+
+def _depth_share_at_die(process: Process) -> float:
+    """Return the depth at the die over that in the middle of the wafer, with the process's mean non-uniformity."""
+    y, x = (at / process.wafer_radius_m for at in process.die_m)
+    tilt = _mean(process, "linear_nonuniformity_y") * y + _mean(process, "linear_nonuniformity_x") * x
+    return 1 + _mean(process, "radial_nonuniformity") * (y * y + x * x) + tilt
+
+
+def _mask_errors(process: Process, bit: int, mask: MaskMeasured, depth_m: float | None) -> dict[str, float]:
+    """Return what was measured of one mask as errors by flat name."""
+    found = {}
+    times = 1 if mask.times_etched is None else mask.times_etched
+    if depth_m is not None and times:
+        due_m = times * process.depths_m()[bit] * _depth_share_at_die(process)
+        found[f"depth_scale[{bit}]"] = depth_m / due_m - 1
+    if mask.edges_m is not None:
+        found[f"cd_bias_m[{bit}]"] = mask.edges_m
+    # The verniers stand at the die, and an overlay is told for the middle of the wafer.
+    y, x = process.die_m
+    turn, growth = _mean(process, f"rotation_rad[{bit}]"), _mean(process, f"magnification[{bit}]")
+    if mask.overlay_y_m is not None:
+        found[f"overlay_y_m[{bit}]"] = mask.overlay_y_m - growth * y - turn * x
+    if mask.overlay_x_m is not None:
+        found[f"overlay_x_m[{bit}]"] = mask.overlay_x_m - growth * x + turn * y
+    return found
+
+
+def plate_of(measured: AsBuilt, process: Process) -> Plate:
+    """Turn measured numbers into the errors of a plate.
+
+    Args:
+        measured: the numbers.
+        process: what the lab does: target depths, and the means of what was not measured.
+
+    Returns:
+        The errors. Depths and line widths of all masks are whole, the common parts are 0. Edges that were moved on the
+        mask count with the line width.
+    """
+    values = _assumed(process)
+    fit = _fitted(measured.masks, _mean(process, "etch_lag"))
+    found = {} if fit.per_m is None else {"etch_lag": fit.lag}
+    for bit, mask in enumerate(measured.masks):
+        found |= _mask_errors(process, bit, mask, fit.depths_m.get(bit))
+    plain = {
+        "corner_radius_m": measured.corner_radius_m,
+        "sidewall_rad": measured.sidewall_rad,
+        "chrome_x_m": measured.chrome.overlay_x_m,
+        "chrome_y_m": measured.chrome.overlay_y_m,
+        "chrome_diameter_m": measured.chrome.wider_m,
+    }
+    found |= {name: value for name, value in plain.items() if value is not None}
+    values |= found
+    for bit, mask in enumerate(measured.masks):
+        values[f"cd_bias_m[{bit}]"] += mask.edge_move_m
+    repeats = tuple(0 if mask.times_etched is None else mask.times_etched - 1 for mask in measured.masks)
+    taken = [
+        Taken(name, values[name], "measured" if name in found else _unmeasured(values[name]))
+        for name in values
+        if name not in _PARTS.values()
+    ]
+    said = {name: value for name, value in values.items() if value}
+    variation = variation_of(process.masks, said, repeats=repeats if any(repeats) else ())
+    return Plate(variation, tuple(taken), None if fit.per_m is None else fit.per_m * NM)
+
+
+def _unmeasured(value: float) -> str:
+    return "process mean" if value else "not measured, taken as 0"
+
+
+def _of_sheet(predicted: Mapping[str, Any] | None, kind: str, seen: Any) -> Mapping[str, Any]:
+    """Return what a sheet foretold for the same colour and depth; nothing if it did not."""
+    rows = (predicted or {}).get(kind)
+    for row in rows if isinstance(rows, list) else []:
+        if isinstance(row, Mapping) and row.get("colour") == seen.colour and _same(row.get("depth_m"), seen.depth_m):
+            return row
+    return {}
+
+
+def _same(one: Any, other: float | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return isinstance(one, int | float) and math.isclose(one, other, rel_tol=1e-6)
+
+
+def compared(rows: Sequence[dict[str, Any]], predicted: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """Put a plate beside what its run sheet foretold.
+
+    Args:
+        rows: the prediction of the plate as built (`doedesign.prediction.plate_rows`).
+        predicted: "predicted" of the run sheet.
+
+    Returns:
+        A row per colour, depth and quantity: `as_drawn` and `expected` of the sheet (None if it has no such row) and
+        `as_built`.
+    """
+    out = []
+    for seen in seen_of(rows):
+        before = {kind: _of_sheet(predicted, kind, seen) for kind in ("as_drawn", "expected")}
+        for quantity in _COMPARED:
+            value = getattr(seen, quantity)
+            if value is None:
+                continue
+            old = {kind: row.get(quantity) for kind, row in before.items()}
+            out.append({"colour": seen.colour, "depth_m": seen.depth_m, "quantity": quantity, **old, "as_built": value})
+    return out
+
+
+def gratings_compared(measured: AsBuilt, process: Process, variation: Variation, material: str) -> list[dict[str, Any]]:
+    """Put what the test gratings showed beside what the measured depths say that they should.
+
+    Args:
+        measured: the numbers.
+        process: target depths.
+        variation: the errors of the plate (`plate_of`).
+        material: of the substrate.
+
+    Returns:
+        A row per grating with `as_drawn`, `as_built` and `measured` (None if it was not); none if the sheet does not
+        say at which wavelength.
+
+    Raises:
+        InputError: a wavelength at which the glass is not known.
+    """
+    probe_nm = (measured.predicted or {}).get("probe_wavelength_nm")
+    if not isinstance(probe_nm, int | float) or isinstance(probe_nm, bool) or probe_nm <= 0:
+        return []
+    nominal = process.depths_m()
+    scales = variation.depth_scale or (0.0,) * process.masks
+    repeats = variation.repeats or (0,) * process.masks
+    built = [d * (1 + s) * (1 + again) for d, s, again in zip(nominal, scales, repeats, strict=True)]
+    # The binary grating is that of the deepest target, whatever became of it.
+    deepest = max(range(process.masks), key=lambda bit: nominal[bit])
+    drawn = grating_orders(nominal, material, probe_nm * NM)
+    now = (
+        grating_orders([built[deepest]], material, probe_nm * NM)[0],
+        grating_orders(built, material, probe_nm * NM)[1],
+    )
+    shown = (measured.grating_binary, measured.grating_blazed)
+    return [
+        {"grating": name, "wavelength_nm": probe_nm, "as_drawn": a, "as_built": b, "measured": m}
+        for name, a, b, m in zip(("binary", "blazed"), drawn, now, shown, strict=True)
+    ]

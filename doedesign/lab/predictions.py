@@ -1,0 +1,235 @@
+"""What a run sheet foretells: the plate's light, the test gratings, and which measured number matters most.
+
+The ranking is the tolerance analysis of one error at a time, on a patch of the design: Strehl ratio and 0th order are
+means over the plate, and a patch half way to the rim has them about as the whole plate does. What the chrome does is
+not in it.
+"""
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from doedesign.prediction import Drawn, Prediction, plate_rows, predict, process_with_moves
+from doedesign.report.pictures import draw_psfs
+from doedesign.tolerancing.analysis import table_of
+from doedesign.tolerancing.draws import EXPECTED, one_at_a_time_keys, variation_at
+from doedesign.tolerancing.sensitivity import one_at_a_time
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels
+from fab.process import ERRORS, Process, Spread, Variation
+from fab.runsheet.tables import Grating, Matter, Outlook, Seen
+from fab.sampling import varying
+from sim.aperture import circle_coverage
+from sim.leakage import strehl, zeroth_order
+from sim.material import full_wave_wavelength_m, refractive_index
+from sim.psf_bank import surface_bank
+from sim.surface import Surface, as_fabricated
+
+__all__ = ["Foretold", "foretold", "grating_orders", "matters_of", "seen_of"]
+
+# A laser of the kind that most optics labs have, and that of the published prototype.
+PROBE_M = 520e-9
+_DEPTH_ERRORS = (-0.05, -0.02, 0.0, 0.02, 0.05)
+_PATCH = 256
+_MEASURED = {
+    "depth": "depth",
+    "overlay": "overlay",
+    "cd": "line width (CD bars)",
+    "uniformity": "depth at the rim of the wafer against its middle",
+    "corners": "rounding of the corners",
+    "sidewalls": "tilt of the walls",
+    "lag": "etch lag (depth of the small pads)",
+    "roughness": "roughness of the floors",
+}
+
+
+def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[Seen, ...]:
+    """Return the rows of a prediction as a run sheet has them; a ratio without any light in the disc is left out."""
+    seen = []
+    for row in rows:
+        ratio = row.get("ring_to_disc")
+        if ratio is not None and not math.isfinite(ratio):
+            ratio = None
+        shared = {name: row[name] for name in ("colour", "depth_m", "strehl", "zeroth_order", "throughput")}
+        seen.append(Seen(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
+    return tuple(seen)
+
+
+def grating_orders(
+    depths_m: Sequence[float] | NDArray[np.floating], material: str, wavelength_m: float
+) -> tuple[float, float]:
+    """Return what the test gratings send straight on, as shares of the light through an empty window.
+
+    Args:
+        depths_m: depth of every mask's etch, metres.
+        material: of the substrate.
+        wavelength_m: vacuum wavelength.
+
+    Returns:
+        The binary grating, half of whose area the deepest etch opens: cos^2(phi / 2). The blazed one, which all
+        combinations of masks share alike: the product of cos^2(phi / 2) over all etches. phi is an etch's phase.
+    """
+    waves = np.asarray(depths_m) * (refractive_index(material, wavelength_m) - 1) / wavelength_m
+    orders = np.cos(np.pi * waves) ** 2
+    return float(orders[np.argmax(depths_m)]), float(np.prod(orders))
+
+
+def _patch(drawn: Drawn, process: Process) -> tuple[Drawn, Process]:
+    """Cut the middle of the right half out of a design, with the place on the wafer where it lies."""
+    ny, nx = drawn.level.shape
+    side = min(_PATCH, ny, nx // 2)
+    y0, x0 = (ny - side) // 2, min(nx - side, 3 * nx // 4 - side // 2)
+    camera, pitch_m = drawn.camera, drawn.camera.grid.pitch_m
+    off = ((y0 + (side - ny) / 2) * pitch_m, (x0 + (side - nx) / 2) * pitch_m)
+    die_m = (process.die_m[0] + off[0], process.die_m[1] + off[1])
+    # An opening beyond the corners, so that every cell counts alike.
+    small = replace(camera, grid=Grid((side, side), pitch_m), aperture_m=2 * side * pitch_m)
+    level = np.ascontiguousarray(drawn.level[y0 : y0 + side, x0 : x0 + side])
+    on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))
+    return replace(drawn, level=level, camera=small), replace(process, die_m=die_m, wafer_radius_m=on_wafer)
+
+
+def _row(surface: Surface, nominal: Surface) -> dict[str, Any]:
+    """Strehl ratio and 0th order of a patch with one wavelength."""
+    found = {"strehl": float(strehl(surface, nominal)[0]), "zeroth_order": float(zeroth_order(surface)[0])}
+    return {"colour": "", "depth_m": None, **found}
+
+
+def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Matter, ...]:
+    """Rank the numbers that a lab measures by how much of the plates' differences they explain.
+
+    Args:
+        drawn: the design.
+        process: how far it strays.
+        wavelength_m: where Strehl ratio and 0th order are looked at.
+
+    Returns:
+        Numbers and their shares of the variance of both, the largest share of the Strehl ratio first; none if nothing
+        varies.
+
+    Raises:
+        InputError: errors beyond what the model describes.
+    """
+    known = [name for name in varying(process) if ERRORS[name.partition("[")[0]].source in _MEASURED]
+    kept = replace(process, spreads={n: s if n in known else Spread(s.mean) for n, s in process.spreads.items()})
+    if not known:
+        return ()
+    small, there = _patch(drawn, kept)
+    side_m = max(small.camera.grid.extent_m)
+    keys = [EXPECTED, *one_at_a_time_keys(kept)]
+    made = partial(as_fabricated, small.level, small.camera, wavelengths_m=(wavelength_m,))
+    nominal = made(Process(kept.levels), Variation())
+    plates = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
+    variances: dict[str, dict[str, float]] = {"strehl": {}, "zeroth_order": {}}
+    for change in one_at_a_time(kept, table_of(plates)):
+        if change.colour is None and change.quantity in variances:
+            of = variances[change.quantity]
+            name = _measured(change.error)
+            of[name] = of.get(name, 0.0) + change.variance
+    totals = {quantity: sum(of.values()) or 1.0 for quantity, of in variances.items()}
+    found = [
+        Matter(name, variance / totals["strehl"], variances["zeroth_order"][name] / totals["zeroth_order"])
+        for name, variance in variances["strehl"].items()
+    ]
+    return tuple(sorted(found, key=lambda matter: (-matter.strehl, matter.measured)))
+
+
+def _measured(error: str) -> str:
+    """Name what is measured to find an error: "overlay of mask 3", "depth of every mask"."""
+    key, bracket, mask = error.partition("[")
+    name = _MEASURED[ERRORS[key].source]
+    if bracket:
+        return f"{name} of mask {int(mask.removesuffix(']')) + 1}"
+    return f"{name} of every mask" if key.startswith("common_") else name
+
+
+def _full_wave_m(levels: Levels, material: str) -> float | None:
+    try:
+        return full_wave_wavelength_m(material, levels.period_m)
+    except InputError:
+        return None  # the sheet says so
+
+
+class Foretold(NamedTuple):
+    """What stands on the sheet, and a PNG picture of the PSFs of the plate with the process's mean errors."""
+
+    outlook: Outlook
+    picture: bytes
+
+
+def _on_grid_of(plate: Surface, nominal: Surface, aperture_m: float) -> Surface:
+    """Return the plate as drawn on the raster of another, whose propagation is then compiled already."""
+    parts = plate.grid.shape[0] // nominal.grid.shape[0]
+    field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
+    coverage = jnp.asarray(circle_coverage(plate.grid, aperture_m))
+    return Surface(field, field, coverage, plate.grid, nominal.wavelengths_m)
+
+
+def _predictions(drawn: Drawn, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
+    """Predict the plate as drawn (its rows) and the one with mean errors."""
+    plate = process.expected()
+    expected = predict(drawn, process, plate)
+    if plate.nominal:
+        return expected.rows, expected
+    nominal = as_fabricated(drawn.level, drawn.camera, process, Variation())
+    alike = _on_grid_of(expected.surface, nominal, drawn.camera.aperture_m)
+    return plate_rows(drawn, alike, surface_bank(drawn.camera, alike, drawn.depths_m)), expected
+
+
+def foretold(
+    drawn: Drawn,
+    process: Process,
+    design_m: float,
+    probe_m: float = PROBE_M,
+    edge_moves_m: Sequence[float] = (),
+) -> Foretold:
+    """Foretell what a lab should see, for one depth: the middle one of the near depths, or else the farthest.
+
+    Args:
+        drawn: the design.
+        process: what the lab does.
+        design_m: design wavelength.
+        probe_m: wavelength of the lab's test laser.
+        edge_moves_m: how far the edges of each mask were moved outward to make up for the process; empty for none.
+
+    Raises:
+        InputError: a probe wavelength at which the glass is not known, or errors beyond what the model describes.
+    """
+    levels, material = drawn.levels, drawn.camera.material
+    waves_per_m = (refractive_index(material, probe_m) - 1) / probe_m
+    seen = process_with_moves(process, edge_moves_m)
+    middle = len(drawn.near_m) // 2
+    # All depths would take most of the time of a whole order, and say the same.
+    near_m = drawn.near_m[middle : middle + 1]
+    drawn = replace(drawn, near_m=near_m, far_m=() if near_m else drawn.far_m[-1:])
+    with ThreadPoolExecutor(1) as pool:
+        ranking = pool.submit(matters_of, drawn, seen, design_m)
+        as_drawn, expected = _predictions(drawn, seen)
+        matters = ranking.result()
+    depths = np.array([levels.etch_depth_m(bit) for bit in range(levels.bits)])
+    outlook = Outlook(
+        drawn=seen_of(as_drawn),
+        expected=seen_of(expected.rows),
+        design_m=design_m,
+        full_wave_m=_full_wave_m(levels, material),
+        probe_m=probe_m,
+        probe_waves=levels.period_m * waves_per_m,
+        gratings=tuple(
+            Grating(error, *grating_orders(depths * (1 + error), material, probe_m)) for error in _DEPTH_ERRORS
+        ),
+        matters=matters,
+    )
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "psf.png"
+        draw_psfs(path, drawn.camera, expected.bank, drawn.near_m, drawn.far_m)
+        return Foretold(outlook, path.read_bytes())

@@ -1,0 +1,147 @@
+"""Plates evaluated by the workers of a Dask cluster, wherever they run.
+
+    dask scheduler                                   # prints ADDRESS
+    dask worker ADDRESS --nthreads 1                 # on as many machines as there are, with doedesign installed
+    doedesign tolerance RUN --scheduler ADDRESS
+
+Dask hands out the plates and hands those of a lost worker to another; this module only asks and listens.
+"""
+
+import gc
+import os
+import queue
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from doedesign import __version__
+from doedesign.tolerancing.pool import Parcel, Work, evaluated, named, opened, packed, single_thread_settings
+from fab.errors import InputError
+from fab.process import Variation
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+_PATIENCE_S = 30.0
+_KEPT = "Finished draws are kept."
+
+
+def evaluate_there(
+    work: Work, plates: Mapping[str, Variation], address: str, say: Callable[[str], None] = lambda _: None
+) -> Iterator[tuple[str, Any]]:
+    """Evaluate plates by the workers of a Dask cluster.
+
+    Args:
+        work: how, and of what design and process.
+        plates: variations by key.
+        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+        say: told when there is nobody to work.
+
+    Yields:
+        key and what was found of every plate, as they are finished.
+
+    Raises:
+        InputError: no Dask here, no scheduler or no workers there, workers without this version of doedesign, or a
+            plate that ended its worker again and again.
+    """
+    finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
+    parcel = packed(work)
+    with _client(address) as client:
+        # A task, and no scattered value: whoever holds it may be lost.
+        held = client.submit(_held, parcel, key=f"doedesign-{parcel.token}", pure=False)
+        waiting: dict[Future, str] = {}
+        for key, variation in plates.items():
+            name = f"doedesign-plate-{parcel.token}-{key}"
+            future = client.submit(_evaluate, held, variation, __version__, key=name, pure=False)
+            waiting[future] = key
+            future.add_done_callback(finished.put)
+        while waiting:
+            future = _next(finished, client, address, say)
+            key = waiting.pop(future)
+            yield key, _rows(future, key, address)
+
+
+@contextmanager
+def _client(address: str) -> "Iterator[Client]":
+    try:
+        import dask.config
+        from distributed import Client
+    except ImportError as error:
+        cure = 'Install it with: pip install "doedesign[cluster]"'
+        raise InputError("--scheduler", "a cluster is reached through Dask", "no Dask here", cure) from error
+    client, refusal = None, ""
+    try:
+        client = Client(address, timeout=_PATIENCE_S, set_as_default=False)  # pyright: ignore[reportArgumentType]
+    except (OSError, ValueError, ImportError) as error:
+        refusal = str(error)
+    if client is None:
+        # The half-made client closes itself when it is collected, which must not be while the next one is being made:
+        # both take the same lock of Dask's.
+        gc.collect()
+        cure = "Start one with `dask scheduler` and give the address it prints."
+        raise InputError(address, "a Dask scheduler must answer there", f'"{refusal}"', cure)
+    # A design is larger than what Dask expects in a task.
+    with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
+        except TimeoutError as error:
+            cure = f"Start some with: dask worker {address} --nthreads 1"
+            raise InputError(address, "the cluster must have workers", "none", cure) from error
+        yield client
+
+
+def _next(
+    finished: "queue.SimpleQueue[Future]", client: "Client", address: str, say: Callable[[str], None]
+) -> "Future":
+    """The next future that is done, however long it takes."""
+    told = False
+    while True:
+        try:
+            return finished.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            try:
+                working = client.nthreads()
+            except OSError as error:
+                raise _lost(address) from error
+            if not working and not told:
+                say(f"no worker is left at {address}; waiting for new ones")
+                told = True
+
+
+def _rows(future: "Future", key: str, address: str) -> Any:
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
+    try:
+        return named(key, future.result)
+    except KilledWorker as error:
+        got = f"several that ended while they computed it, the last one {error.last_worker.address}"
+        cure = f"Give workers more memory, or see what it is with --draw. {_KEPT}"
+        raise InputError(f"draw {key}", "a worker must live through a draw", got, cure) from error
+    except FutureCancelledError as error:
+        raise _lost(address) from error
+    except ModuleNotFoundError as error:
+        cure = f"Install doedesign {__version__} where the workers run."
+        raise InputError(address, "the workers must have what the study needs", f'"{error}"', cure) from error
+
+
+def _lost(address: str) -> InputError:
+    cure = f"Start it again and repeat the command. {_KEPT}"
+    return InputError(address, "the scheduler must stay reachable", "a lost connection", cure)
+
+
+# What follows runs in a worker.
+
+
+def _held(parcel: Parcel) -> Parcel:
+    return parcel
+
+
+def _evaluate(parcel: Parcel, variation: Variation, version: str) -> Any:
+    if version != __version__:
+        cure = "Install the same version everywhere."
+        raise InputError("worker", f"must have doedesign {version}", __version__, cure)
+    if "jax" not in sys.modules:
+        os.environ.update(single_thread_settings())
+    return evaluated(opened(parcel), variation)

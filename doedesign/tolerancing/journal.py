@@ -1,0 +1,136 @@
+"""The finished plates of a study, in memory and, where a folder is given, on disk.
+
+    study.json     what was studied: design, process, seed; only plates of the same study are kept together
+    draws.jsonl    one line per finished plate, in the order in which they were finished
+
+A line is on the disk before the next plate is taken, so a run that is killed at any moment loses no finished plate; the
+half of a line that a killed run left behind is cut off.
+"""
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from doedesign.runs.folder import alone_in
+from doedesign.tolerancing.pool import Beyond, Rows
+from fab.errors import InputError
+from fab.files import canonical_json, explain_os_error, read_json, write_atomic
+
+STUDY_NAME, DRAWS_NAME = "study.json", "draws.jsonl"
+
+
+class Journal:
+    """What was found of finished plates.
+
+    Attributes:
+        folder: where they are kept, or None for memory alone.
+        study: what was studied, as JSON.
+        finished: what was found by key. Only `add` changes it.
+    """
+
+    def __init__(self, folder: Path | None, study: Mapping[str, Any]) -> None:
+        self.folder, self.study = folder, study
+        self.finished: dict[str, Rows | Beyond] = {}
+        self._file: int | None = None
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[None]:
+        """Keep the folder for this process, and read what is in it.
+
+        Raises:
+            InputError: the folder holds another study or something else, or another process works in it.
+        """
+        if self.folder is None or self._file is not None:
+            yield  # nothing on the disk, or open already
+            return
+        with alone_in(self.folder):
+            self._claim(self.folder)
+            path = self.folder / DRAWS_NAME
+            self.finished |= _read(path)
+            try:
+                self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            except OSError as error:
+                raise explain_os_error(error, path) from error
+            try:
+                yield
+            finally:
+                os.close(self._file)
+                self._file = None
+
+    def add(self, key: str, found: Rows | Beyond) -> None:
+        """Keep one plate; returns when it is on the disk. An infinite number is kept as None, for JSON has none.
+
+        Raises:
+            InputError: the disk is full, or refuses otherwise.
+        """
+        line = json.dumps({"key": key, **_record(found)}, sort_keys=True, allow_nan=False) + "\n"
+        if self._file is not None:
+            try:
+                data = line.encode()
+                while data:
+                    data = data[os.write(self._file, data) :]
+                os.fsync(self._file)
+            except OSError as error:
+                raise explain_os_error(error, (self.folder or Path()) / DRAWS_NAME) from error
+        # As it would be read again.
+        self.finished |= dict([_plate(json.loads(line))])
+
+    def _claim(self, folder: Path) -> None:
+        path = folder / STUDY_NAME
+        # Only what compares equal after a way through the file is the same study.
+        study = json.loads(canonical_json(self.study))
+        if not path.exists():
+            foreign = [p.name for p in sorted(folder.iterdir())]
+            if foreign:
+                rule, cure = "a study needs a new or empty folder, or its own", "Choose another --out."
+                raise InputError(str(folder), rule, f"other content, such as {foreign[0]!r}", cure)
+            write_atomic(path, canonical_json(study))
+            return
+        found = read_json(path)
+        different = [key for key in sorted(found.keys() | study.keys()) if found.get(key) != study.get(key)]
+        if different:
+            raise InputError(
+                str(folder),
+                "the folder must belong to this study",
+                f"one with another {', '.join(different)}",
+                "Choose another --out, or remove that study.",
+            )
+
+
+def _read(path: Path) -> dict[str, Rows | Beyond]:
+    """What was found by key; half a line at the end is cut off the file."""
+    try:
+        data = path.read_bytes()
+        whole = data.rfind(b"\n") + 1
+        if whole < len(data):
+            os.truncate(path, whole)
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    finished: dict[str, Rows | Beyond] = {}
+    for number, line in enumerate(data[:whole].splitlines(), 1):
+        try:
+            key, found = _plate(json.loads(line))
+        # What a damaged line lacks shows in different ways.
+        except (ValueError, KeyError, TypeError) as error:
+            cure = f"Remove {path} to compute all plates again."
+            raise InputError(f"{path}, line {number}", "must be one finished plate", f'"{error}"', cure) from error
+        finished[key] = found
+    return finished
+
+
+def _record(found: Rows | Beyond) -> dict[str, Any]:
+    if isinstance(found, Beyond):
+        return {"beyond": found.reason}
+    return {"rows": [{name: None if value == math.inf else value for name, value in row.items()} for row in found]}
+
+
+def _plate(record: dict[str, Any]) -> tuple[str, Rows | Beyond]:
+    if "beyond" in record:
+        return record["key"], Beyond(record["beyond"])
+    return record["key"], [dict(row) for row in record["rows"]]

@@ -1,0 +1,437 @@
+"""Joint training of optics and network (paper §3.4): state, step, devices.
+
+A step is a pure function of the state, the batch and the seed: noise, field points and the errors of plates follow from
+the seed and the number of the batch. So a training that goes on from a checkpoint takes the very steps that it would
+have taken.
+
+More than one device: the batch is shared out over a mesh with the one axis "data", every device looks at its part with
+the same state, and gradients are averaged. With several hosts each hands in its own part of every batch.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Key
+
+from doedesign.build import camera_of, process_of
+from doedesign.capture.from_spec import outside_of, seen_in, sensor_of
+from doedesign.capture.scenes import Batch
+from doedesign.capture.simulate import depth_range_m, shadow_window
+from doedesign.design.optimize import Free
+from doedesign.design.parametrize import softness_at
+from doedesign.design.problem import plans_of
+from doedesign.recon.network import Layout, Network
+from doedesign.runtime.compiling import compiled_step
+from doedesign.spec import Spec
+from doedesign.spec.training import TrainSpec
+from doedesign.tolerancing.draws import variation_at
+from doedesign.training.hosts import on_all, own_copy, parts_of
+from doedesign.training.loss import TERMS, Weights, losses
+from doedesign.training.optics import Bench, LivePlate, Plate, RingPlate, Seen, Shot, StoredPlate, shots
+from fab.errors import InputError
+from fab.levels import height_of
+from fab.process import Process
+from sim.camera import Camera
+from sim.imaging.occlusion import Model
+from sim.light import srgb_from_linear
+from sim.obstruction import Kind
+from sim.psf_bank import psf_bank
+from sim.surface import as_fabricated
+
+AXIS = "data"
+
+_SALT_NOISE, _SALT_FIELD, _SALT_LOOK = 1, 2, 3
+# Depths at which a plate at rest is computed: between two of them its blur disc grows by a few pixels.
+_NEAR_DEPTHS, _FAR_DEPTHS = 24, 3
+
+
+class State(NamedTuple):
+    """Everything a step changes.
+
+    Attributes:
+        step: number of steps done.
+        network: the network.
+        free: what is learnt of the plate (`doedesign.design.optimize.State.free`); None for a plate at rest.
+        network_moments: Adam's moments.
+        optics_moments: Adam's moments; None for a plate at rest.
+    """
+
+    step: int
+    network: Network
+    free: Free | None
+    network_moments: optax.OptState
+    optics_moments: optax.OptState | None
+
+
+class Record(NamedTuple):
+    """One line of the history: the loss of a step before its update.
+
+    Attributes:
+        step: number of the step.
+        loss: the loss.
+        parts: its terms before they are weighted.
+    """
+
+    step: int
+    loss: float
+    parts: dict[str, float]
+
+
+class Rates(NamedTuple):
+    """Step sizes of one step; 0 for what stays as it is."""
+
+    network: float
+    optics: float
+
+
+class Trainer(eqx.Module):
+    """What stays the same from step to step. `Trainer.of` makes one.
+
+    Attributes:
+        plate: the plate that training looks through.
+        bench: the rest of the camera.
+        weights: of the loss.
+        perceptual: perceptual distance, or None.
+        process: process whose errors every step's plate has, or None.
+        spec: the spec.
+        mesh: devices, or None for one.
+    """
+
+    plate: Plate
+    perceptual: Any
+    bench: Bench = eqx.field(static=True)
+    weights: Weights = eqx.field(static=True)
+    process: Process | None = eqx.field(static=True)
+    spec: Spec = eqx.field(static=True)
+    mesh: Mesh | None = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        spec: Spec,
+        files: Mapping[str, Path],
+        source: str,
+        model: Model,
+        kind: Kind,
+        height_m: Float[np.ndarray, "y x"],
+        *,
+        perceptual: Any = None,
+        mesh: Mesh | None = None,
+    ) -> "Trainer":
+        """Prepare a training.
+
+        Args:
+            spec: the spec.
+            files: its input files by key.
+            source: the spec's file, for messages.
+            model: occlusion model.
+            kind: obstruction.
+            height_m: `[y, x]` map of the plate, for one that stays at rest.
+            perceptual: distance of two batches (`doedesign.training.perceptual`); None leaves the term out.
+            mesh: devices (`devices_mesh`).
+
+        Raises:
+            InputError: what cannot be trained: a sensor with a mosaic, rings off the axis or with errors, a batch that
+                the devices do not divide.
+        """
+        train = spec.train
+        sensor = sensor_of(spec)
+        if sensor.pattern is not None:
+            rule = "must be left out for training: demosaicing has no gradient"
+            raise InputError(f"{source}: sensor.bayer", rule, f'"{sensor.pattern}"', "Train on pixels of all colours.")
+        if mesh is not None and train.batch % mesh.size:
+            rule = f"must be a multiple of the {mesh.size} devices"
+            raise InputError(f"{source}: train.batch", rule, train.batch, "Change it, or take fewer devices.")
+        camera = replace(camera_of(spec), window=spec.sensor.window | 1)
+        if train.camera == "conventional":
+            height_m = np.zeros(camera.grid.shape, np.float32)
+        alive = train.moves_optics or train.fabricated or train.field == "random"
+        plate = _live_plate(spec, files, source, camera) if alive else resting_plate(spec, camera, kind, height_m)
+        bench = Bench(camera, model, outside_of(kind), sensor, shadow_window(kind, camera))
+        weights = Weights(train.l1, train.perceptual, train.masked)
+        process = process_of(spec.process) if train.fabricated else None
+        plate = plate if mesh is None else on_all(plate, mesh)
+        return cls(plate, perceptual, bench, weights, process, spec, mesh)
+
+    def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> State:
+        """The state before the first step.
+
+        Args:
+            height_m: heights to begin with, a map or a profile of rings, before quantisation.
+            network: network to begin with; a fresh one if None.
+        """
+        layout = layout_of(self.spec, len(self.bench.camera.colours))
+        if network is None:
+            network = Network.make(layout, self.spec.train.seed)
+        adam = optax.scale_by_adam()
+        moments = adam.init(eqx.filter(network, eqx.is_inexact_array))
+        free, optics_moments = None, None
+        if not isinstance(self.plate, StoredPlate):
+            free = jnp.asarray(self.plate.staircase.radians_of(height_m))
+            optics_moments = adam.init(free) if self.spec.train.moves_optics else None
+        state = State(0, network, free, moments, optics_moments)
+        # Where the step will leave it: otherwise the second step would be compiled anew.
+        return state if self.mesh is None else on_all(state, self.mesh)
+
+    def step(self, state: State, batch: Batch) -> tuple[State, Record]:
+        """Take one step.
+
+        Args:
+            state: the state; its memory is used again.
+            batch: scenes; with several hosts, this host's part of them.
+
+        Raises:
+            InputError: the loss is no longer finite.
+        """
+        train = self.spec.train
+        rates = rates_at(train, state.step)
+        trainer = self._with_errors(state, batch.step)
+        seen, keys = self._seen(batch, train.seed, train.field == "random", part=self.mesh is not None)
+        if self.mesh is not None:
+            seen, keys = parts_of((seen, keys), self.mesh)
+        softness = jnp.float32(softness_at(self.spec.optimize.quantisation, state.step, train.steps))
+        learnt = (state.network, state.free)
+        moves = (rates.network > 0, rates.optics > 0)
+        moments = (state.network_moments, state.optics_moments)
+        constants = trainer, seen, keys, softness, jnp.asarray(rates, jnp.float32), moves
+        (network, free), moments, loss, terms = _update()(constants, (learnt, moments))
+        record = Record(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
+        if not np.isfinite(record.loss):
+            cure = "Lower train.learning_rate or train.optics_learning_rate."
+            raise InputError(f"train, step {state.step}", "the loss must stay finite", record.loss, cure)
+        return State(state.step + 1, network, free, *moments), record
+
+    def reconstruct(self, state: State, batch: Batch) -> tuple[Shot, Float[Array, "b c y x"]]:
+        """Photograph and reconstruct scenes on one device, on the axis and without errors of a process.
+
+        Returns:
+            the captures, and the pictures `[b, c, y, x]` in display values.
+        """
+        seen, keys = self._seen(batch, _SALT_LOOK, False)
+        network, free, trainer = state.network, state.free, self
+        if self.mesh is not None:
+            network, free, trainer = own_copy((network, free, trainer))
+        return _look(network, free, trainer, seen, keys)
+
+    def _seen(self, batch: Batch, seed: int, off_axis: bool, *, part: bool = False) -> tuple[Seen, Key[Array, " b"]]:
+        """A batch, or this host's part of one, as the compiled step takes it, with a key of noise for every scene."""
+        camera, count = self.bench.camera, len(batch.names)
+        # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
+        hosts, host = (jax.process_count(), jax.process_index()) if part else (1, 0)
+        first = (batch.step * hosts + host) * count
+        items = []
+        for k in range(count):
+            angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
+            near, far = float(batch.depth_m[k]), float(batch.background_depth_m[k])
+            light = [seen_in(np.asarray(rgb), camera) for rgb in (batch.background[k], batch.radiance[k])]
+            sources = [self.plate.source(depth, angles) for depth in (far, near)]
+            items.append(Seen(light[0], batch.mask[k], light[1], np.float32(near), np.float32(far), *sources))
+        seen: Seen = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
+        root = jax.random.key(seed + (_SALT_NOISE << 32))
+        return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + count))
+
+    def _with_errors(self, state: State, step: int) -> "Trainer":
+        """The same with a plate that has this step's errors, where the process makes any."""
+        if self.process is None or not isinstance(self.plate, LivePlate):
+            return self
+        plate, camera = self.plate, self.bench.camera
+        assert isinstance(state.free, Array)  # learnt depths are refused with errors
+        level = np.asarray(plate.staircase.level(plate.staircase.continuous_m(state.free))).astype(np.uint8)
+        plate_m = max(camera.grid.extent_m)
+        errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
+        surface = as_fabricated(level, camera, self.process, errors, plate.wavelengths_m)
+        height = jnp.asarray(height_of(level, plate.staircase.levels).astype(np.float32))
+        rates = [camera.waves_per_metre(line) for line in plate.wavelengths_m]
+        ratio = [
+            _error_of(jnp.asarray(surface.at(line)), height, rate)
+            for line, rate in zip(plate.wavelengths_m, rates, strict=True)
+        ]
+        return eqx.tree_at(lambda t: t.plate.errors, self, jnp.stack(ratio), is_leaf=lambda leaf: leaf is None)
+
+
+@eqx.filter_jit
+def _error_of(transmission: Array, height_m: Array, rate: Array | float) -> Array:
+    """What a plate does to light beside its nominal heights."""
+    return transmission * jnp.exp(-2j * np.pi * height_m * rate)
+
+
+def layout_of(spec: Spec, colours: int) -> Layout:
+    """Shape of a spec's network."""
+    given = spec.network
+    return Layout(
+        colours,
+        given.width,
+        given.depth,
+        given.wiener,
+        given.features,
+        given.near_estimate,
+        given.refine,
+        given.variant,
+    )
+
+
+def rates_at(train: TrainSpec, step: int) -> Rates:
+    """Step sizes of Adam: along a cosine to a tenth, and 0 for what does not move in this step."""
+    share = 1.0
+    if train.schedule == "cosine":
+        share = 0.1 + 0.9 * 0.5 * (1 + float(np.cos(np.pi * min(step / max(train.steps, 1), 1.0))))
+    turn = train.mode == "alternating" and train.moves_optics and train.moves_network
+    optics_turn = step % train.period == train.period - 1
+    moves_network = train.moves_network and not (turn and optics_turn)
+    moves_optics = train.moves_optics and not (turn and not optics_turn)
+    return Rates(share * train.learning_rate * moves_network, share * train.optics_learning_rate * moves_optics)
+
+
+def devices_mesh(count: int | None = None) -> Mesh | None:
+    """A mesh of devices for `Trainer.of`; None for a single one.
+
+    Args:
+        count: number of devices; all there are, on all hosts, if None.
+
+    Raises:
+        InputError: more than there are.
+    """
+    devices = jax.devices()
+    wanted = len(devices) if count is None else count
+    if not 1 <= wanted <= len(devices):
+        rule = f"must lie from 1 to the {len(devices)} that there are"
+        raise InputError("--devices", rule, wanted, "Leave it out to take all.")
+    return None if wanted == 1 else Mesh(np.array(devices[:wanted]), (AXIS,))
+
+
+def _live_plate(spec: Spec, files: Mapping[str, Path], source: str, camera: Camera) -> LivePlate | RingPlate:
+    """A plate that is learnt, or looked at off the axis, or with errors."""
+    problem = plans_of(spec.model_copy(update={"sensor": _odd_window(spec)}), files)
+    wavelengths = tuple(w for colour in camera.colours for w in colour.wavelengths_m)
+    if not problem.radial:
+        assert problem.coverage is not None  # only rings go without
+        return LivePlate(problem.lines, problem.coverage, None, problem.staircase, camera, wavelengths)
+    if spec.train.field == "random" or spec.train.fabricated:
+        key = "field" if spec.train.field == "random" else "fabricated"
+        cure = 'Use parametrization = "freeform" with this design as its start.'
+        raise InputError(f"{source}: train.{key}", "must be left out for a design of rings", "it", cure)
+    return RingPlate(problem.lines, problem.staircase, camera, wavelengths)
+
+
+def _odd_window(spec: Spec) -> Any:
+    return spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
+
+
+def resting_plate(spec: Spec, camera: Camera, kind: Kind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
+    """A plate that stays as it is, by exact PSFs over all depths that scenes may have."""
+    bank = psf_bank(camera, height_m, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
+    return StoredPlate.of(bank)
+
+
+def resting_depths_m(spec: Spec, kind: Kind) -> tuple[float, ...]:
+    """Depths at which a plate at rest is computed: those of the obstruction, and those of the background."""
+    least, most = depth_range_m(kind)
+    near = 1 / np.linspace(1 / most, 1 / least, _NEAR_DEPTHS)
+    far = spec.scene.far_m
+    with np.errstate(divide="ignore"):  # of infinity
+        backs = 1 / np.linspace(1 / max(far), 1 / min(far), _FAR_DEPTHS)
+    return tuple(dict.fromkeys(float(depth) for depth in (*backs, *near)))
+
+
+def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
+    """Field angles (y, x) of a scene, anywhere on the sensor."""
+    share = np.random.default_rng((seed, _SALT_FIELD, number)).uniform(-0.5, 0.5, 2)
+    width, height = (n * spec.sensor.pitch_m for n in spec.sensor.resolution)
+    y, x = np.arctan(share * np.array([height, width]) / spec.optics.focal_length_m)
+    return float(y), float(x)
+
+
+Learnt = tuple[Network, Any]
+
+
+def _loss(moving: Any, still: Any, trainer: Trainer, seen: Seen, keys: Array, softness: Array) -> tuple[Array, Array]:
+    network, free = eqx.combine(moving, still)
+    train = trainer.spec.train
+    found = shots(seen, trainer.plate, free, softness, trainer.bench, keys)
+    picture = network(
+        found.capture,
+        found.far,
+        found.near,
+        half=train.precision == "mixed",
+        checkpointed=train.checkpointing,
+    )
+    reference = srgb_from_linear(jnp.asarray(seen.background))
+    return losses(picture, reference, jnp.asarray(seen.mask), trainer.weights, trainer.perceptual)
+
+
+def _slopes(
+    moving: Any, still: Any, trainer: Trainer, seen: Seen, keys: Array, softness: Array
+) -> tuple[tuple[Array, Array], Any]:
+    return eqx.filter_value_and_grad(_loss, has_aux=True)(moving, still, trainer, seen, keys, softness)
+
+
+def _averaged(trainer: Trainer) -> Callable[..., Any]:
+    """`_slopes` over all devices of the trainer."""
+    if trainer.mesh is None:
+        return _slopes
+    here, shared = PartitionSpec(AXIS), PartitionSpec()
+    arrays, rest = eqx.partition(trainer, eqx.is_array)
+
+    def local(moving: Any, still: Any, arrays: Any, seen: Seen, keys: Array, softness: Array) -> Any:
+        found = _slopes(moving, still, eqx.combine(arrays, rest), seen, keys, softness)
+        return jax.tree.map(lambda leaf: jax.lax.pmean(leaf, AXIS), found)
+
+    def whole(moving: Any, still: Any, _: Trainer, seen: Seen, keys: Array, softness: Array) -> Any:
+        solid, hollow = eqx.partition(still, eqx.is_array)
+        call = jax.shard_map(
+            lambda m, s, a, x, k, f: local(m, eqx.combine(s, hollow), a, x, k, f),
+            mesh=trainer.mesh,
+            in_specs=(shared, shared, shared, here, here, shared),
+            out_specs=shared,
+            check_vma=False,
+        )
+        return call(moving, solid, arrays, seen, keys, softness)
+
+    return whole
+
+
+Constants = tuple[Trainer, Seen, Array, Array, Array, tuple[bool, bool]]
+
+
+def _take(constants: Constants, changing: tuple[Learnt, tuple[Any, Any]]) -> Any:
+    """One step in arrays."""
+    trainer, seen, keys, softness, rates, moves = constants
+    learnt, moments = changing
+    chosen = tuple(
+        jax.tree.map(lambda leaf, move=move: move and eqx.is_inexact_array(leaf), part)
+        for part, move in zip(learnt, moves, strict=True)
+    )
+    moving, still = eqx.partition(learnt, chosen)
+    (loss, terms), slopes = _averaged(trainer)(moving, still, trainer, seen, keys, softness)
+    fresh = [
+        _moved(part, slope, moment, rate) if move else (part, moment)
+        for part, slope, moment, rate, move in zip(learnt, slopes, moments, rates, moves, strict=True)
+    ]
+    return tuple(part for part, _ in fresh), tuple(moment for _, moment in fresh), loss, terms
+
+
+def _moved(part: Any, slope: Any, moment: optax.OptState, rate: Array) -> tuple[Any, optax.OptState]:
+    """One step of Adam."""
+    direction, moment = optax.scale_by_adam().update(slope, moment)
+    return eqx.apply_updates(part, jax.tree.map(lambda d: -rate * d, direction)), moment
+
+
+@cache
+def _update() -> Callable[[Constants, tuple[Learnt, tuple[Any, Any]]], Any]:
+    """The compiled step. Made on first use: several hosts have to find each other first."""
+    return compiled_step(_take)
+
+
+@eqx.filter_jit
+def _look(network: Network, free: Any, trainer: Trainer, seen: Seen, keys: Array) -> tuple[Shot, Array]:
+    found = shots(seen, trainer.plate, free, jnp.float32(0.0), trainer.bench, keys)
+    return found, network(found.capture, found.far, found.near)

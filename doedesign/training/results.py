@@ -1,0 +1,183 @@
+"""What a training makes: scores and pictures of scenes it never saw, the trained plate, its PSFs, and the network."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.capture.from_spec import shown_as
+from doedesign.capture.scenes import Batch, SceneData
+from doedesign.capture.simulate import depth_range_m
+from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
+from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
+from doedesign.runs.folder import Run
+from doedesign.runs.level_maps import read_any_height
+from doedesign.training.evaluation import Found, judge
+from doedesign.training.joint import State, Trainer, resting_plate
+from doedesign.training.optics import RingPlate, StoredPlate
+from doedesign.training.perceptual import Lpips
+from doedesign.training.validation import looks
+from fab.files import canonical_json, write_atomic
+from fab.levels import height_of
+from sim.camera import Camera
+from sim.light import srgb_from_linear
+from sim.obstruction import Kind
+from sim.propagation.hankel import radial_profile, revolve, ring_count
+from sim.psf_bank import psf_bank
+from sim.store import write_bank, write_height
+
+
+class HeldOut(NamedTuple):
+    """Scenes that are never trained on.
+
+    Attributes:
+        data: where they come from, one to a batch.
+        scenes: how many.
+        lpips: weights of LPIPS, if at hand.
+    """
+
+    data: SceneData
+    scenes: int
+    lpips: Lpips | None
+
+
+def validate(
+    trainer: Trainer, state: State, held_out: HeldOut, most_rows: int = 4, *, baselines: bool = False
+) -> Found:
+    """Look at held-out scenes with the network as it is now.
+
+    Args:
+        trainer: the training.
+        state: its state.
+        held_out: the scenes.
+        most_rows: scenes to keep for a picture.
+        baselines: judge the rows of Table 1 that need no training, too (`doedesign.recon.baselines`).
+    """
+    camera = trainer.bench.camera
+    trainer, state = _at_rest(trainer, state, held_out.data.kind)
+    seen = looks(held_out.data, held_out.scenes, camera, lambda batch: _shown(trainer, state, batch, baselines))
+    return judge(seen, held_out.lpips, lambda image: shown_as(image, camera), most_rows)
+
+
+def _at_rest(trainer: Trainer, state: State, kind: Kind) -> tuple[Trainer, State]:
+    """The same with the plate that is to be drawn, and its exact PSFs.
+
+    Within a step PSFs are estimates: samples may be sparse, and a near source lights the cells obliquely, which plans
+    for all depths leave out (`sim.propagation.farfield`): at 5 cm that is up to a fifth of the light in the window.
+    """
+    if isinstance(trainer.plate, StoredPlate):
+        return trainer, state
+    plate = resting_plate(trainer.spec, trainer.bench.camera, kind, _maps_of(trainer, state).drawn_m)
+    return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
+
+
+def _shown(trainer: Trainer, state: State, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
+    """What the camera records of a scene, and what the network and others make of it, in display values."""
+    shot, picture = trainer.reconstruct(state, batch)
+    light, far, near = (np.asarray(image, np.float32)[0] for image in shot)
+    found = {"capture": light}
+    if baselines:
+        variance = noise_variance(light, trainer.bench.sensor)
+        ratio = noise_to_signal(light, variance)
+        found |= {
+            "wiener_far": np.asarray(wiener(light, far, ratio)),
+            "wiener_near": np.asarray(wiener(light, near, ratio)),
+            "richardson_lucy_far": np.asarray(richardson_lucy(light, far, noise_variance=variance)),
+        }
+    return {name: srgb_from_linear(image) for name, image in found.items()} | {
+        "reconstruction": np.asarray(picture, np.float32)[0]
+    }
+
+
+class PlateMaps(NamedTuple):
+    """Height maps of a plate, metres, float32 `[y, x]`.
+
+    Attributes:
+        drawn_m: what is to be made.
+        continuous_m: the same before rounding; None for a plate that training left as it was.
+    """
+
+    drawn_m: Float[np.ndarray, "y x"]
+    continuous_m: Float[np.ndarray, "y x"] | None
+
+
+def height_at_rest_m(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
+    """The plate that a run draws, or a flat one where the spec wants a conventional camera."""
+    if run.spec.train.camera == "conventional":
+        return np.zeros(camera.grid.shape, np.float32)
+    return read_any_height(run.path("height.exr")).height_m
+
+
+def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
+    """The heights that training begins with: those of the run before rounding; of rings, their profile."""
+    camera = trainer.bench.camera
+    if run.spec.train.camera == "conventional":
+        flat = np.zeros(camera.grid.shape, np.float32)
+        return flat[0, : ring_count(camera)] if isinstance(trainer.plate, RingPlate) else flat
+    heights = read_any_height(run.path("height_continuous.exr")).height_m
+    if not isinstance(trainer.plate, RingPlate):
+        return heights
+    profile = radial_profile(heights, camera.grid)
+    assert profile is not None  # that is what `optimize` writes for a radial design
+    return profile[: ring_count(camera)]
+
+
+def plate_after(run: Run, trainer: Trainer, state: State) -> PlateMaps:
+    """The plate of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
+    if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
+        return PlateMaps(height_at_rest_m(run, trainer.bench.camera), None)
+    return _maps_of(trainer, state)
+
+
+def _maps_of(trainer: Trainer, state: State) -> PlateMaps:
+    """What parameters make."""
+    plate = trainer.plate
+    assert not isinstance(plate, StoredPlate)  # which has none
+    # A finished run has chosen its depths, so only the map is free.
+    assert isinstance(state.free, jax.Array)
+    continuous = np.asarray(plate.staircase.continuous_m(state.free))
+    if isinstance(plate, RingPlate):
+        continuous = revolve(continuous, trainer.bench.camera.grid)
+    if trainer.spec.optimize.quantisation == "none":
+        return PlateMaps(continuous, continuous)
+    level = np.asarray(plate.staircase.level(jnp.asarray(continuous))).astype(np.uint8)
+    return PlateMaps(height_of(level, plate.staircase.levels).astype(np.float32), continuous)
+
+
+def write_results(
+    folder: Path, run: Run, trainer: Trainer, state: State, held_out: HeldOut, kind: Kind, about: Mapping[str, Any]
+) -> list[str]:
+    """Write network, plate, PSFs and scores.
+
+    Args:
+        folder: where to.
+        run: the run, with the spec of the training.
+        trainer: the training.
+        state: its last state.
+        held_out: scenes to judge it by.
+        kind: obstruction.
+        about: what the network's file says beside the camera's facts.
+
+    Returns:
+        names of the files.
+    """
+    spec, camera = run.spec, trainer.bench.camera
+    maps, near = plate_after(run, trainer, state), spec.scene.near_m or depth_range_m(kind)
+    names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
+    if spec.train.camera == "doe":
+        for name, height in (("height", maps.drawn_m), ("height_continuous", maps.continuous_m)):
+            if height is not None:
+                write_height(folder / f"{name}.exr", height, camera.grid.pitch_m, spec.doe.aperture_m)
+                names.append(f"{name}.exr")
+    depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
+    bank = psf_bank(camera, maps.drawn_m, depths, propagation=spec.optics.propagation)
+    write_bank(folder / BANK_NAME, bank, {"design": spec.name})
+    found = validate(trainer, state, held_out, baselines=True)
+    write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
+    write_network(folder / NETWORK_NAME, state.network, {**camera_facts(camera, near), **about})
+    return names

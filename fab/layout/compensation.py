@@ -1,0 +1,202 @@
+"""Compensation of line width: a mask drawn with its edges moved, so that the print comes back as designed.
+
+A process that widens every etched area by b prints the design from a drawing whose edges moved by -b. An edge moves
+by the same amount along x and y, as it does in the process model: what grows is the Minkowski sum with a square, what
+shrinks is the complement of the grown complement. Edges between rectangles of one area are no edges and do not move.
+Pixels that touch at a corner become one area when they grow, and part when they shrink.
+
+The moved drawing lies on the raster of all pixel edges moved by + and by -. A cell of it is etched if any (growing), or
+all (shrinking), of the pixels within the move of it are, so it is cut into rectangles like the plane itself.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.layout.geometry import PixelEdges, Shapes
+from fab.layout.polygons import rectangles, smallest_runs
+from fab.units import format_length
+
+__all__ = ["edge_moves", "grown", "read_back"]
+
+_LIMIT = 2**31 - 1
+
+
+def edge_moves(bias_m: Sequence[float], dbu_m: float) -> tuple[int, ...]:
+    """Return how far the edges of every mask must move to undo the bias of the process.
+
+    Args:
+        bias_m: per mask, how far the process moves every edge of an etched area outward, metres.
+        dbu_m: database unit, metres.
+
+    Returns:
+        Moves in database units, positive where etched areas are drawn wider: ``-bias_m``, rounded.
+
+    Raises:
+        InputError: a bias that is not finite.
+    """
+    if not np.all(np.isfinite(bias_m)):
+        raise InputError("CD bias", "must be finite", list(bias_m), "Give one length per mask.")
+    return tuple(-round(bias / dbu_m) for bias in bias_m)
+
+
+def _cells(edges: NDArray[np.int64], move: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the moved raster of one axis, and the first and end pixel within the move of each of its cells."""
+    moved = np.unique(np.concatenate([edges - move, edges + move]))
+    # A pixel reaches a cell if it begins before the cell ends, less the move, and ends after it begins.
+    first = np.searchsorted(edges[1:] + move, moved[:-1], side="right")
+    end = np.searchsorted(edges[:-1] - move, moved[1:], side="left")
+    return moved, np.stack([first, end], axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _spread(plane, rows, columns, out):  # pragma: no cover - compiled
+    # A cell is set if any pixel of its rows and columns is.
+    merged = np.empty(plane.shape[1], np.uint8)
+    for j in range(rows.shape[0]):
+        merged[:] = 0
+        for y in range(rows[j, 0], rows[j, 1]):
+            for x in range(plane.shape[1]):
+                merged[x] |= plane[y, x]
+        for i in range(columns.shape[0]):
+            value = np.uint8(0)
+            for x in range(columns[i, 0], columns[i, 1]):
+                value |= merged[x]
+            out[j, i] = value
+
+
+@njit(cache=True, nogil=True)
+def _gather(cells, rows, columns, out):  # pragma: no cover - compiled
+    # A pixel is set if every cell within the move of it is.
+    out[:] = 1
+    for j in range(rows.shape[0]):
+        for i in range(columns.shape[0]):
+            if cells[j, i]:
+                continue
+            for y in range(rows[j, 0], rows[j, 1]):
+                for x in range(columns[i, 0], columns[i, 1]):
+                    out[y, x] = 0
+
+
+@njit(cache=True, nogil=True)
+def _fill(boxes, out):  # pragma: no cover - compiled
+    # Paint boxes of cells; return how many cells were painted again.
+    overlaps = 0
+    for k in range(boxes.shape[0]):
+        for j in range(boxes[k, 1], boxes[k, 3]):
+            for i in range(boxes[k, 0], boxes[k, 2]):
+                overlaps += out[j, i]
+                out[j, i] = 1
+    return overlaps
+
+
+class _Raster(NamedTuple):
+    """The lines of a moved raster, and the pixels within the move of its cells, by first and end.
+
+    Shrinking is growing of the complement, which has one more pixel on every side: the blank glass around the plate.
+    """
+
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    shrinks: bool
+
+    @classmethod
+    def of(cls, edges: PixelEdges, move_units: int) -> "_Raster":
+        """Move the edges both ways."""
+        move, lines = abs(move_units), [edges.x.astype(np.int64), edges.y.astype(np.int64)]
+        if move_units < 0:
+            lines = [np.concatenate([[axis[0] - 2 * move], axis, [axis[-1] + 2 * move]]) for axis in lines]
+        (x, columns), (y, rows) = (_cells(axis, move) for axis in lines)
+        worst = max(abs(int(v)) for v in (x[0], x[-1], y[0], y[-1]))
+        if worst > _LIMIT:
+            got = f"an edge at {worst} units"
+            raise InputError("edge move", "the moved drawing must fit 32-bit coordinates", got, "Choose a smaller one.")
+        return cls(x, y, columns, rows, move_units < 0)
+
+    def cells(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the moved plane, cell by cell."""
+        out = np.empty((len(self.rows), len(self.columns)), dtype=np.uint8)
+        _spread(np.pad(1 - plane, 1, constant_values=1) if self.shrinks else plane, self.rows, self.columns, out)
+        return np.subtract(1, out, out=out) if self.shrinks else out
+
+    def pixels(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the plane whose move the cells are, if there is one."""
+        out = np.empty((int(self.rows[-1, 1]), int(self.columns[-1, 1])), dtype=np.uint8)
+        _gather(1 - cells if self.shrinks else cells, self.rows, self.columns, out)
+        return 1 - out[1:-1, 1:-1] if self.shrinks else out
+
+
+def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shapes:
+    """Draw a plane with all its edges moved.
+
+    Args:
+        plane: ``[y, x]`` of 0 and 1, 1 where etched.
+        edges: where the pixel edges fall in the drawing.
+        move_units: how far every edge of an etched area moves outward, database units; inward where negative.
+
+    Returns:
+        Rectangles that do not overlap, sorted by y0, then x0.
+
+    Raises:
+        InputError: moving the edges back would not give the plane, because a line or a space is not wider than twice
+            the move; or coordinates beyond 32 bits.
+    """
+    plane = np.ascontiguousarray(plane, dtype=np.uint8)
+    if move_units == 0:
+        return Shapes(rectangles(plane, edges.x, edges.y))
+    raster = _Raster.of(edges, move_units)
+    cells = raster.cells(plane)
+    if not np.array_equal(raster.pixels(cells), plane):
+        line, space = smallest_runs(plane)
+        what, pixels = ("line", line) if move_units < 0 else ("space", space)
+        finest = "" if pixels is None else f", where the narrowest {what} has {pixels} pixels"
+        rule = "edges must move by less than half the narrowest line and space"
+        raise InputError("edge move", rule, f"{_text(move_units, edges)}{finest}", "Choose a smaller one.")
+    x, y = (lines.astype(np.int32) for lines in (raster.x, raster.y))
+    return Shapes(rectangles(cells, x, y))
+
+
+def read_back(shapes: Shapes, edges: PixelEdges, move_units: int) -> NDArray[np.uint8]:
+    """Return the plane that a drawing was made from by `grown`, and prove that it was.
+
+    Args:
+        shapes: the drawing.
+        edges: where the pixel edges fall in it before the move.
+        move_units: how far its edges were moved.
+
+    Returns:
+        ``[y, x]`` of 0 and 1, 1 where etched; drawing it again with this move covers exactly the same area.
+
+    Raises:
+        InputError: polygons, rectangles that overlap, a coordinate that is no moved pixel edge, or an area that no
+            plane gives with this move.
+    """
+    raster, where = _Raster.of(edges, move_units), "compensated mask"
+    boxes = shapes.rectangles.astype(np.int64)
+    places = [np.searchsorted(lines, boxes[:, k]) for k, lines in enumerate((raster.x, raster.y) * 2)]
+    on_line = [
+        (place < len(lines)) & (lines[np.minimum(place, len(lines) - 1)] == boxes[:, k])
+        for k, (place, lines) in enumerate(zip(places, (raster.x, raster.y) * 2, strict=True))
+    ]
+    strays = len(shapes.polygons) + int(np.count_nonzero(~np.logical_and.reduce(on_line)))
+    if strays:
+        rule = f"every edge must be a pixel edge moved by {_text(move_units, edges)}"
+        raise InputError(where, rule, f"{strays} shapes that are not", "Draw the mask again.")
+    cells = np.zeros((len(raster.rows), len(raster.columns)), dtype=np.uint8)
+    if _fill(np.stack(places, axis=1), cells):
+        raise InputError(where, "rectangles must not overlap", "some that do", "Draw the mask again.")
+    plane = raster.pixels(cells)
+    if not np.array_equal(raster.cells(plane), cells):
+        rule = f"must be a plane of pixels with its edges moved by {_text(move_units, edges)}"
+        raise InputError(where, rule, "another area", "Draw the mask again.")
+    return plane
+
+
+def _text(move_units: int, edges: PixelEdges) -> str:
+    return format_length(round(move_units * edges.dbu_m, 18))

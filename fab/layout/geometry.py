@@ -1,0 +1,352 @@
+"""The geometry of a mask set: cells with layers of rectangles and polygons in integer database units.
+
+Rules of the drawing. The centre of the clear aperture is (0, 0). Mask bit k is layer k + 1, datatype 0
+(the number is the bit, not the order of etching); chrome is layer 5 for up to four masks and the next
+free one otherwise. A polygon in an etch layer means "etched here", in the chrome layer "chrome here".
+Names of cells hold A-Z, 0-9 and _ only, up to 32 characters, and are never "main", which some writers
+keep for themselves.
+
+The database unit is 1 nm where every pixel edge falls on it, otherwise the coarsest finer unit on which
+it does; where none does, each edge is rounded once, so that neighbours still share it.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.layout.polygons import annulus_sectors, doubled_area
+from fab.levels import Levels
+from fab.units import MM, NM, format_length
+
+__all__ = [
+    "Cell",
+    "Chrome",
+    "Layer",
+    "Layout",
+    "PixelEdges",
+    "Reference",
+    "Shapes",
+    "chrome_layer",
+    "chrome_shapes",
+    "etch_layer",
+    "in_order",
+    "layer_from",
+    "pixel_edges",
+    "require_name",
+]
+
+_NAME = re.compile(r"[A-Z0-9_]{1,32}")
+_FEMTO = 10**15
+_NANO_FM = 10**6
+_UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
+_LIMIT = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer of the drawing. Two layers are the same if number and datatype are; files lose the name.
+
+    Attributes:
+        number: GDSII layer number.
+        datatype: GDSII datatype.
+        name: what it is, for people.
+    """
+
+    number: int
+    datatype: int = 0
+    name: str = field(default="", compare=False)
+
+    def __str__(self) -> str:
+        """Return the usual short form, such as ``3/0``."""
+        return f"{self.number}/{self.datatype}"
+
+
+def layer_from(text: str) -> Layer:
+    """The layer of a short form, such as ``3/0``."""
+    number, datatype = text.split("/")
+    return Layer(int(number), int(datatype))
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What is drawn on one layer.
+
+    Attributes:
+        rectangles: ``(n, 4)`` int32: x0, y0, x1, y1 with x0 < x1 and y0 < y1, in database units.
+        polygons: simple polygons, each ``(v, 2)`` int32 vertices x, y, not closed.
+    """
+
+    rectangles: NDArray[np.int32]
+    polygons: tuple[NDArray[np.int32], ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of shapes."""
+        return len(self.rectangles) + len(self.polygons)
+
+    @property
+    def doubled_area(self) -> int:
+        """Twice the summed area of the shapes in squared database units, exact."""
+        total = sum(abs(doubled_area(polygon)) for polygon in self.polygons)
+        if len(self.rectangles):
+            x0, y0, x1, y1 = self.rectangles.T
+            total += 2 * int(np.sum((x1 - x0).astype(np.int64) * (y1 - y0)))
+        return total
+
+    @property
+    def box(self) -> tuple[int, int, int, int] | None:
+        """The smallest x0, y0, x1, y1 around all shapes, or None if there are none."""
+        boxes = [(*polygon.min(axis=0), *polygon.max(axis=0)) for polygon in self.polygons]
+        if len(self.rectangles):
+            boxes.append((*self.rectangles[:, :2].min(axis=0), *self.rectangles[:, 2:].max(axis=0)))
+        if not boxes:
+            return None
+        corners = np.array(boxes)
+        x0, y0 = (int(v) for v in corners[:, :2].min(axis=0))
+        x1, y1 = (int(v) for v in corners[:, 2:].max(axis=0))
+        return x0, y0, x1, y1
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A cell placed in another one, once or on a raster; never turned, never mirrored.
+
+    Attributes:
+        cell: name of the placed cell.
+        x: where its origin comes to lie, in database units.
+        y: the same along y.
+        columns: copies along x.
+        rows: copies along y.
+        step_x: distance of the columns.
+        step_y: distance of the rows.
+    """
+
+    cell: str
+    x: int = 0
+    y: int = 0
+    columns: int = 1
+    rows: int = 1
+    step_x: int = 0
+    step_y: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A named drawing that others may place.
+
+    Attributes:
+        name: its name.
+        shapes: the layers in the order they are written.
+        references: the cells it places.
+    """
+
+    name: str
+    shapes: Mapping[Layer, Shapes]
+    references: tuple[Reference, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Everything in one file.
+
+    Attributes:
+        dbu_m: database unit, metres.
+        cells: every cell after those that it places; the last one is the top.
+    """
+
+    dbu_m: float
+    cells: tuple[Cell, ...]
+
+    @property
+    def top(self) -> Cell:
+        """The cell that no other places."""
+        return self.cells[-1]
+
+    def cell(self, name: str) -> Cell | None:
+        """The cell of a name, or None."""
+        return next((cell for cell in self.cells if cell.name == name), None)
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """All layers, in the order in which the cells first use them, the top first."""
+        return tuple(dict.fromkeys(layer for cell in reversed(self.cells) for layer in cell.shapes))
+
+
+def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+    """Cells put so that each comes after those that it places.
+
+    Raises:
+        ValueError: a name is there twice, a placed cell is missing, cells place each other, or there is not
+            exactly one that no other places.
+    """
+    waiting = {}
+    for cell in cells:
+        if cell.name in waiting:
+            raise ValueError(f"two cells are named {cell.name!r}")
+        waiting[cell.name] = cell
+    placed = {reference.cell for cell in waiting.values() for reference in cell.references}
+    tops = [name for name in waiting if name not in placed]
+    if missing := sorted(placed - set(waiting)):
+        raise ValueError(f"the placed cell {missing[0]!r} is missing")
+    if len(tops) != 1:
+        raise ValueError(f"{len(tops)} cells instead of one are placed by no other")
+    done: dict[str, Cell] = {}
+    while waiting:
+        ready = [c for c in waiting.values() if all(r.cell in done for r in c.references)]
+        if not ready:
+            raise ValueError(f"cell {min(waiting)!r} places itself")
+        for cell in ready:
+            done[cell.name] = waiting.pop(cell.name)
+    return tuple(done.values())
+
+
+@dataclass(frozen=True)
+class Chrome:
+    """How the chrome around the clear aperture is drawn.
+
+    Attributes:
+        overlap_m: how far the chrome reaches inside the clear aperture, metres, so that the edge of the
+            relief stays covered when the chrome is aligned a little off.
+        outer_m: outer radius, metres; by default the corners of the raster and half a millimetre more.
+        chord_error_m: largest distance between the circles and their chords, metres.
+    """
+
+    overlap_m: float = 5e-6
+    outer_m: float | None = None
+    chord_error_m: float = 5e-9
+
+    def radii_m(self, grid: Grid, aperture_m: float) -> tuple[float, float]:
+        """Return the radius of the opening and the outer radius for one plate.
+
+        Args:
+            grid: the raster of the plate.
+            aperture_m: diameter of its clear aperture, metres.
+
+        Returns:
+            Inner and outer radius in metres.
+
+        Raises:
+            InputError: nothing of the opening, or nothing of the chrome, would be left.
+        """
+        inner = aperture_m / 2 - self.overlap_m
+        outer = self.outer_m
+        if outer is None:
+            # Whole tenths of a millimetre, because this number stands on the order form.
+            outer = (np.ceil((np.hypot(*grid.extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
+        if not 0 <= self.overlap_m < aperture_m / 2:
+            got = format_length(self.overlap_m)
+            raise InputError("chrome overlap", "must lie from 0 to the aperture's radius", got, "Choose a smaller one.")
+        if not inner < outer < float("inf"):
+            got = format_length(outer)
+            raise InputError("chrome outer radius", "must exceed the opening's radius", got, "Choose a larger one.")
+        return float(inner), float(outer)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelEdges:
+    """Where the pixel edges of a grid fall in the drawing.
+
+    Attributes:
+        x: coordinates of the edges along x in database units, ``(nx + 1,)`` int32.
+        y: the same along y, ``(ny + 1,)``.
+        dbu_m: the database unit, metres.
+        shift_m: how far the worst edge was moved to fall on the database unit; 0 if every one is exact.
+    """
+
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
+    dbu_m: float
+    shift_m: float
+
+
+def _axis_edges(count: int, pitch_fm: int, unit_fm: int) -> tuple[NDArray[np.int32], float]:
+    """Return the edges of an axis in units, symmetric about 0, and the largest shift in femtometres."""
+    doubled_fm = np.arange(-count, count + 1, 2) * pitch_fm
+    # Half a unit goes outward on both sides, so that the drawing stays symmetric.
+    edges = np.sign(doubled_fm) * ((np.abs(doubled_fm) + unit_fm) // (2 * unit_fm))
+    return edges.astype(np.int32), float(np.max(np.abs(2 * unit_fm * edges - doubled_fm))) / 2
+
+
+def pixel_edges(grid: Grid) -> PixelEdges:
+    """Place the pixel edges of a grid on a database unit.
+
+    Args:
+        grid: the raster; its centre is the origin of the drawing.
+
+    Returns:
+        The edges and the unit, 1 nm wherever it can be.
+
+    Raises:
+        InputError: pixels finer than 10 nm, or a raster too large for 32-bit coordinates.
+    """
+    # The pitch is meant as a decimal number; whole femtometres recover it from the binary one.
+    pitch_fm = round(grid.pitch_m * _FEMTO)
+    if pitch_fm < 10 * _NANO_FM or max(grid.extent_m) / 2 > _LIMIT * NM:
+        got = f"{grid.shape} pixels of {format_length(grid.pitch_m)}"
+        rule = "the pixels must measure 10 nm or more and the raster must fit 32-bit nanometres"
+        raise InputError("grid", rule, got, "Check the unit of the pitch.")
+    ny, nx = grid.shape
+    # Every edge is exact if the pitch and half of either side are whole units.
+    doubled_fm = (2 * pitch_fm, ny * pitch_fm, nx * pitch_fm)
+    exact = (u for u in _UNITS_FM if all(v % (2 * u) == 0 for v in doubled_fm) and max(doubled_fm) < 2 * u * _LIMIT)
+    unit_fm = next(exact, _NANO_FM)
+    (x, shift_x), (y, shift_y) = (_axis_edges(n, pitch_fm, unit_fm) for n in (nx, ny))
+    return PixelEdges(x, y, unit_fm / _FEMTO, max(shift_x, shift_y) / _FEMTO)
+
+
+def require_name(name: str) -> str:
+    """Check the name of a cell or of a mask file (without its suffix).
+
+    Args:
+        name: the name.
+
+    Returns:
+        The same name.
+
+    Raises:
+        InputError: characters other than A-Z, 0-9 and _, more than 32 of them, none, or "MAIN".
+    """
+    if not _NAME.fullmatch(name) or name == "MAIN":
+        rule = "must be 1 to 32 characters A-Z, 0-9 or _, and not MAIN"
+        raise InputError("mask name", rule, repr(name), "Choose a plainer or shorter name.")
+    return name
+
+
+def etch_layer(bit: int, levels: Levels) -> Layer:
+    """Return the layer of an etch mask: number ``bit + 1``, datatype 0."""
+    return Layer(bit + 1, 0, f"ETCH_B{bit}_{format_length(levels.etch_depth_m(bit)).replace(' ', '')}")
+
+
+def chrome_layer(levels: Levels) -> Layer:
+    """Return the chrome layer: 5 for up to four masks, otherwise the next free number."""
+    return Layer(max(5, levels.bits + 1), 0, "CHROME")
+
+
+def chrome_shapes(grid: Grid, aperture_m: float, dbu_m: float, chrome: Chrome) -> Shapes:
+    """Draw the chrome around the clear aperture as an annulus.
+
+    Args:
+        grid: the raster of the plate.
+        aperture_m: diameter of the clear aperture, metres.
+        dbu_m: database unit, metres.
+        chrome: overlap, outer radius and chord error.
+
+    Returns:
+        Sectors that share their radial edges; a polygon means "chrome here".
+
+    Raises:
+        InputError: the radii leave nothing, or do not fit 32-bit coordinates.
+    """
+    inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(grid, aperture_m))
+    if outer > _LIMIT:
+        got = format_length(outer * dbu_m)
+        raise InputError("chrome outer radius", "must fit 32-bit coordinates", got, "Choose a smaller one.")
+    if not chrome.chord_error_m >= dbu_m:
+        got = format_length(chrome.chord_error_m)
+        raise InputError("chrome chord error", "must be one database unit or more", got, "Choose a larger one.")
+    polygons = annulus_sectors(inner, outer, chrome.chord_error_m / dbu_m)
+    return Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygons))

@@ -1,0 +1,162 @@
+"""Lettering: text as rectangles, and what is written on a mask.
+
+Letters stand on a raster of 5 x 7 strokes, one stroke apart. They are drawn square, and a slope is a stair whose steps
+overlap, so that no two rectangles touch at a corner only. Every line and every gap is one stroke wide or more; a zero
+has a dot, to be told from an O.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.layout.geometry import Shapes
+from fab.layout.part import Part, Plate, column, joined, moved
+from fab.layout.polygons import rectangles
+from fab.units import UM, format_length
+
+__all__ = ["HEIGHT", "label_block", "letter_boxes", "lettering", "mask_label", "written"]
+
+# Strokes in the height of a letter, and from one letter to the next.
+HEIGHT, _ADVANCE = 7, 6
+# From one line of text to the next, and from one label to the next.
+_LINE, _BLOCK = 11, 18
+
+_FONT = """
+A ..#.. .###. ##.## #...# ##### #...# #...#
+B ####. #..#. #..#. ##### #...# #...# #####
+C ##### #.... #.... #.... #.... #.... #####
+D ###.. #.##. #..## #...# #..## #.##. ###..
+E ##### #.... #.... ####. #.... #.... #####
+F ##### #.... #.... ####. #.... #.... #....
+G ##### #.... #.... #.### #...# #...# #####
+H #...# #...# #...# ##### #...# #...# #...#
+I ##### ..#.. ..#.. ..#.. ..#.. ..#.. #####
+J ..### ....# ....# ....# #...# #...# #####
+K #..## #..#. #.##. ###.. #.##. #..#. #..##
+L #.... #.... #.... #.... #.... #.... #####
+M #...# ##.## ##### #.#.# #...# #...# #...#
+N #...# ##..# ###.# #.### #..## #...# #...#
+O ##### #...# #...# #...# #...# #...# #####
+P ##### #...# #...# ##### #.... #.... #....
+Q ####. #..#. #..#. #..#. #..#. ##### ...##
+R ##### #...# #...# ##### #.##. #..## #...#
+S .#### ##... ##... .###. ...## ...## ####.
+T ##### ..#.. ..#.. ..#.. ..#.. ..#.. ..#..
+U #...# #...# #...# #...# #...# #...# #####
+V #...# #...# #...# ##.## .#.#. .###. ..#..
+W #...# #...# #...# #.#.# ##### ##.## #...#
+X #...# ##.## .###. ..#.. .###. ##.## #...#
+Y #...# #...# ##.## .###. ..#.. ..#.. ..#..
+Z ##### ...## ..##. ..#.. .##.. ##... #####
+0 ##### #...# #...# #.#.# #...# #...# #####
+1 ..#.. .##.. ..#.. ..#.. ..#.. ..#.. #####
+2 ##### ....# ....# ##### #.... #.... #####
+3 ##### ....# ....# .#### ....# ....# #####
+4 #...# #...# #...# ##### ....# ....# ....#
+5 ##### #.... #.... ##### ....# ....# #####
+6 ###.. #.... #.... ##### #...# #...# #####
+7 ##### ....# ...## ...#. ..##. ..#.. ..#..
+8 ##### #...# #...# ##### #...# #...# #####
+9 ##### #...# #...# ##### ....# ....# ..###
+. ..... ..... ..... ..... ..... ..... ..#..
+- ..... ..... ..... .###. ..... ..... .....
+_ ..... ..... ..... ..... ..... ..... #####
+/ ....# ...## ..##. ..#.. .##.. ##... #....
+: ..... ..... ..#.. ..... ..... ..#.. .....
++ ..... ..#.. ..#.. ##### ..#.. ..#.. .....
+"""
+_GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {" ": ["....."] * HEIGHT}
+
+
+def letter_boxes(text: str) -> NDArray[np.int32]:
+    """Return the rectangles of a line of text in strokes.
+
+    Args:
+        text: A-Z, 0-9, ``. - _ / : +`` and spaces.
+
+    Returns:
+        ``(n, 4)``: x0, y0, x1, y1, disjoint; the text begins at x = 0 and stands on y = 0.
+
+    Raises:
+        InputError: another character.
+    """
+    odd = sorted(set(text) - set(_GLYPHS))
+    if odd:
+        rule = "must hold A-Z, 0-9, . - _ / : + and spaces only"
+        raise InputError("lettering", rule, repr("".join(odd)), "Choose plainer words.")
+    lines = [".".join(_GLYPHS[letter][line] for letter in text) for line in reversed(range(HEIGHT))]
+    return rectangles(np.array([[mark == "#" for mark in line] for line in lines], dtype=np.uint8).reshape(HEIGHT, -1))
+
+
+def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
+    """Draw a line of text.
+
+    Args:
+        text: A-Z, 0-9, ``. - _ / : +`` and spaces.
+        height_m: height of the letters, metres; a stroke is a seventh of it, rounded to whole database units.
+        dbu_m: database unit, metres.
+
+    Returns:
+        Disjoint rectangles; the text begins at x = 0 and stands on y = 0.
+
+    Raises:
+        InputError: another character, or letters too small to be drawn.
+    """
+    stroke = round(height_m / HEIGHT / dbu_m)
+    if stroke < 1:
+        rule = "letters must be seven database units high or more"
+        raise InputError("lettering", rule, format_length(height_m), "Choose a larger height.")
+    return Shapes(letter_boxes(text) * np.int32(stroke))
+
+
+def mask_label(job: str, plate: Plate, reading: str, digest: str) -> list[str]:
+    """Return what is written on a mask.
+
+    Args:
+        job: name of the job.
+        plate: the mask.
+        reading: reading sense in words, such as "right-reading chrome down".
+        digest: hexadecimal digest of what the mask draws; its first eight digits are written.
+
+    Returns:
+        Lines in capitals, the first on top.
+    """
+    if plate.bit is not None:
+        what = f"mask {plate.bit + 1} bit {plate.bit} etch {plate.depth}"
+    else:
+        what = "zero layer - chrome marks" if plate.makes == "zero layer" else "chrome aperture"
+    field = "dark" if plate.tone == "clear" else "clear"
+    tone = f"polygons {plate.tone} - {field} field plate"
+    return [line.upper() for line in (job, what, tone, reading, f"hash {digest[:8]}")]
+
+
+def label_block(labels: Sequence[tuple[Plate, Sequence[str]]], height_m: float, dbu_m: float) -> Part:
+    """Write the labels of several masks one below the other, so that no two meet on the wafer.
+
+    Args:
+        labels: plates and their lines, the first on top.
+        height_m: height of the letters, metres.
+        dbu_m: database unit, metres.
+
+    Returns:
+        The lettering on datatype 3 of each plate, its lower left corner at (0, 0). Places: "label, mask 3", the lower
+        left corner of each.
+
+    Raises:
+        InputError: a character that cannot be drawn, or letters that are too small.
+    """
+    stroke_m = height_m / HEIGHT
+    blocks = []
+    for plate, lines in labels:
+        drawn = [Part(dbu_m, {plate.on(3): lettering(line, height_m, dbu_m)}, {}) for line in lines]
+        placed = [moved(p, 0, (len(lines) - 1 - i) * _LINE * stroke_m) for i, p in enumerate(drawn)]
+        part = joined(placed)
+        blocks.append(Part(dbu_m, part.shapes, {f"label, {plate.name}": (part.box[0] * dbu_m, part.box[1] * dbu_m)}))
+    return column(blocks, (_BLOCK - HEIGHT) * stroke_m)
+
+
+def written(plate: Plate, text: str, stroke_um: float, dbu_m: float) -> Part:
+    """Write a line of text on datatype 3 of a plate, beginning at the origin, with strokes of whole database units."""
+    return Part(dbu_m, {plate.on(3): lettering(text, HEIGHT * stroke_um * UM, dbu_m)}, {})

@@ -1,0 +1,295 @@
+"""Parts: what is drawn beside the DOE (marks, test structures, lettering), and the plates it is drawn for.
+
+A part is small, lies about its own origin and knows the points that people measure at. It is moved and joined with
+others, never turned or mirrored, because a mirrored mark would say that a plate is the right way round when it is not.
+
+A plate is one mask: its layer, and what its polygons are on the plate. On an etch layer a polygon means "etched here",
+on the chrome and the zero layer "chrome here". With "clear" polygons the plate is dark field: chrome all over, and
+polygons let light through. With "dark" polygons it is clear field: glass all over, and polygons are chrome.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fab.layout.geometry import Layer, Shapes, chrome_layer
+from fab.layout.polygons import rectangles
+from fab.levels import Levels
+from fab.units import NM, UM
+
+__all__ = [
+    "ZERO_LAYER",
+    "Part",
+    "Plate",
+    "block",
+    "centred",
+    "column",
+    "joined",
+    "moved",
+    "plates_of",
+    "prefixed",
+    "row",
+    "turned",
+    "without",
+]
+
+ZERO_LAYER = 10
+
+Tone = Literal["clear", "dark"]
+_LIMIT = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A group of shapes on any layers.
+
+    Attributes:
+        dbu_m: database unit, metres.
+        shapes: what is drawn, about the part's own origin, in database units.
+        places: named points that people measure at, ``(x_m, y_m)`` in metres from the same origin.
+    """
+
+    dbu_m: float
+    shapes: Mapping[Layer, Shapes]
+    places: Mapping[str, tuple[float, float]]
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """The smallest x0, y0, x1, y1 around all shapes, database units; all 0 if there are none."""
+        boxes = np.array([shapes.box for shapes in self.shapes.values() if len(shapes)] or [(0, 0, 0, 0)])
+        x0, y0 = (int(v) for v in boxes[:, :2].min(axis=0))
+        x1, y1 = (int(v) for v in boxes[:, 2:].max(axis=0))
+        return x0, y0, x1, y1
+
+
+@dataclass(frozen=True)
+class Plate:
+    """One mask of the set.
+
+    Attributes:
+        layer: number of its layer; marks are datatype 1 of it, test structures 2, lettering 3.
+        tone: what polygons are on the plate, "clear" or "dark".
+        makes: "etch", "liftoff" or "wet etch" of the chrome aperture, or the "zero layer".
+        bit: which bit of the levels it etches; None if it makes chrome.
+        depth_m: how deep it etches, metres; 0 if it makes chrome.
+    """
+
+    layer: int
+    tone: Tone
+    makes: Literal["etch", "liftoff", "wet etch", "zero layer"]
+    bit: int | None = None
+    depth_m: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """What people call it: "mask 3", "chrome", "zero layer"; a mask's number is its bit + 1."""
+        return self.makes if self.makes == "zero layer" else "chrome" if self.bit is None else f"mask {self.bit + 1}"
+
+    @property
+    def code(self) -> str:
+        """Two characters for small places: "M3", "CR", "Z0"."""
+        return {"zero layer": "Z0", "chrome": "CR"}.get(self.name, f"M{self.layer}")
+
+    @property
+    def depth(self) -> str:
+        """How deep it etches, as text: "300 nm"."""
+        return f"{self.depth_m / NM:.6g} nm"
+
+    def on(self, datatype: Literal[1, 2, 3]) -> Layer:
+        """Return the layer of its marks (1), test structures (2) or lettering (3)."""
+        return Layer(self.layer, datatype, f"{self.code}_{('MARKS', 'TEST', 'LABEL')[datatype - 1]}")
+
+
+def plates_of(
+    levels: Levels,
+    order: Sequence[int],
+    tone: Tone,
+    chrome: Literal["liftoff", "etch", "none"],
+    zero_layer: bool,
+) -> tuple[Plate, ...]:
+    """List the plates of a job in the order in which they are used.
+
+    The resist is the same at every step, so that chrome that is etched away around its polygons needs the other tone
+    than chrome that is lifted off, or than an etch.
+
+    Args:
+        levels: the staircase.
+        order: the etch masks by bit, first etched first.
+        tone: what polygons of the etch masks are on their plates.
+        chrome: how the chrome aperture is made, or "none".
+        zero_layer: whether chrome marks are made before the first etch.
+
+    Returns:
+        The zero layer if there is one, the etch masks, and the chrome if there is any. The first of them makes the
+        marks that all others are aligned to.
+    """
+    opposite: Tone = "dark" if tone == "clear" else "clear"
+    chrome_tone = opposite if chrome == "etch" else tone
+    zero = [Plate(ZERO_LAYER, chrome_tone, "zero layer")] if zero_layer else []
+    etches = [Plate(bit + 1, tone, "etch", bit, levels.etch_depth_m(bit)) for bit in order]
+    way = "liftoff" if chrome == "liftoff" else "wet etch"
+    last = [] if chrome == "none" else [Plate(chrome_layer(levels).number, chrome_tone, way)]
+    return (*zero, *etches, *last)
+
+
+def without(areas: ArrayLike, holes: ArrayLike = ()) -> NDArray[np.float64]:
+    """Cover some boxes less some others with disjoint boxes.
+
+    Args:
+        areas: ``(n, 4)``: x0, y0, x1, y1; they may overlap.
+        holes: likewise; what lies in one of them is left out.
+
+    Returns:
+        ``(m, 4)`` boxes in the unit of the arguments; their corners are corners of the arguments.
+    """
+    areas, holes = (np.asarray(boxes, dtype=np.float64).reshape(-1, 4) for boxes in (areas, holes))
+    both = np.concatenate([areas, holes])
+    x, y = (np.unique(both[:, axis::2]) for axis in (0, 1))
+    plane = np.zeros((max(0, y.size - 1), max(0, x.size - 1)), dtype=np.uint8)
+    for boxes, value in ((areas, 1), (holes, 0)):
+        columns, rows = np.searchsorted(x, boxes[:, ::2]), np.searchsorted(y, boxes[:, 1::2])
+        for (x0, x1), (y0, y1) in zip(columns, rows, strict=True):
+            plane[y0:y1, x0:x1] = value
+    x0, y0, x1, y1 = rectangles(plane).T
+    return np.stack([x[x0], y[y0], x[x1], y[y1]], axis=1)
+
+
+def turned(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Exchange x and y of boxes ``(n, 4)``, which turns a figure for x into the same figure for y."""
+    return boxes[:, [1, 0, 3, 2]]
+
+
+def block(layer: Layer, boxes_um: ArrayLike, dbu_m: float) -> Part:
+    """Draw boxes on one layer.
+
+    Args:
+        layer: where.
+        boxes_um: ``(n, 4)``: x0, y0, x1, y1 in micrometres, disjoint.
+        dbu_m: database unit, metres.
+
+    Returns:
+        The part; it has no places.
+
+    Raises:
+        ValueError: a corner that is no whole database unit.
+    """
+    exact = np.asarray(boxes_um, dtype=np.float64).reshape(-1, 4) * (UM / dbu_m)
+    whole = np.rint(exact)
+    # 1e-3 of a unit is far above the rounding of these products and far below anything that is meant.
+    if np.abs(exact - whole).max(initial=0.0) > 1e-3:
+        raise ValueError(f"the boxes must be whole units of {dbu_m} m")
+    return Part(dbu_m, {layer: Shapes(whole.astype(np.int32))}, {})
+
+
+def _shifted(part: Part, dx: int, dy: int) -> Part:
+    """Move by whole database units."""
+    if max(map(abs, part.box)) + max(abs(dx), abs(dy)) > _LIMIT:
+        raise ValueError(f"a part moved by ({dx}, {dy}) units must fit 32-bit coordinates")
+    shift = np.array([dx, dy], dtype=np.int32)
+    shapes = {
+        layer: Shapes(drawn.rectangles + np.tile(shift, 2), tuple(polygon + shift for polygon in drawn.polygons))
+        for layer, drawn in part.shapes.items()
+    }
+    places = {name: (x + dx * part.dbu_m, y + dy * part.dbu_m) for name, (x, y) in part.places.items()}
+    return Part(part.dbu_m, shapes, places)
+
+
+def moved(part: Part, x_m: float, y_m: float) -> Part:
+    """Move a part, its places included.
+
+    Args:
+        part: what is moved.
+        x_m: how far along x, metres; rounded to whole database units.
+        y_m: how far along y.
+
+    Returns:
+        The moved copy.
+
+    Raises:
+        ValueError: the result does not fit 32-bit coordinates.
+    """
+    return _shifted(part, round(x_m / part.dbu_m), round(y_m / part.dbu_m))
+
+
+def prefixed(part: Part, prefix: str) -> Part:
+    """Return the part with `prefix` before the name of every place, such as "site left: "."""
+    return Part(part.dbu_m, part.shapes, {prefix + name: place for name, place in part.places.items()})
+
+
+def joined(parts: Iterable[Part]) -> Part:
+    """Put parts together as they lie.
+
+    Args:
+        parts: one or more, all with the same database unit and with different names of places.
+
+    Returns:
+        One part. Layers come in the order of their numbers and datatypes.
+
+    Raises:
+        ValueError: no part, different units, or a name of a place twice.
+    """
+    parts = list(parts)
+    if len({part.dbu_m for part in parts}) != 1:
+        raise ValueError("parts that are joined must have one database unit")
+    names = [name for part in parts for name in part.places]
+    if len(set(names)) < len(names):
+        raise ValueError(f"every place needs its own name, but {max(names, key=names.count)!r} comes twice")
+    layers = sorted({layer for part in parts for layer in part.shapes}, key=lambda a: (a.number, a.datatype))
+    shapes = {}
+    for layer in layers:
+        drawn = [part.shapes[layer] for part in parts if layer in part.shapes]
+        boxes = np.concatenate([s.rectangles for s in drawn])
+        shapes[layer] = Shapes(boxes, tuple(polygon for s in drawn for polygon in s.polygons))
+    return Part(parts[0].dbu_m, shapes, {name: place for part in parts for name, place in part.places.items()})
+
+
+def row(parts: Sequence[Part], gap_m: float) -> Part:
+    """Put parts side by side from left to right.
+
+    Args:
+        parts: one or more.
+        gap_m: blank space between the boxes of neighbours, metres.
+
+    Returns:
+        One part whose box begins at (0, 0); the lower edges of the boxes lie on y = 0.
+
+    Raises:
+        ValueError: as for `joined`.
+    """
+    placed, x = [], 0
+    for part in parts:
+        x0, y0, x1, _ = part.box
+        placed.append(_shifted(part, x - x0, -y0))
+        x += x1 - x0 + round(gap_m / part.dbu_m)
+    return joined(placed)
+
+
+def column(parts: Sequence[Part], gap_m: float) -> Part:
+    """Put parts one below the other, the first on top.
+
+    Args:
+        parts: one or more.
+        gap_m: blank space between the boxes of neighbours, metres.
+
+    Returns:
+        One part whose box begins at (0, 0); the left edges of the boxes lie on x = 0.
+
+    Raises:
+        ValueError: as for `joined`.
+    """
+    placed, y = [], 0
+    for part in reversed(parts):
+        x0, y0, _, y1 = part.box
+        placed.append(_shifted(part, -x0, y - y0))
+        y += y1 - y0 + round(gap_m / part.dbu_m)
+    return joined(reversed(placed))
+
+
+def centred(part: Part) -> Part:
+    """Move a part so that the middle of its box lies on the origin, half a database unit at most off."""
+    x0, y0, x1, y1 = part.box
+    return _shifted(part, -math.floor((x0 + x1) / 2), -math.floor((y0 + y1) / 2))

@@ -1,0 +1,61 @@
+"""Splits: dies of a wafer that draw the same DOE differently on purpose.
+
+A line-width split moves every edge of every etched area a little further out, or in. Where a process strays from the
+line width that the masks were drawn for, one of these dies comes nearer to the design than the plate as ordered.
+
+The control of the etch order gives the plane of the deepest etch to the mask of the shallowest, and so on. If the lab
+took the depths in the opposite order, this die holds the plate as designed and all others do not.
+"""
+
+from dataclasses import dataclass
+
+from fab.layout.wafer import Wafer
+from fab.levels import Levels
+from fab.units import format_length
+
+__all__ = ["Split", "splits_of"]
+
+
+@dataclass(frozen=True)
+class Split:
+    """One way to draw a DOE.
+
+    Attributes:
+        code: end of its cells' names.
+        words: what is special about it; empty for the plate as ordered.
+        lettering: what is written on its die.
+        bits: which plane each mask draws, mask 0 first.
+        moves: how far each mask moves the edges of etched areas outward, database units, mask 0 first.
+    """
+
+    code: str
+    words: str
+    lettering: str
+    bits: tuple[int, ...]
+    moves: tuple[int, ...]
+
+
+def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float) -> tuple[Split, ...]:
+    """List the ways in which a wafer's dies are drawn.
+
+    Args:
+        wafer: says which are wanted.
+        levels: the staircase.
+        moves: how far each mask of the plate as ordered moves its edges outward, database units.
+        dbu_m: database unit, metres.
+
+    Returns:
+        The plate as ordered, the line-width splits in the order of the wafer's list, the control of the etch order.
+    """
+    bits = tuple(range(levels.bits))
+    splits = [Split("DOE", "", "", bits, moves)]
+    for number, move_m in enumerate(wafer.line_splits_m, 1):
+        units = round(move_m / dbu_m)
+        length, out = format_length(abs(units) * dbu_m), units > 0
+        words = f"edges of etched areas drawn {length} further {'out' if out else 'in'} on every etch mask"
+        lettering = f"EDGES {'+' if out else '-'}{length}".upper()
+        splits.append(Split(f"CD{number}", words, lettering, bits, tuple(m + units for m in moves)))
+    if wafer.order_control:
+        words = "planes in the opposite order: right only if the depths were etched in the opposite order"
+        splits.append(Split("ORDER", words, "DEPTHS REVERSED", bits[::-1], moves))
+    return tuple(splits)

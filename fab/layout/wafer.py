@@ -1,0 +1,85 @@
+"""The wafer that a mask set is for: its glass, its mask blanks, and how it is filled."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from fab.errors import InputError
+from fab.units import MM, UM, format_length
+
+__all__ = ["READING", "Wafer"]
+
+READING = "right-reading chrome down"
+# Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
+_FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
+
+
+@dataclass(frozen=True)
+class Wafer:
+    """The glass, the mask blanks, and how the wafer is filled.
+
+    Attributes:
+        diameter_m: diameter of the wafer, metres.
+        thickness_m: its thickness, metres.
+        blank_m: edge of the square mask blanks, metres; 5 inches for a wafer of 100 mm.
+        dies: rows and columns of dies; the most that fit, up to 3 x 3, if None.
+        pitch_m: distance of the dies, metres; the next whole millimetre that a die needs if None.
+        zero_layer: whether marks of chrome are made before the first etch.
+        chrome: how the aperture's chrome is made.
+        compensate: whether masks are drawn with their edges moved against the line-width bias that the process is
+            known for (`Process.expected`).
+        line_splits_m: for each entry one die whose edges of etched areas are drawn so much further out, metres.
+        order_control: whether one die draws the planes in the opposite order of depths (`fab.layout.split`).
+    """
+
+    diameter_m: float = 100 * MM
+    thickness_m: float = 0.5 * MM
+    blank_m: float = 127 * MM
+    dies: tuple[int, int] | None = None
+    pitch_m: float | None = None
+    zero_layer: bool = False
+    chrome: Literal["liftoff", "etch"] = "liftoff"
+    compensate: bool = False
+    line_splits_m: tuple[float, ...] = ()
+    order_control: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: a wafer that its blanks do not hold, no die as ordered, or a length that cannot be.
+        """
+        for name in ("diameter_m", "thickness_m", "blank_m"):
+            if not 0 < getattr(self, name) < 1:
+                got = format_length(getattr(self, name))
+                raise InputError(f"wafer.{name}", "must be positive and below 1 m", got, "Mend it.")
+        if self.blank_m < self.diameter_m:
+            rule = f"must hold the wafer of {format_length(self.diameter_m)}"
+            raise InputError("wafer.blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
+        if self.dies is not None and min(self.dies) < 1:
+            raise InputError("wafer.dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
+        if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
+            got = ", ".join(format_length(move) for move in self.line_splits_m)
+            raise InputError("wafer.line_splits", "must lie from 1 nm to 100 um, out or in", got, "Mend them.")
+        if self.dies is not None:
+            self.require_room(self.dies)
+
+    def require_room(self, dies: tuple[int, int]) -> None:
+        """Check that splits leave a die as ordered.
+
+        Args:
+            dies: rows and columns.
+
+        Raises:
+            InputError: they do not.
+        """
+        rows, columns = dies
+        split = len(self.line_splits_m) + self.order_control
+        if split >= rows * columns:
+            rule = "must leave one die or more as ordered"
+            got = f"{split} of {rows * columns} dies"
+            raise InputError("wafer.line_splits", rule, got, "Take fewer splits, or more dies.")
+
+    @property
+    def usual_flat_m(self) -> float:
+        """Length of the primary flat that wafers of this diameter usually have, metres; 0 for other diameters."""
+        return next((flat * MM for size, flat in _FLATS.items() if abs(self.diameter_m / MM - size) <= 0.5), 0.0)

@@ -1,0 +1,346 @@
+"""The manifest of a mask order: what every file in the folder is, and how to prove it.
+
+Lengths stand here in the units of the order form (nm, um, mm), with the unit in the key. Nothing in it
+depends on the time or the place, so the same inputs give the same manifest.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes
+from fab.grid import Grid
+from fab.levels import Levels
+from fab.units import MM, NM, UM
+
+__all__ = [
+    "CONVENTIONS",
+    "FORMAT",
+    "CellEntry",
+    "ChromeEntry",
+    "DrawnEntry",
+    "FileEntry",
+    "LayerEntry",
+    "Manifest",
+    "MaskEntry",
+    "ModelEntry",
+    "PlateEntry",
+    "SplitEntry",
+    "WaferEntry",
+    "map_digest",
+    "plane_digest",
+    "read_manifest",
+]
+
+FORMAT = "doedesign mask order 1"
+
+CONVENTIONS = {
+    "etch layers": "polygon = etched here (digitised data clear)",
+    "chrome layer": "polygon = chrome stays here",
+    "levels": "level l of L stands as high as the depths of the masks that stay closed there sum up to (l steps where "
+    "mask k etches 2^k steps); the blank glass is level L-1",
+    "masks": "bit k of (L-1-level) set = mask k opens and etches its depth_nm; bit k is layer k+1, datatype 0",
+    "axes": "seen from the etched side, +x right, +y up, origin at the centre of the wafer; not mirrored",
+    "datatypes": "0 the DOE, 1 alignment marks, 2 test structures, 3 lettering; one mask carries them all",
+    "outlines": "layers 100 to 110 show the blank, the wafer, the clear aperture and the die; they are on no mask",
+    "level map": "uint8 [y, x], row 0 at the lowest y; its digest is the SHA-256 of these bytes row by row",
+    "plane digests": "SHA-256 of the rows packed to bytes, first pixel in the highest bit, 1 = etched",
+}
+
+
+@dataclass(frozen=True)
+class LayerEntry:
+    """What is drawn on one layer of a cell; the digest is that of `fab.manifest.cells.shapes_digest`."""
+
+    layer: str
+    polygons: int
+    area_um2: float
+    box_um: list[float]
+    sha256: str
+
+
+@dataclass(frozen=True)
+class CellEntry:
+    """One cell of a mask file: its layers, and the cells it places as [name, x_um, y_um]."""
+
+    cell: str
+    layers: list[LayerEntry]
+    places: list[list[Any]]
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """One file of the folder: its name, kind, size and SHA-256.
+
+    Of a mask file also its top cell, the layers of the DOE in it, and every cell but that of the DOE.
+    """
+
+    file: str
+    format: str
+    bytes: int
+    sha256: str
+    cell: str | None
+    layers: list[str]
+    cells: list[CellEntry]
+
+
+@dataclass(frozen=True)
+class MaskEntry:
+    """One etch mask. `box_um` is x0, y0, x1, y1; box, width and space are None where there is none.
+
+    `edge_move_nm`: how far every edge of an etched area is drawn outward, against the bias of the process; width, space
+    and digest are those of the plane before the move.
+    """
+
+    mask: int
+    bit: int
+    layer: int
+    datatype: int
+    file: str
+    cell: str
+    depth_nm: float
+    edge_move_nm: float
+    polygon_means: str
+    polygons: int
+    area_um2: float
+    box_um: list[float] | None
+    smallest_width_um: float | None
+    smallest_space_um: float | None
+    plane_sha256: str
+
+
+@dataclass(frozen=True)
+class DrawnEntry:
+    """What one layer of a split draws: a plane (`bit`) of the level map, its edges moved."""
+
+    layer: int
+    datatype: int
+    bit: int
+    edge_move_nm: float
+    polygons: int
+    area_um2: float
+    box_um: list[float] | None
+
+
+@dataclass(frozen=True)
+class SplitEntry:
+    """A die that draws the DOE differently on purpose: its cell, what is special, which die, and what it draws."""
+
+    cell: str
+    words: str
+    die: int
+    layers: list[DrawnEntry]
+
+
+@dataclass(frozen=True)
+class PlateEntry:
+    """One mask as the shop makes it, in the order of use: what polygons are on the plate, and how it is read."""
+
+    mask: str
+    makes: str
+    layer: int
+    bit: int | None
+    depth_nm: float | None
+    file: str
+    polygons: str
+    field: str
+    reading: str
+
+
+@dataclass(frozen=True)
+class WaferEntry:
+    """Where everything lies: sizes, the middles of the dies, and the places where people measure, x and y."""
+
+    diameter_mm: float
+    thickness_mm: float
+    blank_mm: float
+    die_pitch_mm: float
+    dies_mm: list[list[float]]
+    places_um: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """A solid or a height map: its content; by part its volume, how exact that is, and its centre; or its scale.
+
+    The window is row, column, rows and columns of the pixels that it shows, if not all.
+    """
+
+    file: str
+    content: str
+    volumes_mm3: dict[str, Any]
+    centres_mm: dict[str, Any]
+    relative_error: float
+    metres_per_count: float | None
+    window_px: list[int] | None
+
+
+@dataclass(frozen=True)
+class ChromeEntry:
+    """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`."""
+
+    layer: int
+    datatype: int
+    file: str
+    cell: str
+    polygon_means: str
+    opening_diameter_mm: float
+    outer_diameter_mm: float
+    overlap_um: float
+    chord_error_nm: float
+    polygons: int
+    area_um2: float
+    box_um: list[float]
+    shapes_sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A whole mask order; `source` says where the height map came from, in the words of who asked."""
+
+    format: str
+    name: str
+    source: dict[str, Any]
+    conventions: dict[str, Any]
+    levels: int
+    step_nm: float
+    shape: list[int]
+    pitch_um: float
+    aperture_mm: float
+    dbu_nm: float
+    pixel_edges: str
+    level_map_file: str
+    level_map_sha256: str
+    combined_gds: str
+    combined_oasis: str
+    preview: str
+    doe_cell: str
+    plates: list[PlateEntry]
+    wafer: WaferEntry
+    rules: dict[str, Any]
+    masks: list[MaskEntry]
+    splits: list[SplitEntry]
+    chrome: ChromeEntry
+    models: list[ModelEntry]
+    files: list[FileEntry]
+    tools: dict[str, Any]
+
+    def edge_moves(self) -> tuple[int, ...]:
+        """Return how far the edges of every mask were moved outward, in database units."""
+        return tuple(round(mask.edge_move_nm / self.dbu_nm) for mask in self.masks)
+
+    def drawn(self) -> dict[str, Sequence[MaskEntry | DrawnEntry]]:
+        """Return every cell of the DOE with what its etch layers draw."""
+        return {self.doe_cell: self.masks, **{split.cell: split.layers for split in self.splits}}
+
+    def staircase(self) -> Levels:
+        """Return the levels of the order, with the depth that stands at every mask."""
+        depths = [round(mask.depth_nm * NM, 18) for mask in sorted(self.masks, key=lambda mask: mask.bit)]
+        return Levels(self.levels, round(self.step_nm * NM, 18), tuple(depths))
+
+    def grid(self) -> Grid:
+        """Return the pixel raster of the order."""
+        return Grid((self.shape[0], self.shape[1]), round(self.pitch_um * UM, 18))
+
+    @property
+    def aperture_m(self) -> float:
+        """Diameter of the clear aperture, metres."""
+        return round(self.aperture_mm * MM, 18)
+
+    def to_json(self) -> bytes:
+        """Return the bytes of the manifest file, with the digest of everything else in it under ``sha256``."""
+        content = asdict(self)
+        return canonical_json({**content, "sha256": sha256_bytes(canonical_json(content))})
+
+
+def map_digest(level_map: NDArray[np.uint8]) -> str:
+    """Return the SHA-256 of a level map's bytes, row by row."""
+    return sha256_bytes(np.ascontiguousarray(level_map).data)
+
+
+def plane_digest(plane: NDArray[np.uint8]) -> str:
+    """Return the SHA-256 of a bit plane with its rows packed to bytes."""
+    return sha256_bytes(np.packbits(plane, axis=1).data)
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    """Return `value` as `kind`, which is a plain type, a dataclass, a list of one, or one of these or None."""
+    if isinstance(kind, UnionType):
+        if value is None and NoneType in get_args(kind):
+            return None
+        kind = next(option for option in get_args(kind) if option is not NoneType)
+    if kind is Any:
+        return value
+    if get_origin(kind) is list:
+        if isinstance(value, list):
+            return [_value(get_args(kind)[0], item, f"{where}[{i}]") for i, item in enumerate(value)]
+    elif hasattr(kind, "__dataclass_fields__"):
+        return _entry(kind, value, where)
+    elif get_origin(kind) is dict:
+        if isinstance(value, dict):
+            return value
+    elif kind is float:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    elif isinstance(value, kind) and not isinstance(value, bool):
+        return value
+    raise InputError(where, f"must be {kind}", repr(value)[:60], "Write the order again.")
+
+
+def _entry(kind: Any, data: Any, where: str) -> Any:
+    kinds = {field.name: field.type for field in fields(kind)}
+    odd = set(kinds) ^ set(data if isinstance(data, Mapping) else ())
+    if odd:
+        rule = "must hold exactly the keys of a mask order"
+        raise InputError(where, rule, f"a key missing or too many: {min(odd)!r}", "Write the order again.")
+    return kind(**{name: _value(kinds[name], data[name], f"{where}: {name}") for name in kinds})
+
+
+def read_manifest(folder: str | Path) -> Manifest:
+    """Read the manifest of a mask order and check that it is one.
+
+    Args:
+        folder: the order.
+
+    Returns:
+        The manifest; every file name in it is a plain name inside the folder.
+
+    Raises:
+        InputError: the manifest is missing, corrupt, of another format, or holds impossible values.
+    """
+    path = Path(folder) / MANIFEST_NAME
+    data = read_json(path)
+    if data.get("format") != FORMAT:
+        got = repr(data.get("format"))
+        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give a folder written by `masks`.")
+    digest = data.pop("sha256", None)
+    if digest != sha256_bytes(canonical_json(data)):
+        rule = "its content must have the digest that it states"
+        raise InputError(str(path), rule, "another one", "Fetch the manifest again, or write the order again.")
+    manifest: Manifest = _entry(Manifest, data, str(path))
+    entries = [*manifest.files, *manifest.masks, manifest.chrome, *manifest.plates, *manifest.models]
+    names = [entry.file for entry in entries]
+    names += [manifest.level_map_file, manifest.combined_gds, manifest.combined_oasis, manifest.preview]
+    for name in names:
+        if Path(name).name != name or name not in {entry.file for entry in manifest.files}:
+            raise InputError(
+                str(path), "every file must be listed by its plain name", repr(name), "Write the order again."
+            )
+    etched = sorted(mask.bit for mask in manifest.masks)
+    if len(manifest.shape) != 2 or etched != list(range(Levels(manifest.levels, 1.0).bits)):
+        got = f"shape {manifest.shape} and {len(manifest.masks)} masks"
+        raise InputError(str(path), "shape and masks must fit the levels", got, "Write the order again.")
+    bits = range(len(manifest.masks))
+    for cell, layers in manifest.drawn().items():
+        if [one.layer for one in layers] != [bit + 1 for bit in bits] or sorted(one.bit for one in layers) != [*bits]:
+            rule = "every cell of the DOE must draw every plane once, bit 0 of the plate on layer 1"
+            raise InputError(str(path), rule, cell, "Write the order again.")
+    manifest.grid()
+    manifest.staircase()
+    return manifest

@@ -1,0 +1,7 @@
+"""A mask order: from numbers to the folder that goes to the lab.
+
+order         Order: what is drawn, for whom, and what everything is called
+entries       what the manifest says of an order
+preview       the picture of a mask set
+write         the folder, its manifest, and its proof
+"""

@@ -1,0 +1,125 @@
+"""What the manifest says of an order: its masks, its chrome, its plates, its wafer and its splits."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.layout.frame import Frame
+from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer
+from fab.layout.part import Plate
+from fab.layout.polygons import smallest_runs
+from fab.layout.split import Split
+from fab.layout.wafer import READING
+from fab.levels import Levels
+from fab.manifest.cells import geometry, shapes_digest
+from fab.manifest.records import (
+    CONVENTIONS,
+    ChromeEntry,
+    DrawnEntry,
+    MaskEntry,
+    PlateEntry,
+    SplitEntry,
+    WaferEntry,
+    plane_digest,
+)
+from fab.order.order import Order
+from fab.units import MM, NM, UM, format_length
+
+__all__ = ["chrome_entry", "edges_told", "mask_entry", "plate_entry", "split_entry", "wafer_entry"]
+
+
+def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
+    """What the manifest says of an etch mask, from the drawing and from its plane before the edges moved."""
+    layer = etch_layer(bit, order.levels)
+    runs = (None if run is None else round(run * order.grid.pitch_m / UM, 6) for run in smallest_runs(plane))
+    width_um, space_um = runs
+    stem = order.mask_stem(bit)
+    return MaskEntry(
+        mask=bit + 1,
+        bit=bit,
+        layer=layer.number,
+        datatype=layer.datatype,
+        file=f"{stem}.gds",
+        cell=stem,
+        depth_nm=round(order.levels.etch_depth_m(bit) / NM, 9),
+        edge_move_nm=round(order.edge_moves()[bit] * layout.dbu_m / NM, 9),
+        polygon_means=CONVENTIONS["etch layers"],
+        smallest_width_um=width_um,
+        smallest_space_um=space_um,
+        plane_sha256=plane_digest(plane),
+        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
+    )
+
+
+def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
+    """What the manifest says of the chrome around the clear aperture."""
+    layer = chrome_layer(order.levels)
+    inner, outer = (round(radius / layout.dbu_m) for radius in order.chrome.radii_m(order.grid, order.aperture_m))
+    return ChromeEntry(
+        layer=layer.number,
+        datatype=layer.datatype,
+        file=f"{order.stem}_CHROME.gds",
+        cell=f"{order.stem}_CHROME",
+        polygon_means=CONVENTIONS["chrome layer"],
+        opening_diameter_mm=round(2 * inner * layout.dbu_m / MM, 9),
+        outer_diameter_mm=round(2 * outer * layout.dbu_m / MM, 9),
+        overlap_um=round(order.chrome.overlap_m / UM, 9),
+        chord_error_nm=round(order.chrome.chord_error_m / NM, 9),
+        shapes_sha256=shapes_digest(layout.cells[0].shapes[layer]),
+        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
+    )
+
+
+def plate_entry(order: Order, plate: Plate) -> PlateEntry:
+    """What the manifest says of a mask as the shop makes it."""
+    dark_field = plate.tone == "clear"
+    return PlateEntry(
+        mask=plate.name,
+        makes=plate.makes,
+        layer=plate.layer,
+        bit=plate.bit,
+        depth_nm=None if plate.bit is None else round(plate.depth_m / NM, 9),
+        file=f"{order.plate_stem(plate)}.gds",
+        polygons=f"digitised data {plate.tone}: polygons are {'clear' if dark_field else 'chrome'} on the plate",
+        field="dark field" if dark_field else "clear field",
+        reading=READING,
+    )
+
+
+def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
+    """What the manifest says of the wafer, and of what lies where on it."""
+    wafer = order.wafer
+    places = {name: [round(x / UM, 6), round(y / UM, 6)] for name, (x, y) in sorted(frame.places.items())}
+    return WaferEntry(
+        diameter_mm=round(wafer.diameter_m / MM, 9),
+        thickness_mm=round(wafer.thickness_m / MM, 9),
+        blank_mm=round(wafer.blank_m / MM, 9),
+        die_pitch_mm=round(frame.die_m / MM, 9),
+        dies_mm=[[round(x / MM, 9), round(y / MM, 9)] for x, y in frame.dies],
+        places_um=places,
+    )
+
+
+def split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float) -> SplitEntry:
+    """What the manifest says of a die that draws the DOE differently; `cell` is that of its DOE."""
+    layers = [
+        DrawnEntry(
+            layer=layer.number,
+            datatype=layer.datatype,
+            bit=bit,
+            edge_move_nm=round(move * dbu_m / NM, 9),
+            **geometry(cell.shapes[layer], dbu_m),  # type: ignore[arg-type]
+        )
+        for mask, (bit, move) in enumerate(zip(split.bits, split.moves, strict=True))
+        for layer in [etch_layer(mask, levels)]
+    ]
+    return SplitEntry(cell.name, split.words, die, layers)
+
+
+def edges_told(edges: PixelEdges) -> str:
+    """Say in words how pixel edges were rounded to the database unit."""
+    unit = format_length(edges.dbu_m)
+    if edges.shift_m == 0:
+        return f"every pixel edge is a whole number of {unit}"
+    return (
+        f"each pixel edge is rounded to {unit}, neighbours alike; the largest shift is {format_length(edges.shift_m)}"
+    )

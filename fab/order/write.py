@@ -1,0 +1,329 @@
+"""The folder that goes to the lab: every mask as a file, the whole as a review file, and the proof.
+
+    DOE_<ID>_ALL.gds, .oas          all layers, for review
+    DOE_<ID>_M<n>_B<k>_<depth>.gds  one file per etch mask, on its own layer k + 1
+    DOE_<ID>_CHROME.gds             the chrome around the clear aperture
+    DOE_<ID>_ZERO.gds               the chrome marks that are made first, if the wafer has any
+    DOE_<ID>_LEVELS.npy             the level map (uint8, row 0 at the lowest y)
+    DOE_<ID>_PREVIEW.png            a picture for people
+    manifest.json                   what each file is, its digest, its geometry
+    ...                             solids and height maps (`fab.solids.write`); what the caller adds
+
+The folder appears at its final path only after everything in it was read back and found equal to the
+level map.
+"""
+
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
+from fab.gds.writer import write_gds, write_oasis
+from fab.grid import Grid
+from fab.layout.doe import mask_layout
+from fab.layout.frame import Frame, draw_frame
+from fab.layout.geometry import (
+    Cell,
+    Chrome,
+    Layer,
+    Layout,
+    Shapes,
+    pixel_edges,
+)
+from fab.layout.wafer import Wafer
+from fab.levels import Levels
+from fab.manifest.cells import cell_entry
+from fab.manifest.records import (
+    CONVENTIONS,
+    FORMAT,
+    CellEntry,
+    FileEntry,
+    Manifest,
+    map_digest,
+    read_manifest,
+)
+from fab.masks import planes, unetched_outside
+from fab.order.entries import chrome_entry, edges_told, mask_entry, plate_entry, split_entry, wafer_entry
+from fab.order.order import Order
+from fab.order.preview import preview_png
+from fab.process import Process
+from fab.solids.patch import Patch
+from fab.solids.write import Relief, write_models
+from fab.units import MM, NM, UM
+from fab.verification.verify import Report, verify_order
+
+__all__ = ["Add", "mask_file", "write_order"]
+
+_TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
+
+
+Add = Callable[[Path, Order, Frame], Sequence[str]]
+
+
+class Content(NamedTuple):
+    """What the manifest says of a file besides its bytes; of a mask file also top cell, DOE layers and other cells."""
+
+    file: str
+    format: str
+    cell: str | None = None
+    layers: Sequence[Layer] = ()
+    cells: Sequence[CellEntry] = ()
+
+
+def _merged(parts: list[Shapes]) -> Shapes:
+    if len(parts) == 1:
+        return parts[0]
+    polygons = tuple(polygon for part in parts for polygon in part.polygons)
+    return Shapes(np.concatenate([part.rectangles for part in parts]), polygons)
+
+
+def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
+    """The drawing of one plate: one layer number, every datatype of it merged onto datatype 0.
+
+    Args:
+        layout: the whole drawing.
+        layer: the layer of the plate, datatype 0.
+        top: name of the top cell.
+    """
+    cells = []
+    for cell in layout.cells:
+        parts = [shapes for other, shapes in cell.shapes.items() if other.number == layer.number and len(shapes)]
+        name = top if cell is layout.top else cell.name
+        cells.append(Cell(name, {layer: _merged(parts)} if parts else {}, cell.references))
+    return Layout(layout.dbu_m, tuple(cells))
+
+
+def _write_map(path: Path, level_map: NDArray[np.uint8]) -> None:
+    try:
+        np.save(path, level_map, allow_pickle=False)
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+
+
+def _frame(order: Order, dbu_m: float) -> Frame:
+    return draw_frame(
+        order.wafer,
+        order.plates,
+        order.levels,
+        splits=order.splits,
+        stem=order.stem,
+        digest=map_digest(order.level_map),
+        pitch_m=order.grid.pitch_m,
+        minimum_line_m=order.process.minimum_line_m,
+        chrome_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[1],
+        aperture_m=order.aperture_m,
+        dbu_m=dbu_m,
+    )
+
+
+def _around(order: Order, layout: Layout) -> list[CellEntry]:
+    """What the manifest says of every cell but those of the DOE, which come first."""
+    return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[len(order.splits) :]]
+
+
+def _drawn_does(order: Order) -> Layout:
+    """Draw the DOE in all the ways that the dies ask for, the plate as ordered first."""
+    drawn = [
+        mask_layout(
+            order.level_map,
+            order.levels,
+            order.grid,
+            order.aperture_m,
+            f"{order.stem}_{split.code}",
+            order.chrome,
+            split.moves,
+            split.bits,
+        )
+        for split in order.splits
+    ]
+    return Layout(drawn[0].dbu_m, tuple(one.top for one in drawn))
+
+
+def _write_masks(
+    folder: Path,
+    order: Order,
+    layout: Layout,
+    doe_layers: list[Layer],
+    gds: str,
+    oasis: str,
+    say: Callable[[str], None],
+) -> list[Content]:
+    """Write the review files and one file per mask."""
+    say("writing GDSII")
+    write_gds(folder / gds, layout)
+    contents = [Content(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
+    for plate in order.plates:
+        name, layer = order.plate_stem(plate), Layer(plate.layer)
+        one = mask_file(layout, layer, name)
+        write_gds(folder / f"{name}.gds", one)
+        on = [layer] if layer in doe_layers else []
+        contents.append(Content(f"{name}.gds", "GDSII", name, on, _around(order, one)))
+    say("writing OASIS")
+    write_oasis(folder / oasis, folder / gds, layout.layers)
+    return [*contents, Content(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
+
+
+def _file_entry(folder: Path, content: Content) -> FileEntry:
+    path = folder / content.file
+    return FileEntry(
+        file=content.file,
+        format=content.format,
+        bytes=path.stat().st_size,
+        sha256=sha256_file(path),
+        cell=content.cell,
+        layers=[str(layer) for layer in content.layers],
+        cells=list(content.cells),
+    )
+
+
+def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
+    """Write everything but the manifest, and return it."""
+    say("drawing the masks")
+    drawn = _drawn_does(order)
+    frame = _frame(order, drawn.dbu_m)
+    splits = [
+        split_entry(split, cell, frame.splits.index(number) + 1, order.levels, drawn.dbu_m)
+        for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
+        if number
+    ]
+    layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
+    doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
+    del drawn
+    bit_planes = planes(order.level_map, order.levels)
+    masks = [mask_entry(order, layout, bit, plane) for bit, plane in enumerate(bit_planes)]
+    chrome = chrome_entry(order, layout)
+    gds, oasis, levels_file, preview = (
+        f"{order.stem}_{end}" for end in ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
+    )
+    contents = _write_masks(folder, order, layout, doe_layers, gds, oasis, say)
+    dbu_m = layout.dbu_m
+    del layout
+    say("drawing the preview")
+    _write_map(folder / levels_file, order.level_map)
+    digest = map_digest(order.level_map)
+    title = f"{order.stem}: {order.levels.told}, level map {digest[:12]}"
+    radii_m = order.chrome.radii_m(order.grid, order.aperture_m)
+    picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
+    (folder / preview).write_bytes(picture)
+    say("drawing the solids")
+    shown = Relief(
+        order.level_map,
+        order.levels,
+        order.grid,
+        order.aperture_m,
+        order.chrome,
+        order.wafer,
+        frame.die_m,
+        frame.dies,
+        order.patch,
+    )
+    # What is added takes long where it follows light; the solids are drawn meanwhile.
+    with ThreadPoolExecutor(1) as pool:
+        solids = pool.submit(write_models, folder, order.stem, shown)
+        added = add(folder, order, frame)
+        models = solids.result()
+    others = [*(model.file for model in models), *added, levels_file, preview]
+    contents += [Content(name, Path(name).suffix[1:].upper()) for name in others]
+    return Manifest(
+        format=FORMAT,
+        name=order.name,
+        source=dict(order.source),
+        conventions=CONVENTIONS,
+        levels=order.levels.count,
+        step_nm=round(order.levels.step_m / NM, 9),
+        shape=list(order.grid.shape),
+        pitch_um=round(order.grid.pitch_m / UM, 12),
+        aperture_mm=round(order.aperture_m / MM, 9),
+        dbu_nm=round(dbu_m / NM, 9),
+        pixel_edges=edges_told(pixel_edges(order.grid)),
+        level_map_file=levels_file,
+        level_map_sha256=digest,
+        combined_gds=gds,
+        combined_oasis=oasis,
+        preview=preview,
+        doe_cell=doe_cell,
+        plates=[plate_entry(order, plate) for plate in order.plates],
+        wafer=wafer_entry(order, frame),
+        rules=order.rules.as_record(),
+        masks=masks,
+        splits=splits,
+        chrome=chrome,
+        models=models,
+        files=[_file_entry(folder, content) for content in contents],
+        tools={"python": platform.python_version(), **{tool: version(tool) for tool in _TOOLS}},
+    )
+
+
+def _require_own(folder: Path) -> None:
+    """Refuse to replace anything but an earlier mask order and the files it lists."""
+    if not (folder / MANIFEST_NAME).exists():
+        return
+    listed = {MANIFEST_NAME, *(entry.file for entry in read_manifest(folder).files)}
+    extra = sorted({path.name for path in folder.iterdir()} - listed)
+    if extra:
+        rule = "a mask order that is replaced must hold its own files only"
+        raise InputError(str(folder), rule, f"also {extra[0]!r}", "Move that file, or choose another folder.")
+
+
+def write_order(
+    folder: str | Path,
+    level_map: NDArray[np.integer],
+    levels: Levels,
+    grid: Grid,
+    aperture_m: float,
+    name: str,
+    source: Mapping[str, Any],
+    *,
+    chrome: Chrome | None = None,
+    process: Process | None = None,
+    wafer: Wafer | None = None,
+    patch: Patch | None = None,
+    add: Add = lambda *_: (),
+    say: Callable[[str], None] = lambda _: None,
+) -> Report:
+    """Write a mask order and prove it; the folder appears only if the proof holds.
+
+    Args:
+        folder: the final folder; missing, empty, or an earlier order, which is replaced.
+        level_map: level numbers ``[y, x]``; outside the clear aperture the glass is left blank.
+        levels: the staircase.
+        grid: the raster of the map.
+        aperture_m: diameter of the clear aperture, metres.
+        name: the owner's name for it; file names are made from it.
+        source: where the height map came from, for the manifest; JSON values only.
+        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
+        process: order of the etches and tone of the masks; an ideal process if left out.
+        wafer: what the masks are filled with; the defaults of `Wafer` if left out.
+        patch: a window to write as a solid at full resolution, too.
+        add: writes further files into the folder and returns their names; what needs light to be written.
+        say: told the name of each step as it begins.
+
+    Returns:
+        The report of the read-back, every check passed.
+
+    Raises:
+        InputError: an argument is out of range; the folder holds anything else than an earlier order;
+            the system refuses it.
+        CheckFailed: what was read back differs; nothing is left at the final path.
+    """
+    _require_own(Path(folder))
+    blank = unetched_outside(level_map, levels, grid, aperture_m)
+    made = process or Process(levels)
+    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source, made, wafer or Wafer(), patch)
+    if patch is not None:
+        patch.require(blank, levels, grid)
+    with atomic_folder(folder) as fresh:
+        manifest = _write_files(fresh, order, add, say)
+        (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
+        say("reading everything back")
+        report = verify_order(fresh)
+        report.require()
+        say("moving the folder into place")
+    return report

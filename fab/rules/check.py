@@ -1,0 +1,341 @@
+"""The rules of lithography: what on a mask is too fine for the process, how often, and where.
+
+What is etched is a line, what is not is a space, on every mask by itself and as drawn, before any compensation. Outside
+the clear aperture nothing is etched, so the staircase of its edge is an edge like any other.
+
+* Width. The length of a run of pixels of one kind along x or along y. A space has a line at either end; the blank glass
+  around the plate is none. This is what KLayout's `width` and `space` checks measure with projection metrics.
+* Place. Neighbouring rows (or columns) with the very same narrow run are one place: the pair of facing edges that
+  KLayout reports. A speck that is too narrow both ways is two. The narrow share counts rows and columns instead, so
+  that a long line weighs more than a short one.
+* Sliver. A narrow place at least three times the minimum long: a ribbon of resist, or of opening, that bends, breaks
+  or lifts off, where a shorter one is merely lost.
+* Kissing corner. Two pixels of one kind that touch only at a corner, which a process joins or parts as it likes.
+* Density. The etched share of the clear aperture, and of the emptiest and the fullest square window inside it, because
+  etch rates follow it.
+* Off grid. A pixel edge that is no whole multiple of the address unit of the mask writer, which will round it.
+"""
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.layout.geometry import pixel_edges
+from fab.levels import Levels, require_levels
+from fab.process import Process
+from fab.rules.check import bitplanes as bits
+from fab.rules.widths import count_bounded, narrow_runs, shortest
+from fab.units import UM, format_length
+
+__all__ = ["OffGrid", "Place", "PlaneRules", "Rules", "RulesReport", "Widths", "check", "shortest_run"]
+
+Kind = Literal["line", "space", "kissing corner"]
+
+_MOST_PLACES = 20
+_MOST_PER_KIND = 5
+_SLIVER_LENGTH = 3
+_FEMTO = 10**15
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a mask may hold.
+
+    Attributes:
+        minimum_line_m: narrowest etched line, metres; 0 for any.
+        minimum_space_m: narrowest gap between etched lines, metres; 0 for any.
+        address_m: address unit of the mask writer, metres; None for the database unit of the drawing.
+        window_m: side of the square windows in which the density is compared, metres.
+    """
+
+    minimum_line_m: float = 0.0
+    minimum_space_m: float = 0.0
+    address_m: float | None = None
+    window_m: float = 100 * UM
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: a length that is negative or not finite, or an address unit or window of no size.
+        """
+        cure = "Give a length such as 1e-6."
+        for name in ("minimum_line_m", "minimum_space_m"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"rules: {name}", "must be finite and not negative", getattr(self, name), cure)
+        for name in ("address_m", "window_m"):
+            value = getattr(self, name)
+            if value is not None and not 1e-15 <= value < math.inf:
+                raise InputError(f"rules: {name}", "must be positive and finite", value, cure)
+
+    @classmethod
+    def of(cls, process: Process) -> "Rules":
+        """Return the rules of a process: the narrowest line and space that it prints."""
+        return cls(process.minimum_line_m, process.minimum_space_m)
+
+
+class Place(NamedTuple):
+    """One place where a rule is broken.
+
+    Attributes:
+        what: "line", "space" or "kissing corner".
+        y_m: its middle along y from the centre of the aperture, metres.
+        x_m: the same along x.
+        size_m: width of the line or space, metres; 0 for a corner.
+        length_m: its length, metres; 0 for a corner.
+    """
+
+    what: Kind
+    y_m: float
+    x_m: float
+    size_m: float
+    length_m: float
+
+
+@dataclass(frozen=True)
+class Widths:
+    """The lines, or the spaces, of one plane.
+
+    Attributes:
+        minimum_m: what the process prints, metres.
+        smallest_m: narrowest one, metres; None if there is none.
+        narrow: places narrower than the minimum.
+        narrow_share: share of all cross-sections along x and y that are narrower.
+        slivers: how many of the narrow places are slivers.
+    """
+
+    minimum_m: float
+    smallest_m: float | None
+    narrow: int
+    narrow_share: float
+    slivers: int
+
+
+@dataclass(frozen=True)
+class PlaneRules:
+    """What the rules say of one etch mask.
+
+    Attributes:
+        bit: the mask's bit; its number is one more.
+        line: what is etched.
+        space: the gaps in it.
+        kissing: kissing corners.
+        density: etched share of the clear aperture.
+        emptiest: etched share of the emptiest window inside the aperture.
+        fullest: the same of the fullest one.
+        places: some of the worst places, narrowest first and then longest.
+    """
+
+    bit: int
+    line: Widths
+    space: Widths
+    kissing: int
+    density: float
+    emptiest: float
+    fullest: float
+    places: tuple[Place, ...]
+
+    @property
+    def breaks(self) -> int:
+        """How many places break a rule of the process; one that prints everything is broken by nothing."""
+        fine = self.line.minimum_m == self.space.minimum_m == 0
+        return 0 if fine else self.line.narrow + self.space.narrow + self.kissing
+
+
+@dataclass(frozen=True)
+class OffGrid:
+    """Pixel edges that the mask writer will round.
+
+    Attributes:
+        address_m: its address unit, metres.
+        edges: how many of the raster's edges along x and y lie off it.
+        of: how many edges there are.
+        worst_m: the farthest that one has to move, metres.
+    """
+
+    address_m: float
+    edges: int
+    of: int
+    worst_m: float
+
+
+@dataclass(frozen=True)
+class RulesReport:
+    """What the rules say of a mask set.
+
+    Attributes:
+        rules: the rules.
+        planes: one entry per etch mask, mask 0 first.
+        off_grid: the raster against the mask writer's address grid.
+    """
+
+    rules: Rules
+    planes: tuple[PlaneRules, ...]
+    off_grid: OffGrid
+
+    @property
+    def clean(self) -> bool:
+        """Whether no mask breaks a rule of the process."""
+        return not any(plane.breaks for plane in self.planes)
+
+    @property
+    def printable(self) -> bool:
+        """Whether no line and no space is too narrow. Touching corners print, though nobody knows as what."""
+        return not any(plane.line.narrow or plane.space.narrow for plane in self.planes)
+
+    def headlines(self) -> tuple[str, ...]:
+        """Say in one sentence per mask why the process cannot print it; empty if it can."""
+        return tuple(text for plane in self.planes for text in _headline(plane))
+
+    def as_record(self) -> dict[str, Any]:
+        """Return everything as plain JSON values; lengths in metres."""
+        planes = [{"mask": plane.bit + 1, **asdict(plane)} for plane in self.planes]
+        for plane in planes:
+            plane["places"] = [place._asdict() for place in plane["places"]]
+        return {
+            "rules": asdict(self.rules),
+            "clean": self.clean,
+            "headlines": list(self.headlines()),
+            "planes": planes,
+            "off_grid": asdict(self.off_grid),
+        }
+
+
+def _headline(plane: PlaneRules) -> Iterator[str]:
+    if not plane.breaks:
+        return
+    said = []
+    for widths, what in ((plane.line, "lines"), (plane.space, "spaces")):
+        if widths.narrow and widths.smallest_m is not None:
+            share, smallest = 100 * widths.narrow_share, format_length(float(f"{widths.smallest_m:.6g}"))
+            ribbons = f", {widths.slivers} of them slivers" if widths.slivers else ""
+            said.append(
+                f"{share:.2g} % of its {what} are narrower than the {format_length(widths.minimum_m)} that the process "
+                f"prints (down to {smallest}, in {widths.narrow} places{ribbons})"
+            )
+    if plane.kissing:
+        said.append(f"{plane.kissing} pairs of pixels touch only at a corner")
+    yield f"mask {plane.bit + 1} (bit {plane.bit}): {'; '.join(said)}"
+
+
+def _metres(length_m: float) -> float:
+    """A length as the decimal number that was meant, to a femtometre."""
+    return round(length_m, 15)
+
+
+def shortest_run(minimum_m: float, pitch_m: float) -> int:
+    """Return the fewest pixels that are not narrower than a length; at least 1."""
+    # The pitch and the minimum are decimal numbers in binary: 2 um are two pixels of 1 um, and not three.
+    return max(1, math.ceil(minimum_m / pitch_m * (1 - 1e-9)))
+
+
+def _spans(grid: Grid, aperture_m: float) -> NDArray[np.int64]:
+    """First and end column of the clear aperture in every row; the same pixels as `Grid.inside_circle`."""
+    limit = (aperture_m / 2) ** 2 * (1 + 1e-12)
+    half = grid.axis_m("x")[grid.shape[1] // 2 :]
+    reach = np.searchsorted(half**2, limit - grid.axis_m("y") ** 2, side="right")
+    first = grid.shape[1] // 2 + (grid.shape[1] % 2) - reach
+    return np.stack([first, np.maximum(grid.shape[1] // 2 + reach, first)], axis=1)
+
+
+def _off_grid(grid: Grid, rules: Rules) -> OffGrid:
+    address_m = pixel_edges(grid).dbu_m if rules.address_m is None else rules.address_m
+    doubled = 2 * round(address_m * _FEMTO)
+    lines = [np.arange(-n, n + 1, 2) * round(grid.pitch_m * _FEMTO) for n in grid.shape]
+    rest = np.concatenate(lines) % doubled
+    worst = int(np.minimum(rest, doubled - rest).max())
+    return OffGrid(address_m, int(np.count_nonzero(rest)), rest.size, worst / 2 / _FEMTO)
+
+
+def _windows(words: bits.Words, grid: Grid, aperture_m: float, rules: Rules, area: int) -> tuple[float, float, float]:
+    """Return the density of the aperture and of its emptiest and fullest window."""
+    overall = bits.count(words) / area if area else 0.0
+    size = max(1, round(rules.window_m / grid.pitch_m))
+    counts = bits.windows(words, grid.shape[1], size)
+    y, x = (
+        np.maximum(abs(axis[: n * size : size]), abs(axis[size - 1 : n * size : size]))
+        for axis, n in zip((grid.axis_m("y"), grid.axis_m("x")), counts.shape, strict=True)
+    )
+    inside = counts[y[:, None] ** 2 + x**2 <= (aperture_m / 2) ** 2] / size**2
+    return (overall, float(inside.min()), float(inside.max())) if inside.size else (overall, overall, overall)
+
+
+def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture_m: float, area: int) -> PlaneRules:
+    pitch, (ny, nx) = grid.pitch_m, grid.shape
+    corner = (nx / 2, ny / 2)
+    places: list[Place] = []
+
+    def place(what: Kind, x: float, y: float, size: float, length: float) -> Place:
+        lengths = ((y - corner[1]) * pitch, (x - corner[0]) * pitch, size * pitch, length * pitch)
+        return Place(what, *map(_metres, lengths))
+
+    bounded = [count_bounded(words, axis) for axis in (0, 1)]
+    widths = []
+    kinds: tuple[tuple[Kind, float, np.uint64], ...] = (
+        ("line", rules.minimum_line_m, bits.NONE),
+        ("space", rules.minimum_space_m, bits.ALL),
+    )
+    for index, (what, minimum_m, outside) in enumerate(kinds):
+        plane = words if what == "line" else ~words
+        fewest = shortest_run(minimum_m, pitch)
+        sliver = shortest_run(_SLIVER_LENGTH * minimum_m, pitch)
+        found = x_found, y_found = [narrow_runs(plane, axis, outside, fewest, sliver) for axis in (1, 0)]
+        places += [place(what, x + w / 2, y + n / 2, w, n) for y, x, w, n in x_found.places]
+        places += [place(what, x + n / 2, y + w / 2, w, n) for y, x, w, n in y_found.places]
+        runs = sum(pair[index] for pair in bounded)
+        smallest = min((f.smallest for f in found if f.smallest is not None), default=None)
+        if smallest is None and runs:
+            smallest = shortest(plane, outside, fewest)
+        widths.append(
+            Widths(
+                minimum_m,
+                None if smallest is None else _metres(smallest * pitch),
+                sum(f.narrow for f in found),
+                sum(f.runs for f in found) / max(runs, 1),
+                sum(f.slivers for f in found),
+            )
+        )
+    kissing = np.empty_like(words)
+    kisses = bits.corners(words, kissing)
+    if kisses and (rules.minimum_line_m or rules.minimum_space_m):
+        listed = bits.longest_runs(kissing, kissing, 1, _MOST_PER_KIND, _MOST_PER_KIND).tolist()
+        places += [place("kissing corner", x + 1, y + 1, 0, 0) for y, x, _ in listed]
+    places.sort(key=lambda p: (p.size_m, -p.length_m, p.y_m, p.x_m))
+    line, space = widths
+    density = _windows(words, grid, aperture_m, rules, area)
+    return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
+
+
+def check(level_map: NDArray[np.integer], levels: Levels, grid: Grid, aperture_m: float, rules: Rules) -> RulesReport:
+    """Check every etch mask of a level map.
+
+    Args:
+        level_map: level numbers ``[y, x]``; outside the clear aperture nothing is etched, whatever they are.
+        levels: the staircase.
+        grid: the raster of the map.
+        aperture_m: diameter of the clear aperture, metres.
+        rules: what the masks may hold.
+
+    Returns:
+        The numbers of every mask, its worst places, and the raster against the address grid.
+
+    Raises:
+        InputError: the array is not a level map of this staircase, or not of the grid's shape.
+    """
+    checked = require_levels(level_map, levels)
+    if checked.shape != grid.shape:
+        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
+    spans = _spans(grid, aperture_m)
+    area = int(np.sum(np.clip(spans[:, 1], 0, grid.shape[1]) - np.clip(spans[:, 0], 0, None)))
+    words = bits.pack(checked, levels.bits, np.clip(spans, 0, grid.shape[1]))
+    with ThreadPoolExecutor() as pool:
+        tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
+        planes = tuple(task.result() for task in tasks)
+    return RulesReport(rules, planes, _off_grid(grid, rules))

@@ -1,0 +1,246 @@
+"""Repair of a level map whose masks are too fine: new levels for the pixels that break a rule, few and near.
+
+A mask must not be mended by itself, since a pixel that is moved in one bit plane jumps by the depth of that etch. Here
+levels change, and a level is judged by all its bits at once.
+
+A move sets a small rectangle of pixels to the level of one of its neighbours. Moves are weighed by what they do to the
+rules (the pixels by which runs are too short, and the kissing corners, of every mask) and to the light (1 - cos of the
+phase error against the map that was asked for). Sweeps over the offending pixels take the best move of each, while the
+weight of a broken rule rises: cheap repairs come first and dear ones only where they are needed.
+
+What is left is frozen: the plate is divided into squares as wide as the rules demand, and every square in which
+something is broken becomes one level. Squares that reach beyond the clear aperture become blank glass. Frozen squares
+stay frozen, and a plate of nothing but squares has no narrow line or space, so this ends; squares that touch only at
+a corner get another level. Last, pixels go back to the level that was asked for, or nearer to it, where they may.
+"""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.levels import Levels
+from fab.masks import unetched_outside
+from fab.rules.check import Rules, check, shortest_run
+from fab.rules.repair_moves import Task, broken, loss, offends, sweep
+
+__all__ = ["Cost", "repaired"]
+
+# How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
+_WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+# So much that no gain of light is worth a broken rule.
+_HARD = 1e6
+_GRAVITY = 1000
+# How often corners that touch in spite of it all are frozen anew.
+_ATTEMPTS = 4
+_WIDEST = 32
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a repair changed and what it costs, over the clear aperture.
+
+    Attributes:
+        changed_share: share of the pixels that got another level.
+        rms_height_m: rms of the change of height, metres.
+        efficiency: |mean exp(2 pi i dh rate)|^2: the share of the light that still goes where it was meant to.
+        broken_before: places that broke a rule, over all masks.
+        broken_after: places that still do.
+    """
+
+    changed_share: float
+    rms_height_m: float
+    efficiency: float
+    broken_before: int
+    broken_after: int
+
+
+@njit(cache=True, nogil=True)
+def _mark(task, side, origin, frozen, active):  # pragma: no cover - compiled
+    # Mark the loose squares that hold an offending pixel (1); return how many there are. Only active ones are seen.
+    fresh = 0
+    for j in range(frozen.shape[0]):
+        for i in range(frozen.shape[1]):
+            if not active[j, i] or frozen[j, i]:
+                continue
+            active[j, i] = False
+            y0, x0 = origin + j * side, origin + i * side
+            for y in range(y0, y0 + side):
+                for x in range(x0, x0 + side):
+                    if not frozen[j, i] and offends(task, y, x):
+                        frozen[j, i] = 1
+                        fresh += 1
+    return fresh
+
+
+@njit(cache=True, nogil=True)
+def _wake(active, j, i):  # pragma: no cover - compiled
+    active[max(j - 2, 0) : j + 3, max(i - 2, 0) : i + 3] = True
+
+
+@njit(cache=True, nogil=True)
+def _freeze(task, side, origin, frozen, active):  # pragma: no cover - compiled
+    # Give every marked square the depth that costs least (2), or none where it is not wholly free (3).
+    etched = task.etched
+    for j in range(frozen.shape[0]):
+        for i in range(frozen.shape[1]):
+            if frozen[j, i] != 1:
+                continue
+            _wake(active, j, i)
+            y0, x0 = origin + j * side, origin + i * side
+            y1, x1 = y0 + side, x0 + side
+            whole = np.all(task.free[y0:y1, x0:x1])
+            frozen[j, i] = 2 if whole else 3
+            best, chosen = np.inf, 0
+            for depth in range(task.error.shape[0] if whole else 0):
+                etched[y0:y1, x0:x1] = depth
+                cost = loss(task, y0, x0, y1, x1)
+                if cost < best:
+                    cost += broken(task, y0, x0, y1, x1)
+                if cost < best:
+                    best, chosen = cost, depth
+            etched[y0:y1, x0:x1] = chosen
+
+
+@njit(cache=True, nogil=True)
+def _part(task, side, origin, frozen, active):  # pragma: no cover - compiled
+    # Frozen squares can only still touch at corners: give them another depth where that mends more than it breaks.
+    # Every move leaves less broken, so this ends.
+    moved = 0
+    for j in range(frozen.shape[0]):
+        for i in range(frozen.shape[1]):
+            y0, x0 = origin + j * side, origin + i * side
+            y1, x1 = y0 + side, x0 + side
+            before = broken(task, y0, x0, y1, x1) if frozen[j, i] == 2 else 0
+            if not before:
+                continue
+            own = task.etched[y0, x0]
+            best, chosen = _HARD * (before - 0.5), np.int64(own)
+            for depth in range(task.error.shape[0]):
+                task.etched[y0:y1, x0:x1] = depth
+                cost = _HARD * broken(task, y0, x0, y1, x1) + loss(task, y0, x0, y1, x1)
+                if cost < best:
+                    best, chosen = cost, depth
+            task.etched[y0:y1, x0:x1] = chosen
+            if chosen != own:
+                _wake(active, j, i)
+                moved += 1
+    return moved
+
+
+def _sweep_all(task: Task, weight: float, changed_too: bool) -> int:
+    """Sweep over stripes, first even and then odd ones: however many run at once, the result is the same."""
+    end = task.etched.shape[0] - task.pad
+    # A move at the edge of a stripe reads two narrowest widths of the next one and writes less than one.
+    height = 16 * max(task.line, task.space) + 32
+    stripes = [(y, min(y + height, end)) for y in range(task.pad, end, height)]
+    if len(stripes) > 1 and stripes[-1][1] - stripes[-1][0] < height:
+        # No stripe may be so low that those beside it meet.
+        stripes[-2:] = [(stripes[-2][0], end)]
+    moved = 0
+    with ThreadPoolExecutor() as pool:
+        for half in (stripes[::2], stripes[1::2]):
+            moved += sum(pool.map(lambda rows: sweep(task, rows[0], rows[1], weight, changed_too), half))
+    return moved
+
+
+def _freeze_all(task: Task, shift: int) -> bool:
+    """Freeze squares, all shifted alike, until no line or space is too narrow; tell whether anything was broken."""
+    side = max(task.line, task.space)
+    origin = task.pad - shift % side
+    frozen = np.zeros([-(-(n - task.pad - origin) // side) for n in task.etched.shape], dtype=np.uint8)
+    active = np.ones(frozen.shape, dtype=np.bool_)
+    while True:
+        fresh = _mark(task, side, origin, frozen, active)
+        _freeze(task, side, origin, frozen, active)
+        if not fresh and not _part(task, side, origin, frozen, active):
+            return bool(frozen.any())
+
+
+def _mend(task: Task) -> None:
+    """Repair in place."""
+    for weight in _WEIGHTS:
+        _sweep_all(task, weight, changed_too=False)
+    # From here on no width is given up for a corner, so that what is frozen stays sound.
+    task = task._replace(gravity=_GRAVITY)
+    for attempt in range(_ATTEMPTS):
+        if not _freeze_all(task, attempt) and attempt:
+            break
+        if not attempt:
+            _sweep_all(task, _HARD, changed_too=True)
+        # Every move lowers the energy, so this ends.
+        while _sweep_all(task, _HARD, changed_too=False):
+            pass
+
+
+def _phases(levels: Levels, waves_per_m: float) -> NDArray[np.float64]:
+    """Return by how many radians the light of every level ``[a]`` is ahead of that of every other ``[b]``."""
+    if levels.is_binary:
+        number = np.arange(levels.count)
+        return 2 * math.pi * waves_per_m * levels.step_m * np.subtract.outer(number, number)
+    return 2 * math.pi * waves_per_m * np.subtract.outer(levels.heights_m(), levels.heights_m())
+
+
+def repaired(
+    level_map: NDArray[np.integer],
+    levels: Levels,
+    grid: Grid,
+    aperture_m: float,
+    rules: Rules,
+    waves_per_m: float,
+) -> tuple[NDArray[np.uint8], Cost]:
+    """Change as few levels as can be, as little as can be, until no mask breaks a rule.
+
+    Args:
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        aperture_m: diameter of the clear aperture, metres; nothing changes outside, where the glass stays blank.
+        rules: narrowest line and space. With neither there is nothing to repair.
+        waves_per_m: waves of light per metre of height, (n - 1) / wavelength; says which levels are near each other.
+
+    Returns:
+        The repaired map, blank outside the clear aperture, and what it costs. `Cost.broken_after` says honestly what
+        could not be repaired: corners that touch, at worst; no narrow line and no narrow space.
+
+    Raises:
+        InputError: not a level map of this staircase and grid, a rate that is not positive, or a minimum of more than
+            32 pixels.
+    """
+    if not 0 < waves_per_m < math.inf:
+        raise InputError("waves per metre", "must be positive and finite", waves_per_m, "Give (n - 1) / wavelength.")
+    line, space = (shortest_run(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
+    if max(line, space) > _WIDEST:
+        rule = f"the narrowest line and space must not exceed {_WIDEST} pixels"
+        raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")
+    wanted = unetched_outside(level_map, levels, grid, aperture_m)
+    before = check(wanted, levels, grid, aperture_m, rules)
+    free = grid.inside_circle(aperture_m)
+    mended = wanted
+    if not before.clean:
+        # Moves and the runs beside them reach no farther than this.
+        pad = 2 * max(line, space) + 2
+        top = levels.count - 1
+        # By what is etched, the top level first.
+        error = 1 - np.cos(_phases(levels, waves_per_m)[::-1, ::-1])
+        target = np.pad(np.uint8(top) - wanted, pad)
+        task = Task(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
+        _mend(task)
+        mended = np.uint8(top) - task.etched[pad:-pad, pad:-pad]
+    # How often which level took the place of which.
+    pairs = np.bincount(mended[free].astype(np.int64) * levels.count + wanted[free], minlength=levels.count**2)
+    shares = pairs.reshape(levels.count, levels.count) / max(pairs.sum(), 1)
+    rises_m = np.subtract.outer(levels.heights_m(), levels.heights_m())
+    after = before if before.clean else check(mended, levels, grid, aperture_m, rules)
+    return mended, Cost(
+        changed_share=1.0 - float(np.trace(shares)) if pairs.any() else 0.0,
+        rms_height_m=math.sqrt(float(np.sum(shares * rises_m**2))),
+        efficiency=float(abs(np.sum(shares * np.exp(1j * _phases(levels, waves_per_m)))) ** 2) if pairs.any() else 1.0,
+        broken_before=sum(plane.breaks for plane in before.planes),
+        broken_after=sum(plane.breaks for plane in after.planes),
+    )

@@ -1,0 +1,257 @@
+"""What an operator does with each plate, step by step, and the arithmetic of a run sheet.
+
+The recipes are ordinary ones for fused silica: positive resist, reactive ions through it, chrome by lift-off or wet
+etch. Doses, bakes and times belong to the lab and are left blank; what follows from the order is filled in.
+
+Depth first. Every etch has its own target, and the target of one is not changed by what another one did. If a staircase
+uses all its levels equally, the light that goes where it should is a product with one factor per mask, cos^2(phi / 2)
+for a phase error phi of that mask's depth; no other factor can make up for it. The choice that keeps the full depth
+right (`next_target_m`) puts its own mask wrong by as much, and so loses the factor twice.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+from fab.layout.part import Plate
+from fab.levels import Levels
+from fab.process import Process, Spread
+from fab.units import NM, UM, format_length
+
+__all__ = [
+    "RATES_M_PER_S",
+    "Action",
+    "Step",
+    "depths_m",
+    "etch_time_s",
+    "next_target_m",
+    "resist_thickness_m",
+    "spread_of",
+    "steps_of",
+    "tone_words",
+]
+
+Deposition = Literal["evaporated", "sputtered"]
+
+# What plasmas of different power and gas do to silica; 20 nm/min is usual for plain reactive ion etching.
+RATES_M_PER_S = tuple(rate * NM / 60 for rate in (10, 20, 30))
+_TWO_SIGMA = 2.0
+# Glass etched per resist lost. Usual recipes do better than 3; twice what is lost at 3 leaves a margin.
+_SELECTIVITY, _THINNEST_M = 3.0, 1 * UM
+_LIFTOFF_FOLD: Mapping[str, int] = {"evaporated": 5, "sputtered": 10}
+
+
+class Action(NamedTuple):
+    """One thing to do.
+
+    Attributes:
+        task: what it is called, "Bake".
+        how: how it is done, whole sentences.
+        fill: what is written down, each with its unit.
+    """
+
+    task: str
+    how: str
+    fill: tuple[str, ...] = ()
+
+
+class Step(NamedTuple):
+    """What is done with one plate.
+
+    Attributes:
+        plate: the plate.
+        before: actions up to the developed resist, in order.
+        after: actions from there to the sign-off.
+        deepest_m: depth of the deepest floor once this step is done, metres.
+    """
+
+    plate: Plate
+    before: tuple[Action, ...]
+    after: tuple[Action, ...]
+    deepest_m: float
+
+
+def depths_m(levels: Levels) -> tuple[float, ...]:
+    """Return the depths below the blank glass that all etches make together, blank glass first, metres."""
+    depths = (
+        sum(levels.etch_depth_m(bit) for bit in range(levels.bits) if code >> bit & 1) for code in range(levels.count)
+    )
+    return tuple(sorted(depths))
+
+
+def etch_time_s(depth_m: float, rate_m_per_s: float) -> float:
+    """Return how long a depth takes, seconds: depth / rate."""
+    return depth_m / rate_m_per_s
+
+
+def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
+    """Return the next etch's target that keeps the sum of all depths right.
+
+    Args:
+        target_m: what this etch should have been, metres.
+        measured_m: what it is.
+        next_m: nominal depth of an etch that is still to come.
+
+    Returns:
+        ``next_m - (measured_m - target_m)``: areas that both masks etch come out right, areas that neither etches
+        stay right, and areas of the next mask alone become wrong by as much as those of this one are.
+    """
+    return next_m - (measured_m - target_m)
+
+
+def resist_thickness_m(plate: Plate, chrome_m: float, deposition: Deposition) -> float:
+    """Return the least thickness of the resist, metres.
+
+    Args:
+        plate: the plate.
+        chrome_m: thickness of the chrome, metres.
+        deposition: how the chrome is laid down.
+
+    Returns:
+        For lift-off five times the metal if it is evaporated and ten times if it is sputtered, because sputtered
+        metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
+    """
+    if plate.makes == "etch":
+        return max(_THINNEST_M, 2 * plate.depth_m / _SELECTIVITY)
+    return _LIFTOFF_FOLD[deposition] * chrome_m if lifts_off(plate) else _THINNEST_M
+
+
+def lifts_off(plate: Plate) -> bool:
+    """Return whether the chrome of a plate is lifted off: clear polygons leave holes in a positive resist."""
+    return plate.makes == "liftoff" or (plate.makes == "zero layer" and plate.tone == "clear")
+
+
+def spread_of(process: Process, bit: int, common: str, own: str) -> Spread:
+    """Return mean and standard deviation of an error of one mask, its common part included.
+
+    Args:
+        process: the process.
+        bit: the mask.
+        common: name of the part that all masks share; "" if there is none.
+        own: name of the part of each mask, as in `fab.process.ERRORS`.
+    """
+    parts = [process.spreads.get(name, Spread()) for name in (common, f"{own}[{bit}]")]
+    return Spread(sum(part.mean for part in parts), math.hypot(*(part.sigma for part in parts)))
+
+
+def tone_words(plate: Plate) -> str:
+    """Say what the polygons of a plate are on the glass."""
+    if plate.tone == "clear":
+        return "polygons are CLEAR: chrome all over, light passes in the polygons (dark-field plate)"
+    return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
+
+
+def _printing(plate: Plate, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
+    """List the actions from the resist to the developed pattern, the same for every plate."""
+    return (
+        Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
+        Action(
+            "Resist",
+            f"Spin POSITIVE resist, {format_length(float(f'{thickness_m:.3g}'))} or thicker. {why}",
+            ("thickness (um)", "resist, batch"),
+        ),
+        Action(
+            "Bake",
+            "Soft bake by the resist's data sheet. Glass warms slowly: give a hot plate more time than for silicon.",
+            ("temperature (C)", "time (s)"),
+        ),
+        Action(
+            "Load the mask",
+            f"{plate.name.capitalize()}, file {file}. The chrome of the plate faces the resist. On the plate: "
+            f"{tone_words(plate)}.",
+            ("plate number",),
+        ),
+        Action("Align", align),
+        Action("Expose", "Vacuum contact. Take the dose from a test exposure.", ("dose (mJ/cm2)",)),
+        Action("Develop", "By the resist's data sheet. Rinse and dry.", ("developer, time (s)",)),
+    )
+
+
+def _clean(first: bool) -> Action:
+    how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
+    if first:
+        how = f"Check thickness, flat and both polished faces, and mark the side to be etched. {how}"
+    return Action("Clean", how, ("wafer number",) if first else ())
+
+
+def _etch_actions(plate: Plate, process: Process) -> tuple[Action, ...]:
+    depth_m, bit = plate.depth_m, plate.bit or 0
+    sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
+    usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
+    return (
+        Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
+        Action(
+            "Etch",
+            f"Reactive ions (CHF3 or alike) into the glass, TARGET {plate.depth}{usual}. Find the rate on a test piece "
+            f"of the same glass, the same chamber and the same day. Time = target / rate.",
+            ("rate (nm/min)", "time (min:s)", "recipe"),
+        ),
+        Action(
+            "Short?",
+            "If a step can be measured with the resist still on and the etch is too shallow: etch the rest, extra time "
+            "= missing depth / rate. An etch that is too deep stays so.",
+            ("extra time (s)",),
+        ),
+        Action("Strip", "Remover, then oxygen plasma. No resist may stay at the edges of the openings."),
+    )
+
+
+def _chrome_actions(plate: Plate, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
+    thickness = format_length(chrome_m)
+    if lifts_off(plate):
+        return (
+            Action("Descum", "Oxygen plasma, short. Metal holds on clean glass only.", ("time (s)",)),
+            Action("Deposit", f"Chrome, {thickness}, {deposition}. Keep the wafer cool.", ("thickness (nm)",)),
+            Action("Lift off", "Remover, warm, then ultrasound. Rinse while wet: flakes that dry stay.", ()),
+        )
+    return (
+        Action("Etch the chrome", "Wet (ceric ammonium nitrate), until the glass is clear.", ("time (s)",)),
+        Action("Strip", "Remover, then oxygen plasma."),
+    )
+
+
+def _resist_reason(plate: Plate, chrome_m: float, deposition: Deposition) -> str:
+    if plate.makes == "etch":
+        used = format_length(float(f"{plate.depth_m / _SELECTIVITY:.3g}"))
+        return f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
+    if lifts_off(plate):
+        fold, thickness = _LIFTOFF_FOLD[deposition], format_length(chrome_m)
+        return f"For lift-off of {deposition} chrome: at least {fold} times its {thickness}, with overhanging edges."
+    return "It only has to hold in the chrome etch."
+
+
+def steps_of(
+    plates: Sequence[Plate],
+    process: Process,
+    files: Mapping[str, str],
+    notes: Sequence[str],
+    chrome_m: float,
+    deposition: Deposition,
+) -> tuple[Step, ...]:
+    """List what is done with every plate.
+
+    Args:
+        plates: all plates in the order in which they are used (`fab.layout.part.plates_of`).
+        process: how far depths stray.
+        files: the mask file of every plate, by the plate's name.
+        notes: how each plate is aligned (`fab.layout.marks.alignment_notes`), in the order of the plates.
+        chrome_m: thickness of the chrome, metres.
+        deposition: how it is laid down.
+
+    Returns:
+        A step per plate.
+    """
+    steps, deepest_m = [], 0.0
+    for number, (plate, note) in enumerate(zip(plates, notes, strict=True)):
+        deepest_m += plate.depth_m
+        align = note if number else f"To the flat of the wafer, by eye, middle on middle. {note}"
+        thickness_m = resist_thickness_m(plate, chrome_m, deposition)
+        why = _resist_reason(plate, chrome_m, deposition)
+        before = [_clean(number == 0)]
+        if plate.makes != "etch" and not lifts_off(plate):
+            how = f"Chrome all over, {format_length(chrome_m)}, {deposition}."
+            before.append(Action("Deposit", how, ("thickness (nm)",)))
+        before += _printing(plate, files[plate.name], align, thickness_m, why)
+        after = _etch_actions(plate, process) if plate.makes == "etch" else _chrome_actions(plate, chrome_m, deposition)
+        steps.append(Step(plate, tuple(before), after, deepest_m))
+    return tuple(steps)

@@ -1,0 +1,151 @@
+"""What stands on a run sheet, in SI units: the order, the wafer, the process, and what the lab should see.
+
+`fab` knows no light: what the finished plate should show comes as plain numbers (`Outlook`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+from fab.errors import InputError
+from fab.layout.part import Plate
+from fab.layout.wafer import Wafer
+from fab.levels import Levels
+from fab.process import Process
+from fab.units import NM
+
+__all__ = ["Die", "Grating", "Matter", "Outlook", "PlateFile", "RunSheet", "Seen"]
+
+
+class PlateFile(NamedTuple):
+    """The file of one plate.
+
+    Attributes:
+        file: its name.
+        sha256: its digest.
+        cell: its top cell.
+        edge_move_m: how far every edge of the DOE was moved outward on the mask to make up for what the process does;
+            test structures and marks are drawn without it.
+    """
+
+    file: str
+    sha256: str
+    cell: str
+    edge_move_m: float = 0.0
+
+
+class Die(NamedTuple):
+    """One die on the wafer: its name, its middle from the wafer's middle in metres, and what is special about it."""
+
+    name: str
+    x_m: float
+    y_m: float
+    note: str = ""
+
+
+class Seen(NamedTuple):
+    """What one colour of a point at one depth (None for infinity) does; shares of the light are 0 to 1."""
+
+    colour: str
+    depth_m: float | None
+    strehl: float
+    zeroth_order: float
+    throughput: float
+    ring_to_disc: float | None = None
+    far_spot: float | None = None
+
+
+class Grating(NamedTuple):
+    """Share of the light that the test gratings send straight on if all depths are off by a share."""
+
+    depth_error: float
+    binary: float
+    blazed: float
+
+
+class Matter(NamedTuple):
+    """Which share of the plates' variance in Strehl ratio and in 0th order a measured number explains."""
+
+    measured: str
+    strehl: float
+    zeroth_order: float
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What the lab should see.
+
+    Attributes:
+        drawn: the plate exactly as drawn.
+        expected: the plate with every error of the process at its mean.
+        design_m: design wavelength.
+        full_wave_m: wavelength at which the full height of the levels is one wave; None if there is none.
+        probe_m: wavelength of the laser that the lab tests with.
+        probe_waves: the full height in waves at the probe.
+        gratings: what the test gratings show at the probe, against an empty window; a depth error of 0 among them.
+        matters: measured numbers, the most important first; empty if the process has no errors.
+    """
+
+    drawn: tuple[Seen, ...]
+    expected: tuple[Seen, ...]
+    design_m: float
+    full_wave_m: float | None
+    probe_m: float
+    probe_waves: float
+    gratings: tuple[Grating, ...]
+    matters: tuple[Matter, ...] = ()
+
+
+@dataclass(frozen=True)
+class RunSheet:
+    """Everything that stands on the sheet.
+
+    Attributes:
+        stem: what all files of the order begin with.
+        level_map_sha256: digest of the level map; tells one design from another.
+        levels: the staircase.
+        plates: all plates in the order in which they are used (`fab.layout.part.plates_of`).
+        files: the file of every plate, by the plate's name.
+        process: what the lab does and how far it strays.
+        aperture_m: diameter of the relief.
+        opening_m: diameter of the opening in the chrome.
+        wafer: the substrate, and the blanks of the masks.
+        places: named points to measure at, from the middle of the wafer in metres, named as in `fab.layout.marks` and
+            `fab.layout.structures` with the place before them ("left site: vernier x, mask 3"). Line widths and depths
+            are measured at the first place of each name, overlay at all of them.
+        dies: the dies.
+        material: what the substrate is made of.
+        chrome_m: thickness of the chrome.
+        deposition: how the chrome is laid down.
+        outlook: what the lab should see; None if nothing is known about the light.
+    """
+
+    stem: str
+    level_map_sha256: str
+    levels: Levels
+    plates: tuple[Plate, ...]
+    files: Mapping[str, PlateFile]
+    process: Process
+    aperture_m: float
+    opening_m: float
+    wafer: Wafer
+    places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    dies: tuple[Die, ...] = ()
+    material: str = "fused silica"
+    chrome_m: float = 100 * NM
+    deposition: Literal["evaporated", "sputtered"] = "evaporated"
+    outlook: Outlook | None = None
+
+    def __post_init__(self) -> None:
+        """Check that every plate has its file, and every etch its plate.
+
+        Raises:
+            InputError: a plate without a file, or etches that are not those of the process, in its order.
+        """
+        if missing := [plate.name for plate in self.plates if plate.name not in self.files]:
+            cure = "Give the file of every plate."
+            raise InputError("run sheet", "every plate must have a file", f"none for {missing[0]}", cure)
+        bits = tuple(plate.bit for plate in self.plates if plate.bit is not None)
+        if bits != self.process.order:
+            rule = f"the etches must come in the order of the process, {self.process.order}"
+            raise InputError("run sheet", rule, bits, "List the plates by the order of the process.")

@@ -1,0 +1,338 @@
+"""The run sheet: what the cleanroom does to one wafer, with blanks for what it measures.
+
+The same sheet comes as a page to print and write on, and as JSON. What was written on paper goes into the JSON under
+"measured", and `fab.runsheet.as_built` reads it back; null stands for what was not measured.
+"""
+
+import base64
+from collections.abc import Iterator, Mapping
+from math import degrees
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fab.files import canonical_json, write_atomic
+from fab.layout.marks import VERNIER_STEP_M, alignment_notes
+from fab.layout.part import Plate
+from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
+from fab.layout.wafer import READING
+from fab.process import Spread
+from fab.runsheet.recipe import (
+    RATES_M_PER_S,
+    Action,
+    Step,
+    depths_m,
+    etch_time_s,
+    next_target_m,
+    spread_of,
+    steps_of,
+    tone_words,
+)
+from fab.runsheet.tables import Outlook, RunSheet
+from fab.units import MM, NM, UM, format_length
+
+__all__ = ["BARS", "FORMAT", "PADS", "html_page", "record", "write_run_sheet"]
+
+FORMAT = "doedesign run sheet 1"
+
+# The blanks of every mask: CD bars and depth pads by name, with their drawn width in metres.
+BARS: Mapping[str, float] = {f"{w:g} um {kind}": w * UM for w in BAR_WIDTHS_UM for kind in ("line", "gap")}
+PADS: Mapping[str, float] = {f"{side:g} um": side * UM for side in PAD_SIDES_UM}
+
+_TWO_SIGMA = 2.0
+_MISSES_NM = (-10.0, -5.0, 5.0, 10.0)
+
+
+def _nm(length_m: float) -> float:
+    return round(length_m / NM, 6)
+
+
+def _um(length_m: float) -> float:
+    return round(length_m / UM, 6)
+
+
+def _mm(place_m: tuple[float, float]) -> dict[str, float]:
+    return {"x_mm": round(place_m[0] / MM, 6), "y_mm": round(place_m[1] / MM, 6)}
+
+
+def _named(sheet: RunSheet, what: str, plate: Plate) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the places of a plate whose own name begins with `what`: where ("" if not said), and coordinates."""
+    ending = f", {plate.name}"
+    for name, place in sheet.places.items():
+        where, _, own = name.rpartition(": ")
+        if own.startswith(what) and own.endswith(ending):
+            yield where, _mm(place)
+
+
+def _first_place(sheet: RunSheet, what: str, plate: Plate) -> dict[str, Any]:
+    where, place = next(_named(sheet, f"{what}, ", plate), ("", {"x_mm": None, "y_mm": None}))
+    return {"where": where, **place}
+
+
+def _width_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+    """List the CD bars of a plate: drawn width, the width at which the DOE comes out as designed, and tolerance."""
+    move_m = sheet.files[plate.name].edge_move_m
+    sigma = Spread().sigma
+    if plate.bit is not None:
+        sigma = spread_of(sheet.process, plate.bit, "common_cd_bias_m", "cd_bias_m").sigma
+    rows = []
+    for name, drawn_m in BARS.items():
+        outward = 1 if name.endswith("line") else -1
+        smallest = sheet.process.minimum_line_m if outward > 0 else sheet.process.minimum_space_m
+        rows.append(
+            {
+                "bar": name,
+                "drawn_um": _um(drawn_m),
+                "target_um": _um(drawn_m - 2 * outward * move_m),
+                # Both edges of a bar move.
+                "tolerance_um": round(2 * _TWO_SIGMA * sigma / UM, 3) or None,
+                "below_process": bool(drawn_m < smallest * (1 - 1e-9)),
+                **_first_place(sheet, f"CD {name}", plate),
+            }
+        )
+    return rows
+
+
+def _depth_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+    lag = sheet.process.spreads.get("etch_lag", Spread()).mean
+    return [
+        {
+            "pad": name,
+            "target_nm": _nm(plate.depth_m),
+            # A pad loses the share lag x depth / width of its depth.
+            "expected_nm": round(plate.depth_m * (1 - lag * plate.depth_m / side_m) / NM, 2),
+            **_first_place(sheet, f"depth pad {name}", plate),
+        }
+        for name, side_m in PADS.items()
+    ]
+
+
+def _overlay_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+    return [
+        {"axis": axis, "where": where, **place}
+        for axis in ("x", "y")
+        for where, place in _named(sheet, f"vernier {axis}, ", plate)
+    ]
+
+
+def _marks(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+    kinds = ("finder", *("box " + gap for gap in ("25 um", "10 um", "5 um", "3 um", "2 um")))
+    return [
+        {"mark": kind, "where": where, **place} for kind in kinds for where, place in _named(sheet, f"{kind}, ", plate)
+    ]
+
+
+def _etch_record(sheet: RunSheet, step: Step, later: tuple[Plate, ...]) -> dict[str, Any]:
+    """Describe the depth of one etch: times, pads, and what to do if it is off."""
+    plate, following = step.plate, later[0] if later else None
+    corrections = []
+    if following:
+        corrections = [
+            {
+                "off_by_nm": miss,
+                "next_target_nm": _nm(next_target_m(plate.depth_m, plate.depth_m + miss * NM, following.depth_m)),
+            }
+            for miss in _MISSES_NM
+        ]
+    return {
+        "target_nm": _nm(plate.depth_m),
+        "deepest_floor_nm": _nm(step.deepest_m),
+        "time_formula": "time = target / rate",
+        "times": [
+            {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(etch_time_s(plate.depth_m, rate))}
+            for rate in RATES_M_PER_S
+        ],
+        "pads": _depth_rows(sheet, plate),
+        "next": following.name if following else None,
+        "corrections": corrections,
+    }
+
+
+def _actions(actions: tuple[Action, ...]) -> list[dict[str, Any]]:
+    return [{"task": one.task, "how": one.how, "fill": list(one.fill)} for one in actions]
+
+
+def _step_record(sheet: RunSheet, number: int, step: Step) -> dict[str, Any]:
+    plate, first = step.plate, sheet.plates[0]
+    later = tuple(other for other in sheet.plates[number:] if other.bit is not None)
+    titles = {"etch": f"etch {plate.depth}", "zero layer": "chrome marks", "liftoff": "the aperture, by lift-off"}
+    structures = plate.makes != "zero layer"
+    overlay = spread_of(sheet.process, plate.bit, "", "overlay_x_m") if plate.bit is not None else Spread()
+    return {
+        "number": number,
+        "plate": plate.name,
+        "code": plate.code,
+        "title": f"{plate.name.capitalize()}: {titles.get(plate.makes, 'the aperture, by wet etch')}",
+        "makes": plate.makes,
+        "file": sheet.files[plate.name].file,
+        "before": _actions(step.before),
+        "after": _actions(step.after),
+        "marks": _marks(sheet, plate) if plate is not first else [],
+        "widths": _width_rows(sheet, plate) if structures else [],
+        "overlay": _overlay_rows(sheet, plate) if plate is not first else [],
+        "overlay_tolerance_um": round(_TWO_SIGMA * overlay.sigma / UM, 3) or None,
+        "etch": _etch_record(sheet, step, later) if plate.makes == "etch" else None,
+    }
+
+
+def _order_record(sheet: RunSheet) -> list[dict[str, Any]]:
+    return [
+        {
+            "plate": plate.name,
+            "code": plate.code,
+            "file": sheet.files[plate.name].file,
+            "sha256": sheet.files[plate.name].sha256,
+            "cell": sheet.files[plate.name].cell,
+            "layer": f"{plate.layer}/0",
+            "bit": plate.bit,
+            "depth_nm": _nm(plate.depth_m) if plate.bit is not None else None,
+            "polygons_mean": "chrome here" if plate.bit is None else "etched here",
+            "tone": tone_words(plate),
+            "reading": READING,
+            "edge_move_nm": _nm(sheet.files[plate.name].edge_move_m),
+        }
+        for plate in sheet.plates
+    ]
+
+
+def _row(values: NamedTuple) -> dict[str, Any]:
+    """Write a row with six digits: more of them are not the same on every machine."""
+    row = values._asdict()
+    return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in row.items()}
+
+
+def _outlook_record(outlook: Outlook) -> dict[str, Any]:
+    full = outlook.full_wave_m
+    return {
+        "as_drawn": [_row(seen) for seen in outlook.drawn],
+        "expected": [_row(seen) for seen in outlook.expected],
+        "design_wavelength_nm": _nm(outlook.design_m),
+        "full_wave_wavelength_nm": None if full is None else round(full / NM, 1),
+        "probe_wavelength_nm": _nm(outlook.probe_m),
+        "waves_at_probe": round(outlook.probe_waves, 5),
+        "gratings": [_row(grating) for grating in outlook.gratings],
+        "matters": [_row(matter) for matter in outlook.matters],
+    }
+
+
+def _blanks(sheet: RunSheet) -> dict[str, Any]:
+    """Everything that may be measured, unfilled; `fab.runsheet.as_built` says what each key means."""
+    overlay = {"overlay_x_um": None, "overlay_y_um": None}
+    widths = {"cd_bias_um": None, "cd_um": dict.fromkeys(BARS)}
+    mask = {**overlay, **widths, "times_etched": None, "depth_nm": None, "depth_by_pad_nm": dict.fromkeys(PADS)}
+    chrome = {**overlay, **widths, "opening_diameter_um": None}
+    etched = [plate for plate in sheet.plates if plate.bit is not None]
+    named = {plate.name: dict(mask) for plate in sorted(etched, key=lambda plate: plate.layer)}
+    for key in overlay if sheet.plates[0].bit is not None else ():
+        del named[sheet.plates[0].name][key]  # its marks are what the others are measured against
+    if any(plate.name == "chrome" for plate in sheet.plates):
+        named["chrome"] = chrome
+    corners = {"corner_radius_um": None, "sidewall_deg": None}
+    light = {"grating_binary": None, "grating_blazed": None}
+    return {**named, "plate": {**corners, **light}, "notes": {"wafer": None, "date": None, "remarks": None}}
+
+
+def record(sheet: RunSheet) -> dict[str, Any]:
+    """Return the run sheet as JSON values.
+
+    Args:
+        sheet: the sheet.
+
+    Returns:
+        A dictionary with the unit of every length in its key. Everything under "measured" is null, to be filled in.
+    """
+    files = {name: one.file for name, one in sheet.files.items()}
+    notes = alignment_notes(sheet.plates)
+    steps = steps_of(sheet.plates, sheet.process, files, notes, sheet.chrome_m, sheet.deposition)
+    process, wafer = sheet.process, sheet.wafer
+    wall = process.spreads.get("sidewall_rad", Spread())
+    return {
+        "format": FORMAT,
+        "job": sheet.stem,
+        "level_map_sha256": sheet.level_map_sha256,
+        "levels": sheet.levels.count,
+        "aperture_mm": round(sheet.aperture_m / MM, 9),
+        "opening_um": _um(sheet.opening_m),
+        "process": {
+            "name": process.name,
+            "order": [f"mask {bit + 1}" for bit in process.order],
+            "minimum_line_um": _um(process.minimum_line_m),
+            "minimum_space_um": _um(process.minimum_space_m),
+            "usual_wall_tilt_deg": round(degrees(wall.mean), 3) or None,
+        },
+        "order": _order_record(sheet),
+        "wafer": {
+            "material": sheet.material,
+            "diameter_mm": round(wafer.diameter_m / MM, 6),
+            "thickness_mm": round(wafer.thickness_m / MM, 6),
+            "finish": "both faces polished",
+            "mask_blank_mm": round(wafer.blank_m / MM, 6),
+        },
+        "dies": [{"name": die.name, **_mm((die.x_m, die.y_m)), "note": die.note} for die in sheet.dies],
+        "chrome": {"thickness_nm": _nm(sheet.chrome_m), "deposition": sheet.deposition},
+        "vernier_step_um": _um(VERNIER_STEP_M),
+        "reference": sheet.plates[0].name,
+        "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps, start=1)],
+        "staircase_nm": [_nm(depth) for depth in depths_m(sheet.levels)],
+        "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
+        "predicted": None if sheet.outlook is None else _outlook_record(sheet.outlook),
+        "measured": _blanks(sheet),
+    }
+
+
+def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None = None) -> str:
+    """Return the run sheet as one page that needs nothing else.
+
+    Args:
+        content: what `record` returned.
+        json_name: name of the JSON file, which the page tells the reader to fill in.
+        picture: PNG of the PSFs, if there is one.
+
+    Returns:
+        HTML without scripts or links, for A4 and for the screen.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_plain,
+    )
+    environment.filters["clock"] = _clock
+    environment.filters["distance"] = format_length
+    source = None if picture is None else "data:image/png;base64," + base64.b64encode(picture).decode()
+    return environment.get_template("runsheet.html").render(sheet=content, json_name=json_name, picture=source)
+
+
+def _plain(value: object) -> object:
+    """Write 75.0 as 75."""
+    return f"{value:.10g}" if isinstance(value, float) else value
+
+
+def _clock(seconds: float) -> str:
+    """Write a time as minutes and seconds, "3:45"."""
+    whole = round(seconds)
+    return f"{whole // 60}:{whole % 60:02d}"
+
+
+def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:
+    """Write the run sheet as a page and as JSON.
+
+    Args:
+        folder: where.
+        sheet: the sheet.
+        picture: PNG of the PSFs that the finished plate should show, if there is one.
+
+    Returns:
+        Names of both files, "<stem>_RUNSHEET.html" and "<stem>_RUNSHEET.json".
+
+    Raises:
+        InputError: the system refuses the folder.
+    """
+    names = tuple(f"{sheet.stem}_RUNSHEET.{suffix}" for suffix in ("html", "json"))
+    content = record(sheet)
+    write_atomic(folder / names[0], html_page(content, names[1], picture).encode())
+    write_atomic(folder / names[1], canonical_json(content))
+    return names[0], names[1]

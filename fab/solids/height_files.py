@@ -1,0 +1,208 @@
+"""The relief in the files of other tools: pictures, arrays, and the sag of an optics program.
+
+Pictures (.tif, .png) are stored from the top row down, so what is up in the picture is +y; `fab.height`
+turns them back. Arrays (.npy) are metres, ``[y, x]``, row 0 at the lowest y. Every file comes from a level
+map, so that a height is one of the levels and never a rounded neighbour of it.
+
+The grid sag of Zemax OpticStudio is the text that its manual describes: one line ``nx ny delx dely unitflag
+xdec ydec`` (unit flag 0: millimetres), then one line ``z dz/dx dz/dy d2z/dxdy nodata`` per point, from the
+corner at -x, +y along x and then down row by row, at least 5 points along either axis. Points are pixel
+centres. The derivatives are left 0; choose linear interpolation there, which does not use them, and know
+that it turns a vertical wall into a slope one pixel wide.
+"""
+
+import io
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import write_atomic
+from fab.grid import Grid
+from fab.levels import Levels, height_of
+from fab.solids.columns import Window, require_map, whole
+from fab.units import MM, format_length
+
+__all__ = ["write_greymap", "write_npy", "write_tiff", "write_zemax_sag"]
+
+# OpticStudio's manual asks for this many points along either axis.
+_FEWEST_ZEMAX = 5
+_ROWS = 256
+
+
+def _said(levels: Levels, grid: Grid, metres_per_count: float, rounding_m: float) -> str:
+    close = "exact" if rounding_m < 1e-15 else f"rounded by at most {rounding_m:.2e} m"
+    return (
+        f"Height above the deepest etched floor = count x {metres_per_count!r} m ({close}). "
+        f"{levels.count} levels; the highest is the blank surface. "
+        f"Square pixels of {format_length(grid.pitch_m)}. The first row is the one at the highest y, "
+        "the first column the one at the lowest x; seen from the side of the relief."
+    )
+
+
+def _full_scale(levels: Levels, top: int) -> tuple[NDArray[np.int64], float]:
+    """Return the count of every level and the metres per count if the highest level is `top`."""
+    heights = levels.heights_m()
+    scale = float(heights.max()) / top
+    return np.rint(heights / scale).astype(np.int64), scale
+
+
+def _exact_scale(levels: Levels) -> tuple[NDArray[np.int64], float]:
+    """Return 16-bit counts that are a whole number per step if the levels are even, else the nearest of full scale."""
+    heights = levels.heights_m()
+    step = float(heights.max()) / (levels.count - 1)
+    per_step = 65535 // (levels.count - 1)
+    counts = np.arange(levels.count) * per_step
+    if np.allclose(heights, np.arange(levels.count) * step, rtol=0, atol=1e-9 * step):
+        return counts, step / per_step
+    return _full_scale(levels, 65535)
+
+
+def _rounding_m(levels: Levels, counts: NDArray[np.int64], scale_m: float) -> float:
+    return float(np.abs(counts * scale_m - levels.heights_m()).max())
+
+
+def write_tiff(path: str | Path, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> float:
+    """Write the heights as a 16-bit grey TIFF, first row at the highest y.
+
+    Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded
+    to the nearest of 65535 counts. The description in the file says metres per count, rounding, pitch and
+    orientation; the resolution tags hold the pitch too.
+
+    Args:
+        path: the file.
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+
+    Returns:
+        Metres per count; count times this is the height above the deepest floor.
+
+    Raises:
+        InputError: the map does not belong to the levels or the grid, or the file cannot be written.
+    """
+    import tifffile
+
+    checked = require_map(level_map, levels, grid)
+    counts, scale_m = _exact_scale(levels)
+    stream = io.BytesIO()
+    tifffile.imwrite(
+        stream,
+        counts.astype(np.uint16)[checked[::-1]],
+        photometric="minisblack",
+        compression="zlib",
+        description=_said(levels, grid, scale_m, _rounding_m(levels, counts, scale_m)),
+        resolution=(0.01 / grid.pitch_m, 0.01 / grid.pitch_m),
+        resolutionunit="CENTIMETER",
+        metadata=None,
+        software="doedesign",
+    )
+    write_atomic(path, stream.getvalue())
+    return scale_m
+
+
+def write_npy(path: str | Path, level_map: NDArray[np.integer], levels: Levels) -> None:
+    """Write the heights as a bare array: float64 metres above the deepest floor, ``[y, x]``, row 0 at the lowest y.
+
+    Args:
+        path: the file.
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+
+    Raises:
+        InputError: the map does not belong to the levels, or the file cannot be written.
+    """
+    stream = io.BytesIO()
+    np.save(stream, height_of(level_map, levels), allow_pickle=False)
+    write_atomic(path, stream.getvalue())
+
+
+def write_greymap(
+    path: str | Path, level_map: NDArray[np.integer], levels: Levels, grid: Grid, bits: Literal[8, 16] = 8
+) -> float:
+    """Write the picture that greyscale and two-photon writers expose: PNG, white highest, linear in height.
+
+    Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is rounded to
+    the nearest count, and exact for 2, 4 and 16 even levels. The first row is at the highest y. The text
+    chunk "Description" says metres per count, rounding, pitch and orientation.
+
+    Args:
+        path: the file.
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        bits: per pixel, 8 or 16.
+
+    Returns:
+        Metres per count.
+
+    Raises:
+        InputError: the map does not belong to the levels or the grid, or the file cannot be written.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    checked = require_map(level_map, levels, grid)
+    counts, scale_m = _full_scale(levels, 2**bits - 1)
+    pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[checked[::-1]]
+    text = PngInfo()
+    text.add_text("Description", _said(levels, grid, scale_m, _rounding_m(levels, counts, scale_m)))
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format="PNG", pnginfo=text)
+    write_atomic(path, stream.getvalue())
+    return scale_m
+
+
+def write_zemax_sag(
+    path: str | Path,
+    level_map: NDArray[np.integer],
+    levels: Levels,
+    grid: Grid,
+    window: Window | None = None,
+    side: Literal["exit", "entry"] = "exit",
+) -> None:
+    """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
+
+    The blank surface is the vertex plane, sag 0, as outside the grid. Light runs toward +z. If the relief is
+    on the exit side (glass before the surface), etched glass is missing toward -z and the sag is minus the
+    etch depth. On the entry side (glass after the surface) it is plus the etch depth. x and y are those
+    of the map in both cases; a plate that is turned over must be mirrored in the optics program.
+
+    Sags are written to a picometre, 22 bytes a point: a 4400 x 4400 map makes 426 MB, so choose a window.
+
+    Args:
+        path: the file.
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        window: the pixels to write; all of them if left out. The decentre in the header puts them where they are.
+        side: on which side of the glass the relief is.
+
+    Raises:
+        InputError: fewer than 5 points along an axis, a window off the map, a map that does not belong to the
+            levels or the grid, a suffix that OpticStudio does not read, or a file that cannot be written.
+    """
+    if Path(path).suffix.upper() != ".DAT":
+        raise InputError(str(path), "OpticStudio reads grid sags from .DAT files", Path(path).suffix, "Use .DAT.")
+    checked = require_map(level_map, levels, grid)
+    window = window or whole(grid)
+    window.require(grid)
+    if min(window.rows, window.columns) < _FEWEST_ZEMAX:
+        rule = f"OpticStudio needs at least {_FEWEST_ZEMAX} points along either axis"
+        raise InputError("grid sag", rule, f"{window.rows} x {window.columns}", "Choose a larger window.")
+    heights = levels.heights_m()
+    sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
+    lines = [f"{sag + 0.0:12.9f} 0 0 0 0\r\n".encode() for sag in sag_mm]  # + 0.0: no minus before a zero
+    if len({len(line) for line in lines}) != 1:  # pragma: no cover - a relief deeper than a centimetre
+        raise InputError(
+            "grid sag", "the relief must be less than 10 mm deep", format_length(heights.max()), "Check it."
+        )
+    table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(levels.count, -1)
+    x_mm, y_mm = (value / MM for value in window.centre_m(grid))
+    pitch_mm = f"{grid.pitch_m / MM:.12g}"
+    header = f"{window.columns} {window.rows} {pitch_mm} {pitch_mm} 0 {x_mm:.12g} {y_mm:.12g}\r\n"
+    pixels = window.cut(checked)[::-1]
+    body = (table[pixels[start : start + _ROWS]].tobytes() for start in range(0, window.rows, _ROWS))
+    write_atomic(path, b"".join([header.encode(), *body]))

@@ -1,0 +1,261 @@
+"""The relief as a closed mesh: for viewers (GLB), for printers and slicers (3MF, STL).
+
+A mesh stands on its map: every cell is a column with a flat top, walls are vertical, and a flat base closes
+it below. Corners of cells carry one vertex per height that meets there, and the walls use all of them, so
+that no vertex lies inside an edge and the mesh is closed whatever the map. Where two columns meet at a corner
+alone, each has its own vertex on top of the common edge, so that every edge belongs to two triangles, as 3MF
+demands. The volume is the sum of the columns.
+
+The origin is the centre of the clear aperture, z = 0 the blank surface and +z away from the glass, as in
+the STEP files.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fab.errors import CheckFailed, InputError
+from fab.solids.columns import Cells
+from fab.units import UM, format_length
+
+__all__ = ["Mesh", "closed_volume_m3", "relief_mesh"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in space, counter-clockwise seen from outside.
+
+    Attributes:
+        vertices_m: ``(n, 3)`` float64, x, y, z in metres.
+        triangles: ``(m, 3)`` int32, numbers of vertices.
+        about: one line of ASCII about what it shows; it goes into the files.
+    """
+
+    vertices_m: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    about: str = ""
+
+    @property
+    def volume_m3(self) -> float:
+        """Enclosed volume in cubic metres, each triangle counted with the prism between it and z = 0."""
+        return _volume(self.vertices_m, self.triangles)
+
+
+@njit(cache=True)
+def _volume(vertices, triangles):  # pragma: no cover - compiled
+    # Per block of triangles, so that the rounding of a long sum stays small.
+    total = 0.0
+    part = 0.0
+    for t in range(triangles.shape[0]):
+        a, b, c = vertices[triangles[t, 0]], vertices[triangles[t, 1]], vertices[triangles[t, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        part += area * (a[2] + b[2] + c[2])
+        if t % 1024 == 1023:
+            total += part
+            part = 0.0
+    return (total + part) / 6
+
+
+@njit(cache=True)
+def _stack(height, base, j, i, out):  # pragma: no cover - compiled
+    """Sort the distinct heights that meet at a corner into `out` and return their number."""
+    ny, nx = height.shape
+    count = 0
+    for y in range(j - 1, j + 1):
+        for x in range(i - 1, i + 1):
+            value = height[y, x] if 0 <= y < ny and 0 <= x < nx else base
+            at = 0
+            while at < count and out[at] < value:
+                at += 1
+            if at < count and out[at] == value:
+                continue
+            for k in range(count, at, -1):
+                out[k] = out[k - 1]
+            out[at] = value
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _kiss(height, j, i):  # pragma: no cover - compiled
+    """Return the height up to which two columns meet at a corner alone, -inf if none do."""
+    ny, nx = height.shape
+    if not (0 < j < ny and 0 < i < nx):
+        return -np.inf
+    one = min(height[j - 1, i - 1], height[j, i])
+    other = min(height[j - 1, i], height[j, i - 1])
+    if one > max(height[j - 1, i], height[j, i - 1]):
+        return one
+    return other if other > max(height[j - 1, i - 1], height[j, i]) else -np.inf
+
+
+@njit(cache=True)
+def _corners(height, base):  # pragma: no cover - compiled
+    """Return the number of the first vertex of every corner, and the z and the twin of every vertex (-1 for none)."""
+    ny, nx = height.shape
+    stack = np.empty(4)
+    first = np.empty((ny + 1, nx + 1), np.int32)
+    used = 0
+    for j in range(ny + 1):
+        for i in range(nx + 1):
+            first[j, i] = used
+            used += _stack(height, base, j, i, stack)
+    z = np.empty(used)
+    twin = np.full(used, -1, np.int32)
+    for j in range(ny + 1):
+        for i in range(nx + 1):
+            count = _stack(height, base, j, i, stack)
+            kiss = _kiss(height, j, i)
+            for k in range(count):
+                z[first[j, i] + k] = stack[k]
+                if stack[k] == kiss:
+                    twin[first[j, i] + k] = used
+                    used += 1
+    return first, z, twin
+
+
+@njit(cache=True)
+def _seek(z, start, value):  # pragma: no cover - compiled
+    while z[start] != value:
+        start += 1
+    return start
+
+
+@njit(cache=True)
+def _named(twin, vertex, north):  # pragma: no cover - compiled
+    return twin[vertex] if north and twin[vertex] >= 0 else vertex
+
+
+@njit(cache=True)
+def _wall(z, twin, p, q, north_p, north_q, low, high, flip, out, used):  # pragma: no cover - compiled
+    """Cover a wall between two corners with triangles, all the vertices on either side taken in; return the count.
+
+    `p` and `q` are the first vertices of the corners. Unflipped triangles face the right of the way from p to q:
+    +x for a way toward +y. An empty `out` only counts.
+    """
+    p, q = _seek(z, p, low), _seek(z, q, low)
+    while z[p] != high or z[q] != high:
+        # The side whose next vertex is lower goes up first, so that the triangles stay short.
+        up_q = z[p] == high or (z[q] != high and z[q + 1] <= z[p + 1])
+        if out.shape[0]:
+            second = _named(twin, q, north_q)
+            third = _named(twin, q + 1, north_q) if up_q else _named(twin, p + 1, north_p)
+            out[used, 0] = _named(twin, p, north_p)
+            out[used, 1] = third if flip else second
+            out[used, 2] = second if flip else third
+        used += 1
+        if up_q:
+            q += 1
+        else:
+            p += 1
+    return used
+
+
+@njit(cache=True)
+def _triangles(height, base, first, z, twin, out):  # pragma: no cover - compiled
+    """Write tops and walls, or count them if `out` is empty; return their number."""
+    ny, nx = height.shape
+    used = 0
+    for j in range(ny + 1):
+        for i in range(nx + 1):
+            here = height[j, i] if j < ny and i < nx else base
+            if j < ny and i < nx:
+                if out.shape[0]:
+                    a = _named(twin, _seek(z, first[j, i], here), True)
+                    b = _named(twin, _seek(z, first[j, i + 1], here), True)
+                    c = _seek(z, first[j + 1, i + 1], here)
+                    d = _seek(z, first[j + 1, i], here)
+                    out[used, 0], out[used, 1], out[used, 2] = a, b, c
+                    out[used + 1, 0], out[used + 1, 1], out[used + 1, 2] = a, c, d
+                used += 2
+            # A wall belongs to its higher column, which names the vertices.
+            if j < ny:
+                left = height[j, i - 1] if i > 0 else base
+                low, high = min(left, here), max(left, here)
+                if low < high:
+                    p, q = first[j, i], first[j + 1, i]
+                    used = _wall(z, twin, p, q, True, False, low, high, left < here, out, used)
+            if i < nx:
+                below = height[j - 1, i] if j > 0 else base
+                low, high = min(below, here), max(below, here)
+                if low < high:
+                    p, q, north = first[j, i], first[j, i + 1], here > below
+                    used = _wall(z, twin, p, q, north, north, low, high, not north, out, used)
+    return used
+
+
+def _bottom(first: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Cover the base with triangles that use every vertex of its rim and none inside."""
+    south, north, west, east = first[0], first[-1], first[:, 0], first[:, -1]
+    ones = np.ones_like
+    parts = [
+        # A strip of triangles between the low and the high rim; the first and the last one ...
+        np.stack([south[1:-1], north[1:-1], south[2:]], axis=1),
+        np.stack([north[:-2], north[1:-1], south[1:-1]], axis=1),
+        # ... are fans, because the left and the right rim have vertices of their own.
+        np.stack([west[:-1], west[1:], south[1] * ones(west[1:])], axis=1),
+        np.stack([north[-2] * ones(east[1:]), east[1:], east[:-1]], axis=1),
+    ]
+    return np.concatenate(parts)
+
+
+def relief_mesh(cells: Cells, base_m: float = 10e-6, exaggeration: float = 1.0) -> Mesh:
+    """Build the closed mesh of a relief on a slab.
+
+    Args:
+        cells: the relief.
+        base_m: thickness of the slab below the deepest floor, metres; never exaggerated.
+        exaggeration: factor on the heights.
+
+    Returns:
+        The mesh; its volume is ``exaggeration * cells.volume_m3 + base_m * cells.area_m2``.
+
+    Raises:
+        InputError: the base or the factor is not positive and finite.
+    """
+    for name, value in (("mesh base", base_m), ("height exaggeration", exaggeration)):
+        if not 0 < value < math.inf:
+            raise InputError(name, "must be positive and finite", value, "Choose a positive number.")
+    height = exaggeration * (cells.height_m - cells.blank_m)
+    base = -exaggeration * cells.blank_m - base_m
+    first, z, twin = _corners(height, base)
+    sides = np.empty((_triangles(height, base, first, z, twin, np.empty((0, 3), np.int32)), 3), dtype=np.int32)
+    _triangles(height, base, first, z, twin, sides)
+    counts = np.diff(np.append(first.ravel(), z.size))
+    corners_x, corners_y = np.meshgrid(cells.x_edges_m, cells.y_edges_m)
+    vertices = np.stack([np.repeat(corners_x.ravel(), counts), np.repeat(corners_y.ravel(), counts), z], axis=1)
+    vertices = np.concatenate([vertices, vertices[twin >= 0]])
+    about = (
+        f"DOE relief, heights x {exaggeration:g}, blocks of {cells.block} x {cells.block} pixels, "
+        f"base {format_length(base_m)}, z = 0 at the blank surface, origin at the centre of the clear aperture"
+    )
+    return Mesh(vertices, np.concatenate([_bottom(first), sides]), about)
+
+
+def closed_volume_m3(mesh: Mesh) -> float:
+    """Let manifold3d judge whether a mesh is closed, and measure it.
+
+    The library works in float32 here, on micrometres, as the files do.
+
+    Args:
+        mesh: the mesh; triangles without common vertices, as in an STL file, are joined where they touch.
+
+    Returns:
+        The volume that the library finds, cubic metres.
+
+    Raises:
+        CheckFailed: the mesh is open, turned inside out or otherwise not the skin of a solid.
+    """
+    import manifold3d
+
+    raw = manifold3d.Mesh((mesh.vertices_m / UM).astype(np.float32), mesh.triangles.astype(np.uint32))
+    if len(mesh.vertices_m) == 3 * len(mesh.triangles):
+        raw.merge()
+    solid = manifold3d.Manifold(raw)
+    volume = solid.volume()
+    if solid.status() != manifold3d.Error.NoError or not volume > 0:
+        raise CheckFailed([f"mesh: not the skin of a solid ({solid.status().name}, volume {volume:g} um3)"])
+    return volume * UM**3

@@ -1,0 +1,282 @@
+"""Mesh files: 3MF and STL for slicers and printers, glTF (.glb) for viewers, and their reader.
+
+3MF says its unit, glTF is in metres by its standard, STL knows none and says it in its header and, better, in
+its name. The same mesh gives the same bytes.
+"""
+
+import io
+import json
+import struct
+import zipfile
+from array import array
+from pathlib import Path
+from typing import Any, Literal
+from xml.parsers.expat import ParserCreate
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import explain_os_error, write_atomic
+from fab.solids.mesh import Mesh
+from fab.units import MM, UM
+
+__all__ = ["Unit", "read_mesh", "write_3mf", "write_glb", "write_stl"]
+
+Unit = Literal["mm", "um"]
+_UNIT_M = {"mm": MM, "um": UM}
+_3MF_UNITS = {"mm": "millimeter", "um": "micron"}
+_CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+_TYPES = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n'
+    '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
+    '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+    '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n'
+)
+_RELATIONS = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n'
+    '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
+    '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
+    'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>\n'
+)
+# The oldest time a zip can hold, so that the same mesh gives the same bytes.
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+@njit(cache=True)
+def _put_integer(value, buffer, at):  # pragma: no cover - compiled
+    start = at
+    while True:
+        buffer[at] = 48 + value % 10
+        value //= 10
+        at += 1
+        if value == 0:
+            break
+    buffer[start:at] = buffer[start:at][::-1].copy()
+    return at
+
+
+@njit(cache=True)
+def _put_picometres(value, decimals, buffer, at):  # pragma: no cover - compiled
+    """Write a whole number of picometres as a decimal number of units that have so many decimals."""
+    if value < 0:
+        buffer[at] = 45
+        at += 1
+        value = -value
+    unit = 10**decimals
+    at = _put_integer(value // unit, buffer, at)
+    rest = value % unit
+    if rest:
+        buffer[at] = 46
+        at += 1
+        while rest:
+            unit //= 10
+            buffer[at] = 48 + rest // unit
+            rest %= unit
+            at += 1
+    return at
+
+
+@njit(cache=True)
+def _put_rows(values, decimals, words, ends, buffer):  # pragma: no cover - compiled
+    """Write rows of three numbers between four words; words are one byte string cut at `ends`."""
+    at = 0
+    for row in range(values.shape[0]):
+        start = 0
+        for column in range(4):
+            for k in range(start, ends[column]):
+                buffer[at] = words[k]
+                at += 1
+            start = ends[column]
+            if column < 3:
+                at = _put_picometres(values[row, column], decimals, buffer, at)
+    return at
+
+
+def _rows_of_xml(values: NDArray[np.int64], decimals: int, words: tuple[bytes, ...]) -> list[bytes]:
+    joined = np.frombuffer(b"".join(words), dtype=np.uint8)
+    ends = np.cumsum([len(word) for word in words])
+    step = 1 << 18
+    buffer = np.empty(step * (joined.size + 3 * 24), dtype=np.uint8)
+    return [
+        buffer[: _put_rows(values[start : start + step], decimals, joined, ends, buffer)].tobytes()
+        for start in range(0, len(values), step)
+    ]
+
+
+def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
+    """Write a mesh as 3MF, which states its unit; numbers are rounded to a picometre.
+
+    Args:
+        path: the file.
+        mesh: the mesh.
+        unit: ``"mm"`` or ``"um"``.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    decimals = {"mm": 9, "um": 6}[unit]
+    picometres = np.rint(mesh.vertices_m * 1e12).astype(np.int64)
+    vertices = _rows_of_xml(picometres, decimals, (b'<vertex x="', b'" y="', b'" z="', b'"/>\n'))
+    triangles = _rows_of_xml(mesh.triangles.astype(np.int64), 0, (b'<triangle v1="', b'" v2="', b'" v3="', b'"/>\n'))
+    head = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<model unit="{_3MF_UNITS[unit]}" xml:lang="en-US" xmlns="{_CORE}">\n'
+        f'<metadata name="Description">{mesh.about}</metadata>\n'
+        '<resources><object id="1" type="model" name="DOE"><mesh>\n<vertices>\n'
+    )
+    tail = '</triangles>\n</mesh></object></resources>\n<build><item objectid="1"/></build>\n</model>\n'
+    model = [head.encode(), *vertices, b"</vertices>\n<triangles>\n", *triangles, tail.encode()]
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, parts in (
+            ("[Content_Types].xml", [_TYPES.encode()]),
+            ("_rels/.rels", [_RELATIONS.encode()]),
+            ("3D/3dmodel.model", model),
+        ):
+            info = zipfile.ZipInfo(name, _ZIP_TIME)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
+                for part in parts:
+                    member.write(part)
+    write_atomic(path, stream.getvalue())
+
+
+def write_glb(path: str | Path, mesh: Mesh) -> None:
+    """Write a mesh as binary glTF for viewers: metres, as the format demands, float32.
+
+    A viewer's up is +y, so the one node turns z up; what was +y points away from the viewer.
+
+    Args:
+        path: the file.
+        mesh: the mesh.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    positions = mesh.vertices_m.astype(np.float32)
+    indices = mesh.triangles.astype(np.uint32)
+    body = indices.tobytes() + positions.tobytes()
+    value: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "doedesign"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "DOE", "matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 1}, "indices": 0}], "extras": {"description": mesh.about}}
+        ],
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": indices.nbytes, "target": 34963},
+            {"buffer": 0, "byteOffset": indices.nbytes, "byteLength": positions.nbytes, "target": 34962},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5125, "count": indices.size, "type": "SCALAR"},
+            {
+                "bufferView": 1,
+                "componentType": 5126,
+                "count": len(positions),
+                "type": "VEC3",
+                "min": positions.min(axis=0).tolist(),
+                "max": positions.max(axis=0).tolist(),
+            },
+        ],
+    }
+    text = json.dumps(value).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + len(body)
+    if total >= 2**32:
+        raise InputError(str(path), "a GLB file must stay below 4 GB", f"{total} bytes", "Mesh fewer columns.")
+    parts = [struct.pack("<III", 0x46546C67, 2, total), struct.pack("<II", len(text), 0x4E4F534A), text]
+    write_atomic(path, b"".join([*parts, struct.pack("<II", len(body), 0x004E4942), body]))
+
+
+def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
+    """Write a mesh as binary STL, float32; the format knows no unit, so the header says it in words.
+
+    Args:
+        path: the file; let its name say the unit too.
+        mesh: the mesh.
+        unit: ``"mm"`` or ``"um"``.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets = np.zeros(len(mesh.triangles), dtype=kind)
+    corners = mesh.vertices_m[mesh.triangles] / _UNIT_M[unit]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facets["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["corners"] = corners
+    header = f"binary STL, unit {unit}; {mesh.about}".encode()[:80].ljust(80)
+    write_atomic(path, b"".join([header, struct.pack("<I", len(facets)), facets.tobytes()]))
+
+
+def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float]:
+    """Read the one object of a 3MF file as a stream; a tree of millions of elements would take gigabytes."""
+    numbers, corners, seen = array("d"), array("i"), {"object": 0, "unit": ""}
+
+    def start(tag: str, values: dict[str, str]) -> None:
+        if tag == "triangle":
+            corners.extend((int(values["v1"]), int(values["v2"]), int(values["v3"])))
+        elif tag == "vertex":
+            numbers.extend((float(values["x"]), float(values["y"]), float(values["z"])))
+        elif tag == "model":
+            seen["unit"] = values.get("unit", "millimeter")
+        elif tag == "object":
+            seen["object"] += 1
+        elif tag in ("component", "item") and "transform" in values:
+            raise ValueError("the mesh is moved or scaled")
+
+    parser = ParserCreate()
+    parser.StartElementHandler = start
+    with zipfile.ZipFile(path) as archive, archive.open("3D/3dmodel.model") as model:
+        parser.ParseFile(model)
+    if seen["object"] != 1:
+        raise ValueError(f"{seen['object']} objects instead of one")
+    scale = {said: _UNIT_M[unit] for unit, said in _3MF_UNITS.items()}[str(seen["unit"])]
+    vertices = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 3)
+    return vertices, np.frombuffer(corners, dtype=np.int32).reshape(-1, 3), scale
+
+
+def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
+    """Read a mesh file with a parser that had no part in writing it: trimesh, and for 3MF Python's own for XML.
+
+    Args:
+        path: a ``.3mf``, ``.glb`` or ``.stl`` file.
+        unit: what the numbers of an STL file mean; the other kinds say it themselves.
+
+    Returns:
+        The triangles in metres, z up (the axes of a glTF file are turned back).
+
+    Raises:
+        InputError: the file is missing, damaged, of another kind, or holds no mesh or several; or the unit
+            of an STL file is not given.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (".3mf", ".glb", ".stl") or (kind == ".stl") != (unit is not None):
+        rule = "the file must be .3mf or .glb, or .stl with its unit given"
+        raise InputError(str(path), rule, f"{kind} and unit {unit}", "Give the unit of an STL file only.")
+    try:
+        path.open("rb").close()
+        if kind == ".3mf":
+            vertices, triangles, scale = _read_3mf(path)
+        else:
+            import trimesh
+
+            parts: Any = trimesh.load_scene(path, process=False).dump()
+            (part,) = parts
+            vertices, triangles, scale = part.vertices, part.faces, _UNIT_M[unit] if unit else 1.0
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+    # Each parser raises what it likes on a damaged file.
+    except Exception as error:
+        cure = "Write the file again from its source."
+        got = str(error) or type(error).__name__
+        raise InputError(str(path), "the file must be whole and hold one mesh", got, cure) from error
+    corners_m = np.asarray(vertices, dtype=np.float64) * scale
+    if kind == ".glb":
+        corners_m = corners_m @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return Mesh(corners_m, np.asarray(triangles, dtype=np.int32))

@@ -1,0 +1,153 @@
+"""A patch: a small square window of a relief that somebody asked for, at full resolution.
+
+As STEP it is one box per rectangle of equal height, side by side and not united: uniting takes minutes at the size that
+is allowed here. As a mesh it may be larger. CAD programs choke on more than a few thousand boxes and viewers on some
+millions of triangles, so either has a cap.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.layout.polygons import rectangles
+from fab.levels import Levels
+from fab.solids.columns import Cells, Window, require_map, window_cells
+from fab.solids.step import Body, boxes, write_step
+from fab.units import format_length
+
+__all__ = ["Patch", "patch_body", "patch_step"]
+
+_MOST_BOXES = 2000
+_NO_MORE_BOXES = 20_000
+_MOST_PIXELS = 1000
+_BASE_M = 10e-6
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A square window, in the coordinates of the DOE: the origin is the centre of the clear aperture, +y up.
+
+    Attributes:
+        x_m: its middle, metres.
+        y_m: the same along y.
+        width_m: its edge, metres; the nearest whole number of pixels is taken.
+        step: whether it is wanted as STEP, too, and not only as a mesh.
+    """
+
+    x_m: float
+    y_m: float
+    width_m: float
+    step: bool = True
+
+    def window(self, grid: Grid) -> Window:
+        """Return the pixels nearest to the patch.
+
+        Raises:
+            InputError: it has no pixel or reaches beyond the map.
+        """
+        (ny, nx), pitch_m = grid.shape, grid.pitch_m
+        count = round(self.width_m / pitch_m) if abs(self.width_m) < math.inf else 0
+        half_y_m, half_x_m = (extent / 2 * (1 + 1e-9) for extent in grid.extent_m)
+        if not (count >= 1 and abs(self.x_m) <= half_x_m and abs(self.y_m) <= half_y_m):
+            rule = (
+                f"must lie on the map, {format_length(2 * half_x_m)} x {format_length(2 * half_y_m)} about its middle"
+            )
+            got = f"{format_length(self.width_m)} about {format_length(self.x_m)}, {format_length(self.y_m)}"
+            raise InputError("patch", rule, got, 'Give its middle and its edge, such as "0 um, 100 um, 50 um".')
+        row, column = (round(at / pitch_m + (n - count) / 2) for at, n in ((self.y_m, ny), (self.x_m, nx)))
+        window = Window(row, column, count, count)
+        window.require(grid)
+        return window
+
+    def require(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> None:
+        """Check that the files of the patch stay small enough to be opened.
+
+        Raises:
+            InputError: it is too large for a mesh, or has too many boxes for STEP, or reaches beyond the map.
+        """
+        window = self.window(grid)
+        if window.rows > _MOST_PIXELS:
+            rule = f"a mesh at full resolution may have at most {_MOST_PIXELS} x {_MOST_PIXELS} pixels"
+            cure = f"Choose an edge of at most {format_length(_MOST_PIXELS * grid.pitch_m)}."
+            raise InputError("patch", rule, f"{window.rows} x {window.columns}", cure)
+        if self.step:
+            _tops(require_map(level_map, levels, grid), window, _MOST_BOXES)
+
+    def cells(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> Cells:
+        """Return the columns of the patch."""
+        return window_cells(level_map, levels, grid, self.window(grid))
+
+
+def _tops(level_map: NDArray[np.uint8], window: Window, most_boxes: int) -> dict[int, NDArray[np.int32]]:
+    """Return the rectangles of every level in a window, or refuse too many."""
+    cut = window.cut(level_map)
+    tops = {int(level): rectangles((cut == level).astype(np.uint8)) for level in np.unique(cut)}
+    count = sum(len(found) for found in tops.values())
+    if count > most_boxes:
+        rule = f"a STEP patch may have at most {most_boxes} boxes (a file of about 7 kB each)"
+        cure = "Choose a smaller window, or take the mesh alone (--mesh-patch)."
+        raise InputError("patch", rule, f"{count} in {window.rows} x {window.columns} pixels", cure)
+    return tops
+
+
+def patch_body(
+    level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window, base_m: float = _BASE_M
+) -> Body:
+    """Return volume and centre of all the boxes that `patch_step` writes."""
+    heights_m = levels.heights_m()[window.cut(require_map(level_map, levels, grid))] + base_m
+    x_m, y_m = ((edges[1:] + edges[:-1]) / 2 for edges in window.edges_m(grid))
+    total = math.fsum(heights_m.ravel())
+    bottom_m = -float(levels.heights_m().max()) - base_m
+    centre_m = (
+        math.fsum(heights_m.sum(axis=0) * x_m) / total,
+        math.fsum(heights_m.sum(axis=1) * y_m) / total,
+        bottom_m + math.fsum(np.square(heights_m).ravel()) / 2 / total,
+    )
+    return Body(total * grid.pitch_m**2, centre_m)
+
+
+def patch_step(
+    path: str | Path,
+    level_map: NDArray[np.integer],
+    levels: Levels,
+    grid: Grid,
+    window: Window,
+    base_m: float = _BASE_M,
+    most_boxes: int = _MOST_BOXES,
+) -> None:
+    """Write a window of a map as STEP. The part is named PATCH and lies where the window does.
+
+    Args:
+        path: the file.
+        level_map: level numbers ``[y, x]``.
+        levels: the staircase.
+        grid: the raster of the map.
+        window: the pixels to write.
+        base_m: glass below the deepest floor, metres.
+        most_boxes: refuse windows that need more; at most 20000, which make a file of about 140 MB.
+
+    Raises:
+        InputError: too many boxes, a window off the map, or a file that cannot be written.
+    """
+    checked = require_map(level_map, levels, grid)
+    window.require(grid)
+    if not 0 < base_m < math.inf:
+        raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")
+    if not 1 <= most_boxes <= _NO_MORE_BOXES:
+        rule = f"a STEP patch may be allowed 1 to {_NO_MORE_BOXES} boxes"
+        raise InputError("patch", rule, most_boxes, "Write a mesh (3MF, STL) of a larger window.")
+    tops = _tops(checked, window, most_boxes)
+    x_m, y_m = window.edges_m(grid)
+    z_m = levels.heights_m() - levels.heights_m().max()
+    bottom = float(z_m.min()) - base_m
+    corners = (
+        (float(x_m[x0]), float(y_m[y0]), bottom, float(x_m[x1]), float(y_m[y1]), float(z_m[level]))
+        for level, found in tops.items()
+        for x0, y0, x1, y1 in found
+    )
+    write_step(path, "DOE_PATCH", {"PATCH": boxes(corners)})

@@ -1,0 +1,299 @@
+"""The plate as a solid, for mechanics: STEP files in millimetres.
+
+The origin is the centre of the clear aperture, the plane z = 0 the blank surface (the datum, on which the
+relief is etched and the chrome lies), and the z axis the light axis. The glass lies below, the relief faces
++z. A file holds named parts: SUBSTRATE and CHROME are solids, DATUM_CLEAR_APERTURE is a disc without thickness
+in the plane z = 0, to be referred to.
+
+A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into
+the top of the substrate. Any other map belongs in a mesh; only a small window of one can be STEP (`fab.solids.patch`).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.solids.step import Body, copies, disc, outline, plate, revolved, slab, write_step
+from fab.units import NM, format_length
+
+__all__ = [
+    "ChromeRing",
+    "Rings",
+    "Substrate",
+    "substrate_bodies",
+    "substrate_step",
+    "substrate_volumes_m3",
+    "wafer_bodies",
+    "wafer_step",
+]
+
+# The kernel takes points 1e-7 mm apart for one; edges must be clearly longer.
+_SHORTEST_M = 0.3 * NM
+_SAME_M = 1e-3 * NM
+
+
+@dataclass(frozen=True)
+class Substrate:
+    """The glass.
+
+    Attributes:
+        outline: ``"die"`` is a square, ``"wafer"`` a disc with a flat at -y.
+        width_m: side of the square or diameter of the disc, metres.
+        thickness_m: thickness, metres.
+        flat_m: length of the wafer's flat, metres; 0 for none.
+    """
+
+    outline: Literal["die", "wafer"]
+    width_m: float
+    thickness_m: float
+    flat_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: a length is not positive, or the flat does not fit the outline.
+        """
+        for name, value in (("width", self.width_m), ("thickness", self.thickness_m)):
+            if not 0 < value < math.inf:
+                raise InputError(
+                    f"substrate {name}", "must be positive and finite", value, 'Give one such as "0.5 mm".'
+                )
+        most = self.width_m if self.outline == "wafer" else 0.0
+        if self.flat_m and not 0 < self.flat_m < most:
+            rule = "a flat must be shorter than the diameter of a wafer, and a die has none"
+            raise InputError("substrate flat", rule, format_length(self.flat_m), "Choose 0 or a shorter one.")
+
+    @property
+    def inside_m(self) -> float:
+        """Radius of the largest centred circle on the surface, metres."""
+        return math.sqrt((self.width_m / 2) ** 2 - (self.flat_m / 2) ** 2)
+
+    def holds(self, x_m: float, y_m: float, radius_m: float) -> bool:
+        """Whether a circle about x, y lies on the surface of a wafer."""
+        return math.hypot(x_m, y_m) + radius_m <= self.width_m / 2 and radius_m - y_m <= self.inside_m
+
+    @property
+    def area_m2(self) -> float:
+        """Area of the surface, square metres."""
+        if self.outline == "die":
+            return self.width_m**2
+        radius = self.width_m / 2
+        half_angle = math.asin(self.flat_m / self.width_m)
+        return math.pi * radius**2 - radius**2 * (half_angle - math.sin(half_angle) * math.cos(half_angle))
+
+    @property
+    def body(self) -> Body:
+        """The glass without relief; what the flat takes from a disc at -y moves its centre to +y."""
+        y_m = (self.flat_m / 2) ** 3 * 2 / 3 / self.area_m2
+        return Body(self.area_m2 * self.thickness_m, (0.0, y_m, -self.thickness_m / 2))
+
+
+@dataclass(frozen=True)
+class ChromeRing:
+    """The chrome around the clear aperture.
+
+    Attributes:
+        inner_m: radius of the opening, metres.
+        outer_m: outer radius, metres.
+        thickness_m: thickness of the film, metres.
+    """
+
+    inner_m: float
+    outer_m: float
+    thickness_m: float = 100 * NM
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: the radii leave no ring, or the film has no thickness.
+        """
+        if not (0 < self.inner_m < self.outer_m < math.inf and _SHORTEST_M <= self.thickness_m < math.inf):
+            got = ", ".join(format_length(v) for v in (self.inner_m, self.outer_m, self.thickness_m))
+            rule = "inner radius, outer radius and thickness must be positive and make a ring"
+            raise InputError("chrome", rule, got, "Check the three lengths.")
+
+    @property
+    def body(self) -> Body:
+        """The ring around the axis, on z = 0."""
+        volume = math.pi * (self.outer_m + self.inner_m) * (self.outer_m - self.inner_m) * self.thickness_m
+        return Body(volume, (0.0, 0.0, self.thickness_m / 2))
+
+    def solid(self) -> Any:
+        """The same as a shape of the kernel."""
+        low, high = 0.0, self.thickness_m
+        corners = [(self.inner_m, low), (self.outer_m, low), (self.outer_m, high), (self.inner_m, high)]
+        return revolved(corners, closed=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """A radial relief: flat rings around the axis, the first one a disc.
+
+    Attributes:
+        outer_m: outer radius of every ring, metres, increasing, ``(n,)``.
+        height_m: height of every ring above the deepest floor, metres, ``(n,)``.
+        blank_m: height of the blank surface above the deepest floor, metres.
+    """
+
+    outer_m: NDArray[np.floating]
+    height_m: NDArray[np.floating]
+    blank_m: float
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            InputError: other shapes, radii that do not increase, heights off the glass, or a ring or a step
+                too small for STEP's numbers (0.3 nm).
+        """
+        radii, heights = self.outer_m, self.height_m
+        if radii.ndim != 1 or radii.shape != heights.shape or not radii.size:
+            got = f"{radii.shape} and {heights.shape}"
+            raise InputError("rings", "radii and heights must be two lists of one length", got, "Give both per ring.")
+        if not np.all(np.diff(radii, prepend=0.0) >= _SHORTEST_M):
+            cure = "Give increasing outer radii."
+            raise InputError("rings", "every ring must be at least 0.3 nm wide", f"{radii.size} radii", cure)
+        if not np.all((heights >= 0) & (heights <= self.blank_m + _SAME_M)):
+            got = f"{heights.min():g} to {heights.max():g} m"
+            rule = f"heights must lie from 0 to that of the blank surface, {format_length(self.blank_m)}"
+            raise InputError("rings", rule, got, "Give heights above the deepest floor.")
+        steps = np.abs(np.diff(heights, append=self.blank_m))
+        if np.any((steps > _SAME_M) & (steps < _SHORTEST_M)):
+            cure = "Quantise the heights first."
+            raise InputError("rings", "every step must be 0 or at least 0.3 nm high", "a lower one", cure)
+
+    @property
+    def removed(self) -> Body:
+        """The glass that is etched away."""
+        inner = np.append(0.0, self.outer_m[:-1])
+        depths = self.blank_m - self.height_m
+        volumes = math.pi * (self.outer_m - inner) * (self.outer_m + inner) * depths
+        volume = math.fsum(volumes)
+        return Body(volume, (0.0, 0.0, -math.fsum(volumes * depths) / 2 / volume if volume else 0.0))
+
+    def profile_m(self) -> list[tuple[float, float]]:
+        """Return the corners r, z of the relief's profile from the axis to its rim at z = 0, metres."""
+        z = self.height_m - self.blank_m
+        z = np.where(np.abs(z) <= _SAME_M, 0.0, z)
+        corners = [(0.0, float(z[0]))]
+        for radius, beyond in zip(self.outer_m, np.append(z[1:], 0.0), strict=True):
+            if abs(beyond - corners[-1][1]) > _SAME_M:
+                corners += [(float(radius), corners[-1][1]), (float(radius), float(beyond))]
+        rim = float(self.outer_m[-1])
+        return corners if corners[-1][0] == rim else [*corners, (rim, 0.0)]
+
+
+def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | None, rings: Rings | None) -> None:
+    # Chrome may reach the edge of the glass; the rim of the relief must leave some surface around it.
+    most = {"clear aperture": (aperture_m / 2, 1 - 1e-6)}
+    if chrome is not None:
+        most["chrome"] = (chrome.outer_m, 1 + 1e-12)
+    for name, (radius, share) in most.items():
+        if not 0 < radius <= share * substrate.inside_m:
+            got = f"a diameter of {format_length(2 * radius)}"
+            rule = f"must lie inside the substrate's surface, a circle of {format_length(2 * substrate.inside_m)}"
+            raise InputError(name, rule, got, "Choose a larger die or a smaller circle.")
+    if rings is not None and not rings.outer_m[-1] <= aperture_m / 2 * (1 + 1e-9):
+        got = f"{format_length(float(rings.outer_m[-1]))} of {format_length(aperture_m / 2)}"
+        raise InputError("rings", "must lie inside the clear aperture", got, "Cut them at the aperture.")
+    if rings is not None and not rings.blank_m < substrate.thickness_m:
+        got = f"{format_length(rings.blank_m)} into {format_length(substrate.thickness_m)}"
+        raise InputError("rings", "must be less deep than the substrate is thick", got, "Check the two lengths.")
+
+
+def substrate_bodies(
+    substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
+) -> dict[str, Body]:
+    """Return volume and centre of every solid that `substrate_step` writes, by closed form and name."""
+    glass = substrate.body
+    if rings is not None:
+        gone = rings.removed
+        volume = glass.volume_m3 - gone.volume_m3
+        x, y, z = (
+            (whole * glass.volume_m3 - part * gone.volume_m3) / volume
+            for whole, part in zip(glass.centre_m, gone.centre_m, strict=True)
+        )
+        glass = Body(volume, (x, y, z))
+    return {"SUBSTRATE": glass, **({"CHROME": chrome.body} if chrome is not None else {})}
+
+
+def substrate_volumes_m3(
+    substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
+) -> dict[str, float]:
+    """Return the volume of every solid that `substrate_step` writes, by closed form, cubic metres by name."""
+    return {name: body.volume_m3 for name, body in substrate_bodies(substrate, chrome, rings).items()}
+
+
+def substrate_step(
+    path: str | Path,
+    substrate: Substrate,
+    aperture_m: float,
+    chrome: ChromeRing | None = None,
+    rings: Rings | None = None,
+) -> None:
+    """Write the plate as STEP: glass, chrome and the clear aperture in the datum plane.
+
+    Without rings the surface is flat, with the clear aperture as a face of its own.
+
+    Args:
+        path: the file.
+        substrate: the glass.
+        aperture_m: diameter of the clear aperture, metres.
+        chrome: the chrome on it, if any. It lies flat at z = 0, also where it reaches over etched rings.
+        rings: the relief, if it is radial.
+
+    Raises:
+        InputError: something does not fit, or the file cannot be written.
+    """
+    _require_fit(substrate, aperture_m, chrome, rings)
+    profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (aperture_m / 2, 0.0)]
+    surface = outline(substrate.width_m, None if substrate.outline == "die" else substrate.flat_m)
+    parts = {
+        "SUBSTRATE": plate(surface, substrate.thickness_m, profile),
+        "DATUM_CLEAR_APERTURE": disc(aperture_m / 2),
+    }
+    if chrome is not None:
+        parts["CHROME"] = chrome.solid()
+    write_step(path, "DOE", parts)
+
+
+def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
+    """Return volume and centre of every solid that `wafer_step` writes, by closed form and name."""
+    x, y = (math.fsum(axis) / len(places_m) for axis in zip(*places_m, strict=True))
+    one = chrome.body
+    return {"SUBSTRATE": wafer.body, "CHROME": Body(len(places_m) * one.volume_m3, (x, y, one.centre_m[2]))}
+
+
+def wafer_step(
+    path: str | Path, wafer: Substrate, aperture_m: float, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
+) -> None:
+    """Write a wafer as STEP before it is diced: flat glass, and chrome and clear aperture of every die.
+
+    Args:
+        path: the file.
+        wafer: the glass.
+        aperture_m: diameter of the clear apertures, metres.
+        chrome: the chrome of one die.
+        places_m: middles of the dies x, y, metres.
+
+    Raises:
+        InputError: a die does not fit, or the file cannot be written.
+    """
+    for x, y in places_m:
+        if not wafer.holds(x, y, chrome.outer_m):
+            got = f"a chrome of {format_length(2 * chrome.outer_m)} at {format_length(x)}, {format_length(y)}"
+            raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
+    parts = {
+        "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),
+        "DATUM_CLEAR_APERTURE": copies(disc(aperture_m / 2), places_m),
+        "CHROME": copies(chrome.solid(), places_m),
+    }
+    write_step(path, "WAFER", parts)

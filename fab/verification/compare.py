@@ -1,0 +1,239 @@
+"""What was read from a mask file against what it should hold; every difference becomes a sentence.
+
+Pure comparisons, no files. The sentences name the layer, how many pixels or shapes differ, and the first.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.gds.gdstk_reader import Reading
+from fab.layout.compensation import read_back
+from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
+from fab.layout.polygons import doubled_area, paint
+from fab.manifest.cells import cell_entry, shapes_digest
+from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
+from fab.units import MM, NM, UM
+
+Drawn = MaskEntry | DrawnEntry
+
+__all__ = ["Expected", "cell_problems", "layout_problems", "reading_problems"]
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What the files of an order should hold.
+
+    Attributes:
+        manifest: the manifest of the order.
+        planes: ``[bit, y, x]`` the pixels each etch mask should open.
+        edges: where the pixel edges fall in the drawing.
+    """
+
+    manifest: Manifest
+    planes: NDArray[np.uint8]
+    edges: PixelEdges
+
+    def etch_layers(self, entry: FileEntry) -> dict[str, dict[Layer, Drawn]]:
+        """Return for every cell of the DOE the etch layers that a file should hold, each with what it draws."""
+        return {
+            cell: {
+                Layer(one.layer, one.datatype): one
+                for one in drawn
+                if str(Layer(one.layer, one.datatype)) in entry.layers
+            }
+            for cell, drawn in self.manifest.drawn().items()
+        }
+
+    def chrome_layer(self, entry: FileEntry) -> Layer | None:
+        """Return the chrome layer if a file should hold it."""
+        layer = Layer(self.manifest.chrome.layer, self.manifest.chrome.datatype)
+        return layer if str(layer) in entry.layers else None
+
+
+def _pixel_problems(layer: Layer, differs: NDArray[np.bool_]) -> list[str]:
+    count = int(np.count_nonzero(differs))
+    if not count:
+        return []
+    row, column = np.unravel_index(int(np.argmax(differs)), differs.shape)
+    noun = "pixel differs" if count == 1 else "pixels differ"
+    return [f"layer {layer}: {count} {noun} from the level map, the first at row {row}, column {column}"]
+
+
+def _count_problem(layer: Layer, count: int, what: str) -> list[str]:
+    return [f"layer {layer}: {count} {what}"] if count else []
+
+
+def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: ChromeEntry, dbu_m: float) -> list[str]:
+    """Check that polygons make the stated annulus: count, radii, chords, area, and every vertex."""
+    if len(polygons) != chrome.polygons:
+        return [f"layer {layer}: {len(polygons)} chrome polygons instead of {chrome.polygons}"]
+    inner, outer = (mm * MM / 2 / dbu_m for mm in (chrome.opening_diameter_mm, chrome.outer_diameter_mm))
+    x, y = np.concatenate(polygons).astype(np.float64).T
+    radius = np.hypot(x, y)
+    # A vertex is rounded by up to half a unit in x and in y.
+    on_inner, on_outer = (np.abs(radius - wanted) <= 1 for wanted in (inner, outer))
+    problems = _count_problem(
+        layer, int(np.count_nonzero(~(on_inner | on_outer))), "chrome vertices lie on neither of the two circles"
+    )
+    chord = chrome.chord_error_nm * NM / dbu_m + 1
+    for name, on_circle, wanted in (("opening", on_inner, inner), ("outer edge", on_outer, outer)):
+        angle = np.sort(np.arctan2(y[on_circle], x[on_circle]))
+        widest = np.max(np.diff(angle, append=angle[:1] + 2 * math.pi), initial=0.0) if angle.size else 2 * math.pi
+        sagitta = wanted * (1 - math.cos(min(widest, 2 * math.pi) / 2))
+        if sagitta > chord:
+            problems.append(f"layer {layer}: the {name} leaves its circle by {sagitta * dbu_m / NM:.3g} nm")
+    area = sum(abs(doubled_area(polygon)) for polygon in polygons) / 2
+    off = abs(area - math.pi * (outer**2 - inner**2))
+    if off > 2 * math.pi * (outer + inner) * chord:
+        problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
+    drawn = Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygon.astype(np.int32) for polygon in polygons))
+    if shapes_digest(drawn) != chrome.shapes_sha256:
+        problems.append(f"layer {layer}: the chrome has another vertex, or one elsewhere")
+    return problems
+
+
+def _etch_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expected) -> list[str]:
+    """Compare one etch layer, as the own reader found it, with its plane."""
+    missing = abs(len(shapes) - mask.polygons)
+    counted = _count_problem(layer, missing, f"polygons more or less than the {mask.polygons} of the manifest")
+    if mask.edge_move_nm:
+        return counted + _moved_problems(layer, shapes, mask, expected)
+    canvas = np.zeros(expected.planes.shape[1:], dtype=np.uint8)
+    painted = paint(shapes.rectangles, expected.edges.x, expected.edges.y, 0, canvas)
+    return [
+        *counted,
+        *_count_problem(layer, len(shapes.polygons), "shapes are no rectangles"),
+        *_count_problem(
+            layer, painted.strays, f"rectangles are off the pixel raster, the first is number {painted.first_stray}"
+        ),
+        *_count_problem(layer, painted.overlaps, "pixels are covered more than once"),
+        *_pixel_problems(layer, canvas != expected.planes[mask.bit]),
+    ]
+
+
+def _moved_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expected) -> list[str]:
+    """Compare one etch layer whose edges were moved against the bias of the process: moved back, it is its plane."""
+    try:
+        plane = read_back(shapes, expected.edges, round(mask.edge_move_nm / expected.manifest.dbu_nm))
+    except InputError as error:
+        return [f"layer {layer}: {error.rule}, but got {error.got}"]
+    return _pixel_problems(layer, plane != expected.planes[mask.bit])
+
+
+def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
+    """Compare a file, as this package's own reader found it, with what it should hold.
+
+    Args:
+        layout: the content of the file.
+        entry: the manifest's entry of the file.
+        expected: what the order should hold.
+
+    Returns:
+        One sentence per difference.
+    """
+    problems = []
+    if layout.top.name != entry.cell:
+        problems.append(f"the top cell is named {layout.top.name!r} instead of {entry.cell!r}")
+    if abs(layout.dbu_m / expected.edges.dbu_m - 1) > 1e-9:
+        right = expected.edges.dbu_m
+        problems.append(f"the database unit is {layout.dbu_m / NM:.9g} nm instead of {right / NM:.9g} nm")
+    etch = expected.etch_layers(entry)
+    others = (cell for cell in layout.cells if cell.name not in etch)
+    problems += cell_problems(others, entry, expected.edges.dbu_m)
+    for name, layers in etch.items():
+        problems += _doe_problems(layout.cell(name), name, layers, expected.chrome_layer(entry), expected)
+    return problems
+
+
+def _doe_problems(
+    doe: Cell | None, name: str, etch: Mapping[Layer, Drawn], chrome: Layer | None, expected: Expected
+) -> list[str]:
+    """Compare one cell of the DOE with what it should draw."""
+    if doe is None:
+        return [f"cell {name} is missing"]
+    problems = [f"cell {name} places others"] if doe.references else []
+    none = Shapes(np.empty((0, 4), dtype=np.int32))
+    for layer, shapes in doe.shapes.items():
+        if layer not in etch and layer != chrome:
+            problems += _count_problem(layer, len(shapes), "shapes on a layer that should be empty")
+    for layer, mask in etch.items():
+        problems += _etch_problems(layer, doe.shapes.get(layer, none), mask, expected)
+    if chrome is not None:
+        shapes = doe.shapes.get(chrome, none)
+        problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
+        problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, expected.edges.dbu_m)
+    # A split has the layers of the plate itself, so its problems need its name.
+    return problems if name == expected.manifest.doe_cell else [f"cell {name}: {problem}" for problem in problems]
+
+
+def cell_problems(cells: Iterable[Cell], entry: FileEntry, dbu_m: float) -> list[str]:
+    """Compare the cells around the DOE (marks, labels, dies, plate) with the manifest.
+
+    Args:
+        cells: every cell of the file but that of the DOE.
+        entry: the manifest's entry of the file.
+        dbu_m: database unit of the order, metres.
+
+    Returns:
+        One sentence per difference.
+    """
+    found = {cell.name: cell_entry(cell, dbu_m) for cell in cells}
+    stated = {cell.cell: cell for cell in entry.cells}
+    problems = [f"cell {name} should not be there" for name in sorted(set(found) - set(stated))]
+    problems += [f"cell {name} is missing" for name in sorted(set(stated) - set(found))]
+    for name in stated.keys() & found.keys():
+        problems += _entry_problems(found[name], stated[name])
+    return problems
+
+
+def _entry_problems(found: CellEntry, stated: CellEntry) -> list[str]:
+    where = f"cell {stated.cell}"
+    problems = [] if found.places == stated.places else [f"{where}: it places other cells, or elsewhere"]
+    here, wanted = ({layer.layer: layer for layer in one.layers} for one in (found, stated))
+    for name in sorted(here.keys() | wanted.keys()):
+        have, want = here.get(name), wanted.get(name)
+        if have is None or want is None:
+            problems.append(f"{where}: layer {name} {'is missing' if have is None else 'should be empty'}")
+        elif have != want:
+            count = f"{have.polygons} shapes of {have.area_um2:.6g} um^2"
+            problems.append(
+                f"{where}: layer {name}: {count} instead of {want.polygons} of {want.area_um2:.6g} um^2, or elsewhere"
+            )
+    return problems
+
+
+def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> list[str]:
+    """Compare one layer, as the other library found it, with what it should hold.
+
+    Args:
+        reading: the layer.
+        entry: the manifest's entry of the file.
+        expected: what the order should hold.
+
+    Returns:
+        One sentence per difference.
+    """
+    problems = _reading_problems(reading, expected.etch_layers(entry)[reading.cell].get(reading.layer), expected)
+    plate = reading.cell == expected.manifest.doe_cell
+    return problems if plate else [f"cell {reading.cell}: {problem}" for problem in problems]
+
+
+def _reading_problems(reading: Reading, mask: Drawn | None, expected: Expected) -> list[str]:
+    layer, winding = reading.layer, reading.winding
+    problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
+    if mask is not None and reading.moved is not None:
+        return problems + _moved_problems(layer, reading.moved, mask, expected)
+    if mask is None:
+        covered = int(np.count_nonzero(winding))
+        problems += _count_problem(layer, covered, "pixels are covered by rectangles in the chrome")
+        return problems + _chrome_problems(
+            layer, list(reading.polygons), expected.manifest.chrome, expected.edges.dbu_m
+        )
+    problems += _count_problem(layer, len(reading.polygons), "shapes are no rectangles")
+    problems += _count_problem(layer, int(np.count_nonzero(winding > 1)), "pixels are covered more than once")
+    return problems + _pixel_problems(layer, (winding > 0) != expected.planes[mask.bit])

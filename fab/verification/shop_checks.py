@@ -1,0 +1,196 @@
+"""What a mask shop looks at on receipt, whatever is drawn: every shape by itself, where all of them lie, their numbers.
+
+A mask writer takes simple polygons of up to 199 vertices and of some area, whose edges neither cross nor meet at less
+than 45 degrees, and nothing beyond the blank. These questions are put to the drawing, not to the manifest, so that a
+drawing which was wrong from the beginning fails, too. The numbers of the order form (areas, boxes, narrowest line and
+space, density) are taken again from the drawing and from the level map.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.files import canonical_json
+from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, require_name
+from fab.layout.polygons import MAX_VERTICES, doubled_area, smallest_runs
+from fab.manifest.cells import geometry
+from fab.manifest.records import FileEntry, Manifest
+from fab.rules.check import Rules, check
+from fab.units import MM, UM, format_length
+from fab.verification.compare import Expected
+
+__all__ = ["drawing_problems", "number_problems"]
+
+_LEAST_ANGLE_RAD = math.pi / 4
+# A right angle or half of one whose corners were rounded to the database unit.
+_SLACK = 1e-3
+# Of one layer of one cell; a sound drawing has a few dozen that are no rectangles.
+_MOST_LOOKED_AT = 2000
+
+
+def drawing_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
+    """Look at every shape and every name of a file, at where all of it lies, and at the stated areas.
+
+    Args:
+        layout: the content of the file.
+        entry: the manifest's entry of the file.
+        expected: what the order should hold.
+
+    Returns:
+        One sentence per kind of defect, cell and layer.
+    """
+    problems = [problem for cell in layout.cells for problem in _cell_problems(cell)]
+    problems += _place_problems(layout, expected.manifest.wafer.blank_mm * MM)
+    return problems + _stated_problems(layout, entry, expected)
+
+
+def _cell_problems(cell: Cell) -> Iterator[str]:
+    try:
+        require_name(cell.name)
+    except InputError as error:
+        yield f"the name of cell {cell.name!r} {error.rule}"
+    for layer, shapes in cell.shapes.items():
+        where = f"cell {cell.name}: layer {layer}"
+        defects = [defect for polygon in shapes.polygons[:_MOST_LOOKED_AT] for defect in _defects(polygon)]
+        for kind in dict.fromkeys(defects):
+            yield f"{where}: {defects.count(kind)} polygons {kind}"
+
+
+def _defects(polygon: NDArray[np.integer]) -> Iterator[str]:
+    """Yield what a mask writer would not take of a polygon."""
+    points = np.asarray(polygon, dtype=np.int64)
+    if len(points) > MAX_VERTICES:
+        yield f"of more than {MAX_VERTICES} vertices"
+        return
+    edges = np.roll(points, -1, axis=0) - points
+    if not edges.any(axis=1).all():
+        yield "with a doubled vertex"
+        return
+    if doubled_area(points) == 0:
+        yield "without area"
+        return
+    back, on = -np.roll(edges, 1, axis=0).astype(np.float64), edges.astype(np.float64)
+    cosine = np.sum(back * on, axis=1) / (np.hypot(*back.T) * np.hypot(*on.T))
+    if np.any(cosine > math.cos(_LEAST_ANGLE_RAD) + _SLACK):
+        yield "with an angle below 45 degrees"
+    if _crosses(points):
+        yield "that cross or touch themselves"
+
+
+def _side(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
+    """On which side of the line a-b the point c lies: 1, -1, or 0 on it."""
+    u, v = b - a, c - a
+    return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+
+def _crosses(points: NDArray[np.int64]) -> bool:
+    """Whether two edges of a polygon that are no neighbours meet; a vertex on another edge counts."""
+    count = len(points)
+    first, second = np.triu_indices(count, 2)
+    apart = (second - first) % count != count - 1
+    first, second = first[apart], second[apart]
+    ahead = np.roll(points, -1, axis=0)
+    a, b, c, d = points[first], ahead[first], points[second], ahead[second]
+    # Edges whose boxes do not meet are out of the question, and those on one line meet if their boxes do.
+    meet = (np.minimum(a, b) <= np.maximum(c, d)).all(axis=1) & (np.minimum(c, d) <= np.maximum(a, b)).all(axis=1)
+    a, b, c, d = a[meet], b[meet], c[meet], d[meet]
+    return bool(np.any((_side(a, b, c) * _side(a, b, d) <= 0) & (_side(c, d, a) * _side(c, d, b) <= 0)))
+
+
+Box = tuple[int, int, int, int]
+
+
+def _around(boxes: list[Box]) -> Box:
+    low_x, low_y, high_x, high_y = zip(*boxes, strict=True)
+    return min(low_x), min(low_y), max(high_x), max(high_y)
+
+
+def _boxes(cell: Cell, done: Mapping[str, dict[Layer, Box]]) -> dict[Layer, Box]:
+    """Return what each layer of a cell covers, with all that it places."""
+    found: dict[Layer, list[Box]] = {}
+    for layer, shapes in cell.shapes.items():
+        box = shapes.box
+        if box is not None:
+            found.setdefault(layer, []).append(box)
+    for reference in cell.references:
+        for layer, box in done[reference.cell].items():
+            found.setdefault(layer, []).append(_placed(box, reference))
+    return {layer: _around(boxes) for layer, boxes in found.items()}
+
+
+def _placed(box: Box, at: Reference) -> Box:
+    far_x, far_y = at.x + (at.columns - 1) * at.step_x, at.y + (at.rows - 1) * at.step_y
+    return (
+        box[0] + min(at.x, far_x),
+        box[1] + min(at.y, far_y),
+        box[2] + max(at.x, far_x),
+        box[3] + max(at.y, far_y),
+    )
+
+
+def _place_problems(layout: Layout, blank_m: float) -> list[str]:
+    done: dict[str, dict[Layer, Box]] = {}
+    for cell in layout.cells:
+        done[cell.name] = _boxes(cell, done)
+    most = round(blank_m / 2 / layout.dbu_m)
+    return [
+        f"layer {layer} reaches {format_length(reach * layout.dbu_m)} from the middle, beyond the blank of "
+        f"{format_length(blank_m)}"
+        for layer, box in done[layout.top.name].items()
+        if (reach := max(abs(edge) for edge in box)) > most
+    ]
+
+
+def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
+    """Compare counts, areas and boxes of the DOE with those of the manifest."""
+    problems = []
+    none = Shapes(np.empty((0, 4), dtype=np.int32))
+    chrome = expected.chrome_layer(entry)
+    for name, drawn in expected.etch_layers(entry).items():
+        cell = layout.cell(name)
+        stated = {**drawn, **({chrome: expected.manifest.chrome} if chrome is not None else {})}
+        for layer, one in stated.items():
+            if cell is None:
+                break
+            found = geometry(cell.shapes.get(layer, none), layout.dbu_m)
+            wanted = {"polygons": one.polygons, "area_um2": one.area_um2, "box_um": one.box_um}
+            problems += [
+                f"cell {name}: layer {layer}: {key} is {found[key]} and not {wanted[key]} as the manifest says"
+                for key in wanted
+                if found[key] != wanted[key]
+            ]
+    return problems
+
+
+def number_problems(
+    manifest: Manifest, planes: NDArray[np.uint8], level_map: NDArray[np.uint8]
+) -> dict[str, list[str]]:
+    """Take the numbers of the order form again from the level map.
+
+    Args:
+        manifest: states them.
+        planes: ``[bit, y, x]`` the pixels each etch mask opens.
+        level_map: level numbers ``[y, x]``.
+
+    Returns:
+        One sentence per difference, by the file that it concerns.
+    """
+    grid, levels = manifest.grid(), manifest.staircase()
+    problems: dict[str, list[str]] = {}
+    for mask in manifest.masks:
+        found = [None if n is None else round(n * grid.pitch_m / UM, 6) for n in smallest_runs(planes[mask.bit])]
+        stated = [mask.smallest_width_um, mask.smallest_space_um]
+        if found != stated:
+            told = f"narrowest line and space are {found} um and not {stated} um as the manifest says"
+            problems.setdefault(mask.file, []).append(told)
+    try:
+        report = check(level_map, levels, grid, manifest.aperture_m, Rules(**manifest.rules.get("rules", {})))
+    except (TypeError, InputError) as error:
+        return {**problems, "manifest.json": [f"the rules cannot be read: {error}"]}
+    if canonical_json(report.as_record()) != canonical_json(manifest.rules):
+        said = "lines, spaces, corners and density are not those that the rules find in the level map"
+        problems["manifest.json"] = [said]
+    return problems

@@ -1,0 +1,287 @@
+"""The proof of a mask order: read every file back and compare every pixel with the level map.
+
+Three questions are put to each mask file, and all of them are always asked, so that a report says not
+only that a file changed but also what in the drawing is different:
+
+1. Are its bytes those of the manifest (SHA-256)?
+2. Read by this package's own reader, do its polygons give the stored level map, pixel by pixel, without
+   an overlap, an edge off the raster, or a shape that does not belong there? Can every shape be written, and is all of
+   it on the blank (`fab.verification.shop_checks`)?
+3. Does a library that had no part in the writing (gdstk) see the same?
+
+gdstk is not safe against broken streams. It is therefore given only GDSII files that the own reader
+accepts, and OASIS files whose bytes are those of the manifest; an altered OASIS file goes through KLayout,
+which refuses what is broken, and then through the own reader.
+"""
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import CheckFailed, InputError
+from fab.files import explain_os_error, read_npy, sha256_file
+from fab.gds.gdstk_reader import Again
+from fab.gds.reader import read_gds
+from fab.gds.writer import oasis_to_gds
+from fab.layout.compensation import read_back
+from fab.layout.geometry import Layer, PixelEdges, layer_from, pixel_edges
+from fab.layout.polygons import paint
+from fab.levels import Levels
+from fab.manifest.records import FileEntry, Manifest, map_digest, plane_digest, read_manifest
+from fab.masks import planes
+from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
+from fab.verification.models import model_problems
+from fab.verification.shop_checks import drawing_problems, number_problems
+
+__all__ = ["Check", "Report", "read_level_map", "verify_order"]
+
+_GDS, _OASIS = "GDSII", "OASIS"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One question and its answer.
+
+    Attributes:
+        file: the file that was asked about.
+        question: what was asked.
+        problems: one sentence per difference; empty if there is none.
+    """
+
+    file: str
+    question: str
+    problems: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing differs."""
+        return not self.problems
+
+
+@dataclass(frozen=True)
+class Report:
+    """All checks of a mask order, in the order they were made."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check holds."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """One sentence per difference, each naming its file first."""
+        return tuple(f"{c.file}: {c.question}: {problem}" for c in self.checks for problem in c.problems)
+
+    def require(self) -> None:
+        """Raise if anything differs.
+
+        Raises:
+            CheckFailed: with the differences.
+        """
+        if not self.passed:
+            raise CheckFailed(self.differences)
+
+
+def _check_bytes(folder: Path, entry: FileEntry) -> Check:
+    path = folder / entry.file
+    if not path.is_file():
+        problems = ["the file is missing"]
+    elif path.stat().st_size != entry.bytes:
+        problems = [f"{path.stat().st_size} bytes instead of {entry.bytes}"]
+    elif sha256_file(path) != entry.sha256:
+        problems = ["the SHA-256 differs"]
+    else:
+        problems = []
+    return Check(entry.file, "bytes as in the manifest", tuple(problems))
+
+
+def _check_nothing_else(folder: Path, manifest: Manifest) -> list[Check]:
+    listed = {entry.file for entry in manifest.files}
+    found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas"))
+    return [
+        Check(name, "listed in the manifest", ("a mask file that the manifest does not know",))
+        for name in found
+        if name not in listed
+    ]
+
+
+def _stored_map(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
+    """Return the stored level map if it can be one of this order, whatever its digest."""
+    try:
+        stored = read_npy(folder / manifest.level_map_file)
+    except InputError:
+        return None
+    fits = stored.dtype == np.uint8 and list(stored.shape) == manifest.shape
+    return stored if fits and stored.max() < manifest.levels else None
+
+
+def read_level_map(
+    path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
+) -> NDArray[np.uint8]:
+    """Rebuild the level map that a combined GDSII file draws, with this package's own reader.
+
+    Args:
+        path: the combined file, bit k on layer k + 1.
+        levels: the staircase.
+        edges: where the pixel edges fall in the drawing.
+        cell: name of the cell with the planes.
+        moves: how far the edges of every mask were moved outward, database units (`Manifest.edge_moves`).
+
+    Returns:
+        Level numbers ``[y, x]``.
+
+    Raises:
+        InputError: the file is missing or corrupt, or draws something else than a plane of pixels.
+    """
+    etched = np.zeros((edges.y.size - 1, edges.x.size - 1), dtype=np.uint8)
+    drawn = read_gds(path).cell(cell)
+    if drawn is None:
+        raise InputError(str(path), f"must hold the cell {cell}", "none of that name", "Write the order again.")
+    for bit, move in zip(range(levels.bits), moves or (0,) * levels.bits, strict=True):
+        shapes = drawn.shapes.get(Layer(bit + 1))
+        if shapes is None:
+            continue
+        if move:
+            etched |= read_back(shapes, edges, move) << np.uint8(bit)
+            continue
+        painted = paint(shapes.rectangles, edges.x, edges.y, bit, etched)
+        if shapes.polygons or painted.strays or painted.overlaps:
+            rule = f"layer {bit + 1}/0 must hold separate rectangles on the pixel raster"
+            got = f"{len(shapes.polygons) + painted.strays} other shapes and {painted.overlaps} pixels covered twice"
+            raise InputError(str(path), rule, got, "Write the order again.")
+    return np.uint8(levels.count - 1) - etched
+
+
+def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdges) -> tuple[NDArray[np.uint8], Check]:
+    """Return the map to compare with, and whether the stored one is that of the manifest.
+
+    A damaged copy of the level map must not put the blame on the masks: if the stored one is not that of the
+    manifest but the one drawn in the combined file is, that one is taken.
+    """
+    stored = _stored_map(folder, manifest)
+    question = "the level map as in the manifest"
+    if stored is not None and map_digest(stored) == manifest.level_map_sha256:
+        return stored, Check(manifest.level_map_file, question, ())
+    failed = Check(manifest.level_map_file, question, ("the level map is unreadable or its digest differs",))
+    try:
+        moves = manifest.edge_moves()
+        drawn = read_level_map(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
+    except InputError:
+        drawn = None
+    if drawn is not None and map_digest(drawn) == manifest.level_map_sha256:
+        return drawn, failed
+    if stored is not None:
+        return stored, failed
+    raise CheckFailed([f"{failed.file}: {problem}; no other file holds that map" for problem in failed.problems])
+
+
+def _check_plane_digests(expected: Expected) -> list[Check]:
+    return [
+        Check(mask.file, "digest of the plane in the manifest", ("it is not that of the level map",))
+        for mask in expected.manifest.masks
+        if plane_digest(expected.planes[mask.bit]) != mask.plane_sha256
+    ]
+
+
+def _check_numbers(expected: Expected, reference: NDArray[np.uint8]) -> list[Check]:
+    found = number_problems(expected.manifest, expected.planes, reference)
+    return [Check(file, "numbers of the order form", tuple(problems)) for file, problems in found.items()]
+
+
+def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check, bool]:
+    """Return what the own reader finds, and whether the file is fit for a library that trusts it."""
+    question = "own reader, every pixel"
+    try:
+        layout = read_gds(path)
+    except InputError as error:
+        problem = f"it cannot be read: {error.rule}, but got {error.got}"
+        return Check(entry.file, question, (problem,)), False
+    fit = abs(layout.dbu_m / expected.edges.dbu_m - 1) < 1e-9
+    problems = layout_problems(layout, entry, expected) + drawing_problems(layout, entry, expected)
+    return Check(entry.file, question, tuple(problems)), fit
+
+
+def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
+    around = sum(one.polygons for cell in entry.cells for one in cell.layers)
+    does = expected.manifest.drawn().values()
+    etched = sum(one.polygons for drawn in does for one in drawn)
+    most = 2 * (etched + len(does) * expected.manifest.chrome.polygons + around)
+    with tempfile.TemporaryDirectory() as folder:
+        gds = Path(folder) / "altered.gds"
+        try:
+            oasis_to_gds(path, gds, most)
+        except InputError as error:
+            return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.got}",))
+        return _own_check(gds, entry, expected)[0]
+
+
+def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
+    layers: Counter[Layer] = Counter()
+    for drawn in expected.etch_layers(entry).values():
+        layers.update({layer: mask.polygons for layer, mask in drawn.items()})
+    chrome = expected.chrome_layer(entry)
+    if chrome is not None:
+        layers[chrome] = expected.manifest.chrome.polygons
+    moved = {
+        cell: [layer for layer, mask in drawn.items() if mask.edge_move_nm]
+        for cell, drawn in expected.etch_layers(entry).items()
+    }
+    again = Again(moved, expected.edges)
+    others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
+    readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
+    problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
+    problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
+    return Check(entry.file, "gdstk, every pixel", tuple(problems))
+
+
+def _check_mask_file(folder: Path, entry: FileEntry, intact: bool, expected: Expected) -> list[Check]:
+    path = folder / entry.file
+    if not path.is_file():
+        return []
+    if entry.format == _OASIS:
+        return [(_library_check if intact else _altered_oasis)(path, entry, expected)]
+    own, fit = _own_check(path, entry, expected)
+    return [own, _library_check(path, entry, expected)] if fit else [own]
+
+
+def verify_order(folder: str | Path) -> Report:
+    """Read a mask order back, with two readers, and compare every pixel with its level map.
+
+    Args:
+        folder: a folder written by `write_order`.
+
+    Returns:
+        The checks; `Report.require` raises if any failed.
+
+    Raises:
+        InputError: the folder is not a mask order, or its manifest is corrupt.
+        CheckFailed: no level map is left to compare with.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    levels = manifest.staircase()
+    edges = pixel_edges(manifest.grid())
+    try:
+        byte_checks = {entry.file: _check_bytes(folder, entry) for entry in manifest.files}
+        checks = [*byte_checks.values(), *_check_nothing_else(folder, manifest)]
+        reference, map_check = _reference(folder, manifest, levels, edges)
+        expected = Expected(manifest, planes(reference, levels), edges)
+        checks += [map_check, *_check_plane_digests(expected), *_check_numbers(expected, reference)]
+        for entry in manifest.files:
+            if entry.format in (_GDS, _OASIS):
+                checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)
+        for model in manifest.models:
+            # Libraries of solids and pictures are given whole files only.
+            if byte_checks[model.file].passed:
+                problems = model_problems(folder, model, manifest, reference)
+                checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
+    except OSError as error:
+        raise explain_os_error(error, folder) from error
+    return Report(tuple(checks))

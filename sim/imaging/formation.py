@@ -1,0 +1,324 @@
+"""From a scene in layers to the light on the sensor, differentiable in PSFs and images.
+
+How an obstruction takes light from what is behind it is the choice of a model by name (`sim.imaging.occlusion`).
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fab.errors import InputError
+from sim.camera import Camera
+from sim.imaging.convolve import Border, Otf, Window, convolve, plan_otf, superpose
+from sim.imaging.disc import disc_window, shadow_disc
+from sim.imaging.occlusion import (
+    Layers,
+    Light,
+    Model,
+    Outside,
+    check_names,
+    compose,
+    eq_10_alpha,
+    follows_light,
+    with_spot,
+)
+from sim.imaging.scene import Depth, Scene
+from sim.psf_bank import PsfBank
+
+
+class Optics(eqx.Module):
+    """What a capture needs to know of a camera.
+
+    Attributes:
+        psf: `[layer, c, y, x]` PSFs of the background and then of every obstruction, from the farthest to the nearest,
+            in energy per pixel. An odd window keeps the capture registered with the scene (`sim.imaging.convolve`).
+        aperture_m: diameter of the clear aperture, metres.
+        focal_m: distance from the lens to the sensor, metres.
+        pixel_m: pixel pitch, metres.
+        shadow_px: pixels of the odd window that holds every shadow disc. Only where depths are traced, as in a compiled
+            function over many of them; otherwise None, and the depths say it. A traced depth whose disc does not
+            fit gives NaN, never a smaller shadow.
+    """
+
+    psf: Float[Array, "layer c ky kx"] | Float[np.ndarray, "layer c ky kx"]
+    aperture_m: float = eqx.field(static=True)
+    focal_m: float = eqx.field(static=True)
+    pixel_m: float = eqx.field(static=True)
+    shadow_px: int | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float], shadow_px: int | None = None) -> "Optics":
+        """Optics for layers at given depths, background first, from a bank.
+
+        Between two depths of the bank PSFs are mixed linearly in 1/z, as the width of a blur grows.
+
+        Raises:
+            InputError: a depth beyond the bank's.
+        """
+        psf = np.stack([psf_at(bank, depth) for depth in depths_m])
+        return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m, shadow_px)
+
+    @property
+    def window(self) -> Window:
+        """Samples (y, x) of a PSF."""
+        return self.psf.shape[-2], self.psf.shape[-1]
+
+    def disc_px(self, depth_m: Depth, behind_m: Depth) -> Float[Array, ""] | float:
+        """Diameter in pixels of the shadow disc of a point at `behind_m` in the plane at `depth_m`.
+
+        Raises:
+            ValueError: the plane is not before the point.
+        """
+        near, far, width = _known(depth_m), _known(behind_m), self.aperture_m * self.focal_m / self.pixel_m
+        if near is None or far is None:
+            return width * (1 / jnp.asarray(depth_m) - 1 / jnp.asarray(behind_m))
+        if not 0 < near < far:
+            raise ValueError(f"an obstruction must be nearer than what it covers, but got {near} m before {far} m")
+        return width * (1 / near - 1 / far)
+
+    def prepared(self, shape: Window, border: Border = "reflect") -> "Prepared":
+        """The same optics with the PSFs' transforms, for many scenes of one shape.
+
+        Args:
+            shape: pixels (y, x) of the scenes; with their own margin and a model that follows the light, less the
+                margin that the shadow discs take (`capture`).
+            border: what lies beyond a scene.
+        """
+        return Prepared(self, plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
+
+
+def _known(depth_m: Depth) -> float | None:
+    """A depth as a number; None while it is traced."""
+    try:
+        return float(depth_m)
+    except jax.errors.ConcretizationTypeError:
+        return None
+
+
+class Prepared(eqx.Module):
+    """Optics with the transforms of their PSFs; `Optics.prepared` makes one.
+
+    Attributes:
+        optics: what they were made from.
+        otf: `[c, layer, fx, fy]` transforms; its layers are those of `with_spot`.
+    """
+
+    optics: Optics
+    otf: Otf
+
+
+def psf_at(bank: PsfBank, depth_m: float) -> Float[np.ndarray, "c y x"]:
+    """PSFs of every colour at a depth, mixed linearly in 1/z from the two nearest of a bank.
+
+    Raises:
+        InputError: a depth beyond the bank's.
+    """
+    order = np.argsort([1 / depth for depth in bank.depths_m])
+    curvatures = np.array([1 / bank.depths_m[d] for d in order])
+    # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.
+    wanted, slack = 1 / depth_m, 1e-6 * curvatures[-1]
+    if not curvatures[0] - slack <= wanted <= curvatures[-1] + slack:
+        depths = sorted(bank.depths_m)
+        rule = f"must lie within the depths of the PSF bank, {depths[0]:g} to {depths[-1]:g} m"
+        raise InputError("depth", rule, f"{depth_m:g} m", "Compute the bank for this depth too.")
+    place = float(np.interp(wanted, curvatures, np.arange(len(order))))
+    low = min(int(place), len(order) - 1)
+    share = np.float32(place - low)
+    lower = bank.energy[:, order[low]]
+    return lower if share == 0 else (1 - share) * lower + share * bank.energy[:, order[low + 1]]
+
+
+def capture(
+    scene: Scene,
+    optics: Optics | Prepared,
+    model: Model,
+    *,
+    border: Border = "reflect",
+    outside: Outside = "scene",
+) -> Float[Array, "c v u"]:
+    """Light on the sensor, relative to a white scene through a lossless lens of the same aperture; no noise.
+
+    Compiled once per shape, model and window of the shadow discs, whatever the depths.
+
+    Args:
+        scene: background and obstructions, linear light.
+        optics: PSFs of every layer of the scene.
+        model: how layers are put together; see above.
+        border: what lies beyond the scene (`sim.imaging.convolve`). With `own` the capture is smaller than the scene,
+            by the PSF's window and, where the model follows the light, that of the shadow discs (`shadow_px`), which
+            `reciprocal` needs twice.
+        outside: what I_obs holds where there is no obstruction; for the paper's models.
+
+    Returns:
+        `[c, y, x]`, differentiable in PSFs and images. Where nothing lands, rounding of the transforms may leave
+        values of about -1e-7 of the brightest.
+
+    Raises:
+        ValueError: PSFs of another number of layers or colours, layers of another shape, an obstruction that is not
+            before the background, or an unknown name.
+    """
+    check_names(model, outside)
+    plain = optics.optics if isinstance(optics, Prepared) else optics
+    check_layers(scene, *plain.psf.shape[:2])
+    window = shadow_px(scene, plain) if follows_light(model) else 1
+    y, x = scene.background.shape[1:]
+    margin = own_margin_px(1, window, model) if border == "own" else 0
+    lit = (y - margin, x - margin)
+    if isinstance(optics, Prepared) and (optics.otf.shape, optics.otf.border) != (lit, border):
+        wanted, got = f"{lit} and {border!r}", f"{optics.otf.shape} and {optics.otf.border!r}"
+        raise ValueError(f"`optics` must be prepared for the shape and border {wanted}, but got {got}")
+    discs = shadow_discs(scene, plain, window) if follows_light(model) else ()
+    kernels = optics.otf if isinstance(optics, Prepared) else jnp.swapaxes(jnp.asarray(plain.psf), 0, 1)
+    if model == "reciprocal" and not isinstance(kernels, Otf):
+        kernels = jnp.asarray(with_spot(kernels))
+    layers = Layers(
+        scene.background, tuple(o.mask for o in scene.obstructions), tuple(o.radiance for o in scene.obstructions)
+    )
+    return _formed(layers, discs, kernels, model, outside, lit, border)
+
+
+def own_margin_px(psf_px: int, shadow_px: int, model: Model) -> int:
+    """Pixels per axis by which a scene that brings its margin along (`border="own"`) is larger than its capture.
+
+    Args:
+        psf_px: window of the PSFs.
+        shadow_px: window of the shadow discs.
+        model: how layers are put together; the paper's models cast no shadow, `reciprocal` casts it twice.
+    """
+    shadows = 2 if model == "reciprocal" else int(follows_light(model))
+    return psf_px - 1 + shadows * (shadow_px - 1)
+
+
+def lost_share(scene: Scene, optics: Optics, model: Model) -> Float[Array, "c v u"]:
+    """Share of the background's light that a model takes away; the view is mirrored at its edges.
+
+    Args:
+        scene: one obstruction before a background.
+        optics: PSFs of both.
+        model: how layers are put together.
+
+    Returns:
+        `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10 otherwise, 0 to 1.
+
+    Raises:
+        ValueError: a scene of another number of obstructions, or an unknown name.
+    """
+    check_names(model, "scene")
+    if len(scene.obstructions) != 1:
+        raise ValueError(f"`scene` must have one obstruction, but got {len(scene.obstructions)}")
+    mask, shape = scene.obstructions[0].mask, (scene.background.shape[1], scene.background.shape[2])
+    if follows_light(model):
+        (disc,) = shadow_discs(scene, optics, shadow_px(scene, optics))
+        share = convolve(mask[None], plan_otf(disc, shape, "reflect"))
+    else:
+        otf = plan_otf(jnp.swapaxes(jnp.asarray(optics.psf), 0, 1), shape, "reflect")
+        colours = (_Patch(_layer(otf, colour)) for colour in range(scene.background.shape[0]))
+        release = model == "paper_release"
+        share = jnp.stack([jnp.asarray(eq_10_alpha(mask, 1, imaging, release)) for imaging in colours])
+    return jnp.clip(share, 0.0, 1.0)
+
+
+@eqx.filter_jit
+def _formed(
+    layers: Layers,
+    discs: tuple[Array, ...],
+    kernels: Otf | Array,
+    model: Model,
+    outside: Outside,
+    lit: Window,
+    border: Border,
+) -> Array:
+    """`capture` in arrays.
+
+    One colour after the other: the arrays between its transforms then stay below the 32 MB from which the C library
+    takes fresh memory from the system at every call, which costs as much as the transforms.
+    """
+    shape = (layers.background.shape[1], layers.background.shape[2])
+    shadows = [plan_otf(disc, shape, border) for disc in discs]
+    kept = [1 - convolve(mask[None], otf) for mask, otf in zip(layers.masks, shadows, strict=bool(shadows))]
+
+    def shaded(number: int, light: Light) -> Array:
+        planned = light.shape == shape
+        otf = shadows[number] if planned else plan_otf(discs[number], (light.shape[0], light.shape[1]), border)
+        return convolve(light, _layer(otf, 0))
+
+    def colour(given: tuple[Array, tuple[Array, ...], Array]) -> Array:
+        background, radiances, kernel = given
+        otf = (
+            eqx.tree_at(lambda o: o.transfer, kernels, kernel)
+            if isinstance(kernels, Otf)
+            else plan_otf(kernel, lit, border)
+        )
+        one = Layers(background, layers.masks, radiances)
+        return jnp.asarray(compose(one, kept, shaded, _Patch(otf), model, outside))
+
+    light = jax.tree.map(jnp.asarray, (layers.background, layers.radiances))
+    return jax.lax.map(colour, (*light, kernels.transfer if isinstance(kernels, Otf) else kernels))
+
+
+def check_layers(scene: Scene, layers: int, colours: int) -> None:
+    """Check that PSFs and layers match.
+
+    Raises:
+        ValueError: they do not.
+    """
+    wanted = (1 + len(scene.obstructions), scene.background.shape[0])
+    if (layers, colours) != wanted:
+        raise ValueError(f"PSFs must have (layers, colours) = {wanted} as the scene, but got {(layers, colours)}")
+    shape = scene.background.shape
+    for near in scene.obstructions:
+        if near.mask.shape != shape[1:] or near.radiance.shape != shape:
+            got = f"a mask {near.mask.shape} and light {near.radiance.shape}"
+            raise ValueError(f"every layer must have the background's shape {shape}, but got {got}")
+
+
+def shadow_px(scene: Scene, optics: Optics) -> int:
+    """Pixels of the odd window that holds every shadow disc of a scene, one more than a multiple of 16.
+
+    Raises:
+        ValueError: depths are traced and `Optics.shadow_px` is not given.
+    """
+    if optics.shadow_px is not None:
+        return optics.shadow_px
+    depths = [scene.background_depth_m, *(near.depth_m for near in scene.obstructions)]
+    if any(_known(depth) is None for depth in depths):
+        raise ValueError("`Optics.shadow_px` must be given where depths are traced, but got None")
+    widths = [optics.disc_px(near, behind) for k, near in enumerate(depths) for behind in depths[:k]]
+    largest = max((disc_window(float(width)) for width in widths), default=1)
+    return 16 * ((largest + 14) // 16) + 1
+
+
+def shadow_discs(scene: Scene, optics: Optics, window: int) -> tuple[Array, ...]:
+    """For every obstruction, the shadow disc `[behind, y, x]` of points of each layer behind it."""
+    depths = [scene.background_depth_m, *(near.depth_m for near in scene.obstructions)]
+    return tuple(
+        jnp.stack([jnp.asarray(shadow_disc(optics.disc_px(near.depth_m, behind), window)) for behind in depths[:count]])
+        for count, near in enumerate(scene.obstructions, start=1)
+    )
+
+
+def _layer(otf: Otf, which: int | slice) -> Otf:
+    """The transforms of one entry of the first axis, a layer or colour, or of some."""
+    return eqx.tree_at(lambda o: o.transfer, otf, otf.transfer[which])
+
+
+class _Patch(eqx.Module):
+    """`Imaging` by one set of PSFs, with one transform per image.
+
+    Attributes:
+        otf: `[layer, fx, fy]` transforms of the PSFs of one colour.
+    """
+
+    otf: Otf
+
+    def one(self, layer: int, light: Light, unit: bool) -> Array:
+        otf = _layer(self.otf, layer)
+        landed = convolve(light, otf)
+        return landed / otf.energy if unit else landed
+
+    def total(self, lights: Sequence[Light]) -> Array:
+        return superpose(lights, _layer(self.otf, slice(len(lights))))

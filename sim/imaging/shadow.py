@@ -1,0 +1,174 @@
+"""The reference for obstructed light: what an obstruction does to the wave of one scene point, by wave optics.
+
+The light of a point passes the plane of the obstruction, is cut there, spreads by Fresnel diffraction to the aperture,
+and makes the PSF of a pupil that is partly in shadow. Nothing is assumed of how PSFs and masks go together, so this
+judges the fast models of `sim.imaging.occlusion`. It takes one PSF per scene point: seconds for a point, hours for a
+picture.
+
+For a point at distance b and an obstruction at distance z the ray to the aperture's point x crosses the obstruction at
+x (1 - z / b) from the chief ray. About that crossing the path differences are quadratic with the effective distance
+z (b - z) / b (J. W. Goodman, Introduction to Fourier Optics, ch. 4: Fresnel diffraction of a spherical wave), so the
+shadow of a rectangle is a product of two differences of Fresnel integrals, and a mask of pixels is a sum of rectangles:
+exact within the Fresnel approximation, whatever the fringes are, with no raster that they would have to fit.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from sim.aperture import circle_coverage
+from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.propagation.pupil import SurfaceRows, cis, surface_pupil
+from sim.psf_bank import pixel_energy, plan_propagation
+
+Border = Literal["edge", "zero"]
+Point = tuple[float, float]
+
+
+def shadow(
+    camera: Camera,
+    mask: Float[np.ndarray, "v u"],
+    depth_m: float,
+    background_depth_m: float,
+    wavelength_m: float,
+    point: Point,
+    border: Border = "edge",
+) -> Complex[np.ndarray, "y x"]:
+    """Field that reaches every DOE cell past an obstruction, over the field without it.
+
+    Args:
+        camera: lens, sensor and grid.
+        mask: `[y, x]` blocked share of every pixel of the view, the middle of the view in the middle of the array.
+        depth_m: distance of the obstruction, metres.
+        background_depth_m: distance of the scene point, metres, beyond the obstruction; `inf` allowed.
+        wavelength_m: wavelength, metres.
+        point: where in the view the scene point is, pixels (row, column), as indices of the mask.
+        border: whether the outermost pixels of the mask go on for ever ("edge") or nothing lies beyond them ("zero").
+
+    Returns:
+        `[y, x]` complex ratio at the cell centres, 1 where nothing is in the way.
+
+    Raises:
+        ValueError: the obstruction is not nearer than the scene point.
+    """
+    if not 0 < depth_m < background_depth_m:
+        raise ValueError(f"`depth_m` must lie from 0 to the background's {background_depth_m}, but got {depth_m}")
+    nearness = 1.0 - depth_m / background_depth_m
+    effective_m = depth_m * nearness
+    rows, row_edges = _runs(mask, 0)
+    runs, column_edges = _runs(rows, 1)
+    # A pixel at u in the picture is at -u depth / focal length in the plane of the obstruction: a lens turns it round.
+    scale_m = camera.pixel_m * depth_m / camera.focal_length_m
+    factors = []
+    for edges, at, axis in zip((row_edges, column_edges), point, ("y", "x"), strict=True):
+        lines_m = -(edges - 0.5 - at) * scale_m
+        if border == "edge":
+            lines_m[[0, -1]] = np.inf, -np.inf
+        crossing_m = camera.grid.axis_m(axis) * nearness
+        factors.append(_fresnel_shares(crossing_m, lines_m, effective_m, wavelength_m))
+    return 1.0 - np.linalg.multi_dot([factors[0], runs.astype(np.complex128), factors[1].T])
+
+
+def _runs(mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mask with equal neighbours along an axis taken together, and the edges of what is left, in pixels."""
+    lines = np.moveaxis(mask, axis, 0)
+    first = np.flatnonzero(np.concatenate([[True], np.any(lines[1:] != lines[:-1], axis=1)]))
+    return np.moveaxis(lines[first], 0, axis), np.append(first, len(lines)).astype(np.float64)
+
+
+def _fresnel_shares(
+    crossing_m: Float[np.ndarray, " x"], lines_m: Float[np.ndarray, " line"], distance_m: float, wavelength_m: float
+) -> Complex[np.ndarray, "x strip"]:
+    """Amplitude that passes each strip between two lines, of that which passes an open plane.
+
+    The strips run toward -x. All strips of an axis together give 1.
+    """
+    from scipy.special import fresnel
+
+    tau = (lines_m[None, :] - crossing_m[:, None]) * np.sqrt(2.0 / (wavelength_m * distance_m))
+    sine, cosine = fresnel(tau)
+    total = cosine + 1j * sine
+    return (total[:, :-1] - total[:, 1:]) / np.sqrt(2j)
+
+
+def shadowed_psf(
+    camera: Camera,
+    height_m: Float[np.ndarray, "y x"],
+    mask: Float[np.ndarray, "v u"],
+    depth_m: float,
+    background_depth_m: float,
+    point: Point,
+    border: Border = "edge",
+) -> Float[np.ndarray, "c window window"]:
+    """PSF of a scene point behind an obstruction, for every colour.
+
+    Args:
+        camera: lens, sensor, substrate and grid.
+        height_m: `[y, x]` DOE height, metres.
+        mask: see `shadow`.
+        depth_m: distance of the obstruction, metres.
+        background_depth_m: distance of the scene point, metres.
+        point: where in the view the scene point is, pixels (row, column).
+        border: see `shadow`.
+
+    Returns:
+        `[colour, y, x]` energy per pixel per unit power that would reach the clear aperture without the obstruction,
+        the chief ray in the middle of the window. The DOE is taken as it is on the axis.
+    """
+    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+    path = source_path_m(camera, background_depth_m)
+    height = jnp.asarray(height_m, jnp.float32)
+    energy = np.zeros((len(camera.colours), camera.window, camera.window), np.float32)
+    for c, colour in enumerate(camera.colours):
+        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
+            plan = plan_propagation(camera, wavelength, background_depth_m)
+            passed = shadow(camera, mask, depth_m, background_depth_m, wavelength, point, border)
+            plate = cis(height * jnp.float32(camera.waves_per_metre(wavelength)))
+            source = jnp.asarray(wrapped_waves(path, wavelength))
+            rows = SurfaceRows(jnp.asarray(passed, jnp.complex64) * plate, source, coverage)
+            factor = weight * camera.transmission(wavelength)
+            energy[c] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
+    return energy
+
+
+def pupil_shadow(
+    camera: Camera,
+    height_m: Float[np.ndarray, "y x"],
+    mask: Float[np.ndarray, "v u"],
+    depth_m: float,
+    points: Sequence[tuple[int, int]],
+    radiance: Float[np.ndarray, "point c"],
+    background_depth_m: float,
+    border: Border = "edge",
+) -> Float[np.ndarray, "c v u"]:
+    """Picture of some scene points behind an obstruction; the obstruction itself sends no light here.
+
+    Args:
+        camera: lens, sensor, substrate and grid; an odd window.
+        height_m: `[y, x]` DOE height, metres.
+        mask: `[y, x]` blocked share of every pixel of the view; the picture has its shape.
+        depth_m: distance of the obstruction, metres.
+        points: row and column of every scene point.
+        radiance: its light, `[point, colour]`.
+        background_depth_m: distance of the scene points, metres.
+        border: see `shadow`.
+
+    Returns:
+        `[colour, y, x]`; light that lands beyond the picture, or farther from its point than half a window, is left
+        out.
+
+    Raises:
+        ValueError: an even window, whose PSFs lie half a pixel off.
+    """
+    if camera.window % 2 == 0:
+        raise ValueError(f"`camera.window` must be odd, but got {camera.window}")
+    half = camera.window // 2
+    height, width = mask.shape
+    wide = np.zeros((len(camera.colours), height + 2 * half, width + 2 * half))
+    for (row, column), light in zip(points, radiance, strict=True):
+        psf = shadowed_psf(camera, height_m, mask, depth_m, background_depth_m, (row, column), border)
+        wide[:, row : row + camera.window, column : column + camera.window] += light[:, None, None] * psf
+    return wide[:, half : half + height, half : half + width].astype(np.float32)

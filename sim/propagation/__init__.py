@@ -1,0 +1,8 @@
+"""Pupil -> pixel energies.
+
+pupil       the field behind the DOE, row block by row block
+pixel       integration of a sampled intensity over square sensor pixels
+farfield    the default path (eqs. 7-9 of the paper)
+hankel      the same for rotationally symmetric pupils
+fresnel     the direct path (eq. 5): reference for the other two
+"""

@@ -1,0 +1,139 @@
+"""The direct path (paper eq. 5): lens and propagation kernel written out, with no cancellation assumed.
+
+It needs the lens's quadratic phase sampled on the DOE grid, so eq. 6, N pitch^2 / lambda <= f, must hold; at the
+paper's sizes that means cells below a micrometre, which is why `sim.propagation.farfield` is the default. Here it
+serves as a reference and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda
+d nu^2) and the `"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T.
+Shimobaba, Opt. Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded
+grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate.
+"""
+
+from typing import Literal, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+from scipy.fft import next_fast_len
+
+from fab.errors import InputError
+from sim.camera import Camera
+from sim.propagation.pixel import Banded, pixel_weights
+from sim.propagation.pupil import PupilRows, cis
+
+Kernel = Literal["fresnel", "angular_spectrum"]
+
+_UNTAPERED = 0.75  # share of the kernel's band that passes in full
+
+
+class DirectPath(eqx.Module):
+    """Operators of one wavelength on the direct path.
+
+    Attributes:
+        gather: samples at the DOE pitch -> pixels, along either axis.
+        lens: `[y, x]` transmission of the thin lens, unit modulus.
+        kernel: `[ky, kx]` transfer function in FFT order on the padded grid.
+        first: first sample kept on the sensor, per axis.
+        expected_error: predicted relative L2 error of the pixel integration alone.
+    """
+
+    gather: Banded
+    lens: Complex[Array, "y x"]
+    kernel: Complex[Array, "ky kx"]
+    first: int = eqx.field(static=True)
+    expected_error: float = eqx.field(static=True)
+
+    def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
+        """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
+        field = pupil(rows, shared) * self.lens
+        spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
+        kept = self.gather_length
+        image = jnp.roll(jnp.fft.ifft2(spectrum), (-self.first, -self.first), (0, 1))[:kept, :kept]
+        intensity = image.real**2 + image.imag**2
+        return self.gather(self.gather(intensity).T).T
+
+    @property
+    def gather_length(self) -> int:
+        """Samples per axis that the pixels use."""
+        return self.gather.starts[-1] + self.gather.tiles[-1].shape[0]
+
+
+def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> float:
+    """Shortest focal length whose lens phase N cells of that pitch can sample, N pitch^2 / lambda (eq. 6), metres."""
+    return cells * pitch_m**2 / wavelength_m
+
+
+def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_spectrum") -> DirectPath:
+    """Prepare the direct path of one wavelength; phases are formed in float64 and wrapped before float32.
+
+    Raises:
+        InputError: eq. 6 does not hold, or the window does not fit on the padded grid.
+    """
+    cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
+    nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m)
+    if nyquist > camera.focal_length_m * (1 + 1e-9):
+        limit = wavelength_m * camera.focal_length_m / camera.aperture_m
+        raise InputError(
+            "optics.propagation",
+            f"the direct path needs N pitch^2 / wavelength (eq. 6) of at most the focal length, "
+            f"{camera.focal_length_m * 1e3:.4g} mm",
+            f"{nyquist * 1e3:.4g} mm at {wavelength_m * 1e9:.4g} nm with N = {cells} and {pitch * 1e6:.4g} um",
+            f'Use propagation = "far_field", or a pitch of at most {limit * 1e6:.3g} um '
+            f"(N = {int(np.ceil(camera.aperture_m / limit))}) for this aperture.",
+        )
+    half = camera.window * camera.pixel_m / 2 / pitch
+    width = camera.pixel_m * camera.fill / pitch
+    kept = 2 * int(np.ceil(half + width + 8))
+    if 2 * half > 3 * cells:
+        raise InputError(
+            "sensor.window",
+            f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm",
+            f"{camera.window * camera.pixel_m * 1e3:.4g} mm",
+            "Use a smaller window or the far-field path.",
+        )
+    # Light from one rim of the aperture to the far edge of the window must pass the kernel's band untapered.
+    padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
+    middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
+    first = int(np.floor(middle)) - kept // 2
+    weights = pixel_weights(
+        camera.axis_m() / pitch + middle - first,
+        width,
+        camera.aperture_m * pitch / (wavelength_m * distance),
+        kept,
+    )
+    area = np.pi * camera.aperture_m**2 / 4
+    matrix = weights.matrix * (pitch / np.sqrt(area))
+    square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
+    # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d.
+    lens = _wrapped(-square / (2 * distance * wavelength_m))
+    return DirectPath(
+        gather=Banded.from_dense(matrix),
+        lens=cis(jnp.asarray(lens)),
+        kernel=_kernel(padded, pitch, wavelength_m, distance, kernel),
+        first=first,
+        expected_error=float(np.sqrt(2) * weights.expected_error),
+    )
+
+
+def _wrapped(waves: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+    return (waves - np.round(waves)).astype(np.float32)
+
+
+def _kernel(
+    padded: int, pitch_m: float, wavelength_m: float, distance_m: float, kernel: Kernel
+) -> Complex[Array, "ky kx"]:
+    frequency = np.fft.fftfreq(padded, pitch_m)
+    square = frequency[:, None] ** 2 + frequency[None, :] ** 2
+    step = 1 / (padded * pitch_m)
+    carrier = 1 / wavelength_m**2
+    if kernel == "fresnel":
+        waves = -0.5 * wavelength_m * distance_m * square
+        limit = 1 / (2 * step * distance_m * wavelength_m)
+    else:
+        # Relative to the carrier exp(ikd): sqrt(a - s) - sqrt(a) without cancellation.
+        waves = -distance_m * square / (np.sqrt(np.maximum(carrier - square, 0.0)) + np.sqrt(carrier))
+        limit = 1 / (wavelength_m * np.sqrt((2 * step * distance_m) ** 2 + 1))
+    fall = np.clip((np.abs(frequency) / limit - _UNTAPERED) / (1 - _UNTAPERED), 0.0, 1.0)
+    passed = np.cos(np.pi / 2 * fall) ** 2
+    passed = passed[:, None] * passed[None, :] * (square < carrier)
+    return cis(jnp.asarray(_wrapped(waves))) * jnp.asarray(passed, jnp.float32)
