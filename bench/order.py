@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.reference import wrapped_map
-from doedesign.build import process_of
+from doedesign.build import process_from_spec
 from doedesign.spec.process import ProcessSpec
 from fab.grid import Grid
 from fab.levels import Levels, quantise
@@ -34,7 +34,7 @@ def one(cells: int) -> None:
     """Write and prove one order, and print seconds and gigabytes."""
     full_m = LEVELS.count * LEVELS.step_m
     level = quantise(np.mod(wrapped_map(cells, smooth_cells=4.0), full_m), LEVELS)
-    process = process_of(ProcessSpec(levels=16, level_step_m=75e-9, stock="contact_aligner"))
+    process = process_from_spec(ProcessSpec(levels=16, level_step_m=75e-9, stock="contact_aligner"))
     grid = Grid((cells, cells), PITCH_M)
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()

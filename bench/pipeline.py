@@ -18,11 +18,11 @@ import numpy as np
 
 from doedesign.capture.images import Pictures, crop, decoded, linear_light, sample_files
 from doedesign.capture.scenes import SceneData
-from sim.obstruction import Dirt, Fence, Kind, Raindrop, View
+from sim.obstruction import CameraView, Dirt, Fence, ObstructionKind, Raindrop
 
 SHAPE = (512, 512)
-VIEW = View(SHAPE, 3.7e-6, 8e-3)
-FENCE_VIEW = View(SHAPE, 12.9e-6, 50e-3)
+VIEW = CameraView(SHAPE, 3.7e-6, 8e-3)
+FENCE_VIEW = CameraView(SHAPE, 12.9e-6, 50e-3)
 
 
 def rate(data: SceneData, items: int) -> float:
@@ -37,7 +37,7 @@ def rate(data: SceneData, items: int) -> float:
 
 def streams(items: int) -> None:
     """Print the rate of every kind."""
-    kinds: dict[str, tuple[Kind, View]] = {
+    kinds: dict[str, tuple[ObstructionKind, CameraView]] = {
         "dirt": (Dirt(), VIEW),
         "raindrop": (Raindrop(), VIEW),
         "fence": (Fence(), FENCE_VIEW),

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.reference import wrapped_map
-from doedesign.build import camera_of, process_of
+from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.prediction import Drawn, predict
 from doedesign.spec import load_spec
 from doedesign.tolerancing.pool import Work, evaluate_here, predicted_rows
@@ -34,13 +34,13 @@ def make_task(cells: int) -> tuple[Drawn, Process]:
     """The automotive camera with a plate of so many cells, and the contact aligner."""
     aperture = f"doe.aperture={cells * 1.85} um"
     spec = load_spec(SPEC, (f"doe.samples={cells}", aperture, "process.stock=contact_aligner"))
-    camera, levels = camera_of(spec), Levels(spec.process.levels, spec.process.level_step_m)
+    camera, levels = camera_from_spec(spec), Levels(spec.process.levels, spec.process.level_step_m)
     full = levels.count * levels.step_m
     height = np.mod(wrapped_map(cells, smooth_cells=4.0), full)
     level = quantise(height, levels)
     level = unetched_outside(level, levels, camera.grid, spec.doe.aperture_m)
     drawn = Drawn("bench", level, levels, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
-    return drawn, process_of(spec.process)
+    return drawn, process_from_spec(spec.process)
 
 
 def time_draws(drawn: Drawn, process: Process, rounds: int) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from bench.masks import field_map, ring_map
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.solids.columns import Cells, reduced_cells, whole, window_cells
+from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
 from fab.solids.step import step_volumes_m3
@@ -63,7 +63,7 @@ def bench_step(quick: bool, folder: Path) -> None:
     print(f"    {path.stat().st_size / 1e6:.1f} MB, read back and measured in {read:.2f} s, volumes off by {wrong:.0e}")
 
 
-def bench_mesh(name: str, cells: Cells, folder: Path) -> None:
+def bench_mesh(name: str, cells: Columns, folder: Path) -> None:
     """Print mesh, check and files of a relief."""
     mesh, made = timed(lambda: relief_mesh(cells, BASE))
     want = cells.volume_m3 + BASE * cells.area_m2

@@ -39,15 +39,15 @@ import numpy as np
 import doedesign.recon.network as layers
 from bench.capture import make_psf, verdict
 from bench.psf import high_water_mb
-from doedesign.capture.from_spec import obstruction_of, occlusion_of
-from doedesign.capture.scenes import Batch
+from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec
+from doedesign.capture.scenes import SceneBatch
 from doedesign.recon.conv import convolution
-from doedesign.recon.network import Layout, Network
+from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.tiles import reconstruct_tiled
 from doedesign.spec import Spec, load_spec
 from doedesign.training.backbones import convolutions, weight_shapes
 from doedesign.training.checkpoint import settled
-from doedesign.training.joint import State, Trainer
+from doedesign.training.joint import JointState, Trainer
 from doedesign.training.perceptual import Lpips
 from sim.imaging.convolve import fast_length
 
@@ -65,16 +65,16 @@ def spec_of(name: str) -> Spec:
     return load_spec(EXAMPLES / f"{name}.toml", [f"train.size={SPECS[name]}", "train.batch=1", "train.perceptual=0.0"])
 
 
-def make_training(spec: Spec) -> tuple[Trainer, State, Batch]:
+def make_training(spec: Spec) -> tuple[Trainer, JointState, SceneBatch]:
     """A training, its first state, and a scene."""
     rng = np.random.default_rng(0)
     height = 1e-6 * rng.random((spec.doe.samples, spec.doe.samples), np.float32)
-    trainer = Trainer.of(spec, {}, "", occlusion_of(spec, ""), obstruction_of(spec, ""), height)
+    trainer = Trainer.of(spec, {}, "", occlusion_from_spec(spec, ""), obstruction_from_spec(spec, ""), height)
     size = spec.train.size
     background, radiance = (rng.random((1, 3, size, size), np.float32) for _ in range(2))
     mask = np.kron(rng.random((1, 8, 8)) > 0.8, np.ones((1, size // 8, size // 8))).astype(np.float32)
     near, far = (np.full(1, depth, np.float32) for depth in (0.08, 5.0))
-    return trainer, settled(trainer.initial(height)), Batch(background, mask, radiance, near, far, ("",), 0)
+    return trainer, settled(trainer.initial(height)), SceneBatch(background, mask, radiance, near, far, ("",), 0)
 
 
 def stepping(spec: Spec) -> Call:
@@ -220,7 +220,7 @@ def report_step(name: str, rounds: int) -> None:
     """Print the table of a step."""
     spec = spec_of(name)
     trainer = make_training(spec)[0]
-    filters, convolved = network_floor(Network.make(Layout(), 0), spec.train.size, trainer.bench.camera.window)
+    filters, convolved = network_floor(Network.make(NetworkShape(), 0), spec.train.size, trainer.bench.camera.window)
     floors = {
         "transforms of the optics": optics_floor(spec),
         "transforms of the capture": capture_floor(trainer),
@@ -268,7 +268,7 @@ def one_step(name: str, rounds: int = 3) -> None:
 
 def one_frame() -> None:
     """Print seconds and gigabytes of a whole capture through the network."""
-    network = Network.make(Layout(), 0)
+    network = Network.make(NetworkShape(), 0)
     frame = np.random.default_rng(0).random((3, *FRAME), np.float32)
     far, near = make_psf(0, (2, 3, 513, 513))
     took, _ = clocked(lambda: reconstruct_tiled(network, frame, far, near))

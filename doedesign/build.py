@@ -10,7 +10,7 @@ from fab.files import MANIFEST_NAME
 from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.process import ERRORS, Defects, Process, Spread, error_names
+from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -18,7 +18,7 @@ _SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m
 _EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")
 
 
-def camera_of(spec: Spec) -> Camera:
+def camera_from_spec(spec: Spec) -> Camera:
     """Lens, sensor, substrate and DOE grid of a spec."""
     return Camera(
         grid=Grid((spec.doe.samples, spec.doe.samples), spec.doe.pitch_m),
@@ -34,7 +34,7 @@ def camera_of(spec: Spec) -> Camera:
     )
 
 
-def levels_of(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
+def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
     """The staircase of heights that a process makes.
 
     Args:
@@ -54,12 +54,12 @@ def levels_of(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
     return Levels(spec.levels, spec.level_step_m, depths_m or ())
 
 
-def process_of(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
+def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
     """What the fab lab does, with what the spec leaves out taken from its stock process.
 
     Args:
         spec: the process of a spec, or of a file of its own.
-        chosen: the staircase where the spec leaves its choice to the optimisation (`levels_of`).
+        chosen: the staircase where the spec leaves its choice to the optimisation (`levels_from_spec`).
 
     Returns:
         The process; errors whose mean and standard deviation are zero are left out of its spreads.
@@ -71,7 +71,7 @@ def process_of(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
     spreads = dict(_spreads(full))
     defects = full.defects.in_si()
     return Process(
-        levels=levels_of(spec, chosen),
+        levels=levels_from_spec(spec, chosen),
         order=tuple(etch.mask for etch in full.etches),
         spreads=spreads,
         defects=Defects(**defects),
@@ -80,7 +80,7 @@ def process_of(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
     )
 
 
-def wafer_of(spec: WaferSpec) -> Wafer:
+def wafer_from_spec(spec: WaferSpec) -> Wafer:
     """What the masks of an order are filled with.
 
     Raises:
@@ -95,7 +95,7 @@ def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> 
     Raises:
         InputError: the file cannot be read, or is for another staircase.
     """
-    made = process_of(spec if file is None else load_process(file), levels)
+    made = process_from_spec(spec if file is None else load_process(file), levels)
     return matching(levels, made, str(file or "process"))
 
 
@@ -110,11 +110,11 @@ def matching(levels: Levels, process: Process, where: str) -> Process:
     return process
 
 
-def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Spread]]:
+def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Normal]]:
     for error, given in spec.errors.given().items():
         names = error_names(spec.masks, error)
         for name, spread in zip(names, given.spreads(len(names)), strict=True):
-            if spread != Spread():
+            if spread != Normal():
                 yield name, spread
 
 
@@ -129,9 +129,9 @@ def process_spec_of(process: Process, like: ProcessSpec) -> ProcessSpec:
         InputError: a number that no spec may hold.
     """
     errors = {}
-    for error in ERRORS:
-        spreads = [process.spreads.get(name, Spread()) for name in error_names(process.masks, error)]
-        if any(spread != Spread() for spread in spreads):
+    for error in DEVIATIONS:
+        spreads = [process.spreads.get(name, Normal()) for name in error_names(process.masks, error)]
+        if any(spread != Normal() for spread in spreads):
             errors[error] = {
                 "mean": _one_or_each([float(spread.mean) for spread in spreads]),
                 "sigma": _one_or_each([float(spread.sigma) for spread in spreads]),

@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.build import camera_of
+from doedesign.build import camera_from_spec
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawn_in_masks, levels_of_run
 from fab.files import MANIFEST_NAME, sha256_bytes
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.masks import unetched_outside
-from fab.process import Process, Spread, Variation
+from fab.process import Normal, Process, Variation
 from fab.units import NM
 from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.metrics import energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m
 from sim.psf_bank import PsfBank, surface_bank
-from sim.surface import Surface, as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def drawn_of(run: Run, masks: Path | None = None) -> Drawn:
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     else:
         level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    scene, camera = run.spec.scene, camera_of(run.spec)
+    scene, camera = run.spec.scene, camera_from_spec(run.spec)
     moves_m = moves_m if any(moves_m) else ()
     return Drawn(run.spec.name, level, drawing.levels, camera, scene.near_m, scene.far_m, moves_m)
 
@@ -94,8 +94,8 @@ def process_with_moves(process: Process, edge_moves_m: Sequence[float]) -> Proce
     if not any(edge_moves_m):
         return process
     names = [f"cd_bias_m[{mask}]" for mask in range(process.masks)]
-    old = [process.spreads.get(name, Spread()) for name in names]
-    moved = {name: Spread(one.mean + move, one.sigma) for name, one, move in zip(names, old, edge_moves_m, strict=True)}
+    old = [process.spreads.get(name, Normal()) for name in names]
+    moved = {name: Normal(one.mean + move, one.sigma) for name, one, move in zip(names, old, edge_moves_m, strict=True)}
     return replace(process, spreads={**process.spreads, **moved})
 
 
@@ -108,7 +108,7 @@ class Prediction(NamedTuple):
         rows: see `plate_rows`.
     """
 
-    surface: Surface
+    surface: FabricatedDoe
     bank: PsfBank
     rows: list[dict[str, Any]]
 
@@ -124,7 +124,7 @@ def predict(drawn: Drawn, process: Process, variation: Variation) -> Prediction:
     return Prediction(surface, bank, plate_rows(drawn, surface, bank))
 
 
-def plate_rows(drawn: Drawn, surface: Surface, bank: PsfBank) -> list[dict[str, Any]]:
+def plate_rows(drawn: Drawn, surface: FabricatedDoe, bank: PsfBank) -> list[dict[str, Any]]:
     """Numbers of a plate, one row per depth and colour.
 
     Returns:
@@ -182,10 +182,10 @@ class _ById:
 
 
 @lru_cache(maxsize=1)
-def _nominal_of(camera: Camera, key: _ById) -> Surface:
+def _nominal_of(camera: Camera, key: _ById) -> FabricatedDoe:
     return as_fabricated(key.drawn.level, camera, Process(key.drawn.levels), Variation())
 
 
-def _nominal(camera: Camera, drawn: Drawn) -> Surface:
+def _nominal(camera: Camera, drawn: Drawn) -> FabricatedDoe:
     """The plate exactly as drawn; kept, because every draw is compared with it."""
     return _nominal_of(camera, _ById(drawn))

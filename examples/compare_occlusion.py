@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.build import camera_of
+from doedesign.build import camera_from_spec
 from doedesign.cli import exit_code
 from doedesign.report.canvas import INK, SERIES, picture, place
 from doedesign.runs.folder import open_run
@@ -186,7 +186,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--line-px", type=int, default=8, help="distance of the bright lines in pixels (default 8)")
     asked = parser.parse_args(arguments)
     run = open_run(asked.run)
-    spec, whole = run.spec, camera_of(run.spec)
+    spec, whole = run.spec, camera_from_spec(run.spec)
     colour = whole.colours[min(asked.colour, len(whole.colours) - 1)]
     # An odd window has the chief ray in the middle of a pixel, so the picture lies on its scene.
     camera = replace(whole, window=whole.window - 1 + whole.window % 2, colours=(colour,))

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from doedesign.build import camera_of
+from doedesign.build import camera_from_spec
 from doedesign.calibration import Family, Targets, explanations
 from doedesign.prediction import Drawn, Prediction, predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import LevelMap, levels_of_run
 from fab.masks import unetched_outside
-from fab.process import Process, Spread, Variation
+from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour
 from sim.metrics import energy_within
@@ -69,7 +69,7 @@ class Bench:
 
 def bench_of(run: Run) -> Bench:
     """The bench of a finished run."""
-    camera = replace(camera_of(run.spec), colours=LINES)
+    camera = replace(camera_from_spec(run.spec), colours=LINES)
     return Bench(levels_of_run(run), camera, run.spec.scene.near_m[0])
 
 
@@ -262,7 +262,7 @@ BEYOND = {"common_depth_scale": 0.05, "common_cd_bias_m": 0.3 * UM}
 def needed(bench: Bench, lift: int) -> Family:
     """How large single errors must be for 1:1 at the probe, within their ranges or not."""
     say(f"how large would single errors have to be at lift {lift}?")
-    process = replace(bench.process, spreads={name: Spread(0.0, step) for name, step in BEYOND.items()})
+    process = replace(bench.process, spreads={name: Normal(0.0, step) for name, step in BEYOND.items()})
     targets = Targets(LINES[1].wavelengths_m[0], bench.near_m, MEASURED_RATIO, MEASURED_THROUGHPUT, CLOSE / 2)
     return explanations(lifted(bench, lift), process, targets, tuple(BEYOND), pairs=False, reach=8.0)
 

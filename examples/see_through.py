@@ -20,11 +20,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.build import camera_of
-from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, sensor_of, shown_as
+from doedesign.build import camera_from_spec
+from doedesign.capture.from_spec import (
+    obstruction_from_spec,
+    occlusion_from_spec,
+    outside_from_kind,
+    rgb_from_channels,
+    sensor_from_spec,
+)
 from doedesign.capture.images import Pictures, sample_files
 from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import Bench, captured, flat_psfs, shadow_window
+from doedesign.capture.simulate import CameraPair, captured, flat_psfs, shadow_window
 from doedesign.cli import exit_code
 from doedesign.recon.model import Model, open_model, released_model
 from doedesign.report.canvas import note, picture, place, scale_bar
@@ -34,7 +40,7 @@ from fab.units import format_length
 from sim.camera import Camera
 from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
-from sim.obstruction import Kind, View
+from sim.obstruction import CameraView, ObstructionKind
 from sim.store import read_height
 
 SIDE, GAP, ROW = 1.75, 0.12, 0.42  # inches; ROW between two rows, for a scale bar and words
@@ -80,7 +86,7 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
     """
     bench, kind, far = bench_of(model, occlusion)
     wanted = (side or load_spec(model.folder / "spec.toml").train.size) + bench.margin_px
-    view = View((wanted, wanted), bench.camera.pixel_m, bench.camera.sensor_distance_m)
+    view = CameraView((wanted, wanted), bench.camera.pixel_m, bench.camera.sensor_distance_m)
     item = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0, 0)
     shot = captured(item, bench, jax.random.key(seed))
     psfs = [psf_at(model.bank, depth) for depth in (item.background_depth_m, item.depth_m)]
@@ -95,11 +101,11 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
     told = f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(item.depth_m, 4))}, "
     told += f"occlusion model {bench.model}. PSNR where it is covered, in brackets over all."
     pictures |= {"far": psfs[0], "near": psfs[1]}
-    shown = {name: shown_as(image, bench.camera) for name, image in pictures.items()}
+    shown = {name: rgb_from_channels(image, bench.camera) for name, image in pictures.items()}
     return Chain(mask=shot.mask, near_m=item.depth_m, psnr=psnr, words=told, **shown)
 
 
-def bench_of(model: Model, occlusion: str | None = None) -> tuple[Bench, Kind, tuple[float, float]]:
+def bench_of(model: Model, occlusion: str | None = None) -> tuple[CameraPair, ObstructionKind, tuple[float, float]]:
     """The camera of a model beside a conventional one, its obstruction, and the distances of its scenes.
 
     Args:
@@ -108,10 +114,15 @@ def bench_of(model: Model, occlusion: str | None = None) -> tuple[Bench, Kind, t
     """
     where = str(model.folder / "spec.toml")
     spec = load_spec(model.folder / "spec.toml")
-    camera = replace(camera_of(spec), window=model.bank.energy.shape[-1])
-    kind, name = obstruction_of(spec, where), occlusion_of(spec, where, occlusion or model.about["occlusion"])
+    camera = replace(camera_from_spec(spec), window=model.bank.energy.shape[-1])
+    kind, name = (
+        obstruction_from_spec(spec, where),
+        occlusion_from_spec(spec, where, occlusion or model.about["occlusion"]),
+    )
     eyes = partial(psf_at, model.bank), flat_psfs(camera)
-    bench = Bench(camera, *eyes, name, outside_of(kind), sensor_of(spec), shadow_window(kind, camera), "own")
+    bench = CameraPair(
+        camera, *eyes, name, outside_from_kind(kind), sensor_from_spec(spec), shadow_window(kind, camera), "own"
+    )
     return bench, kind, (min(spec.scene.far_m), max(spec.scene.far_m))
 
 
@@ -171,7 +182,7 @@ def main() -> int:
     def work() -> None:
         model = open_model(given.model or released_model())
         chain = photographed(model, given.picture or sample_files()[0], given.seed, given.occlusion)
-        draw(given.out, chain, model, camera_of(load_spec(model.folder / "spec.toml")))
+        draw(given.out, chain, model, camera_from_spec(load_spec(model.folder / "spec.toml")))
         print(given.out)
 
     return exit_code(work)

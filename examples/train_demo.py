@@ -36,7 +36,7 @@ from doedesign.capture.scenes import SceneData
 from doedesign.capture.simulate import captured, within
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
-from doedesign.commands.train import Request, train
+from doedesign.commands.train import TrainingSettings, train
 from doedesign.recon.model import open_model
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec
@@ -46,7 +46,7 @@ from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
 from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
-from sim.obstruction import View
+from sim.obstruction import CameraView
 
 SPEC = Path(__file__).parent / "automotive_cpu.toml"
 # Where the checkout has a folder of data beside it. Trained on: pictures whose licences allow it (Unsplash, CC0, free
@@ -151,7 +151,7 @@ def trained(plan: Plan, design: Path, model: str, camera: str, seed: int) -> dic
     """Train one network, and return how it is judged."""
     images, test, licence = source_of(plan)
     settings = [f"train.validation={len(picture_files(test))}", f'train.camera="{camera}"', f"train.seed={seed}"]
-    request = Request(images, test, (*settings, *plan.overrides), licence=licence, occlusion=model)
+    request = TrainingSettings(images, test, (*settings, *plan.overrides), licence=licence, occlusion=model)
     folder = train(design, plan.out / f"{model}_{camera}_{seed}", request, say)
     return json.loads((folder / "metrics.json").read_text())
 
@@ -166,7 +166,7 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
     bench, kind, far = see_through.bench_of(models["doe"])
     bench = bench._replace(without=partial(psf_at, models["conventional"].bank))
     side = load_spec(models["doe"].folder / "spec.toml").train.size + bench.margin_px
-    view = View((side, side), bench.camera.pixel_m, bench.camera.sensor_distance_m)
+    view = CameraView((side, side), bench.camera.pixel_m, bench.camera.sensor_distance_m)
     files = picture_files(source_of(plan).test)
     data = SceneData(Pictures(files, most_px=2 * side), kind, view, far, SCENE_SEED, mirrored=False)
     found: dict[str, dict[str, list[float]]] = {border: {} for border in BORDERS}

@@ -11,7 +11,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, require_levels
 
-__all__ = ["levels_of", "planes", "unetched_outside"]
+__all__ = ["level_map_from_planes", "planes", "unetched_outside"]
 
 
 def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
@@ -34,7 +34,7 @@ def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
     return out
 
 
-def levels_of(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
+def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
     """Join etch masks into the level map that they make.
 
     Args:

@@ -2,7 +2,7 @@
 
 A `Process` is the recipe: which etches, in which order and how deep, and how large every error usually is. A
 `Variation` is one outcome: the errors of one plate, all of them zero for a plate that is exactly as drawn. Errors are
-physical numbers in SI units; `ERRORS` says what each of them is.
+physical numbers in SI units; `DEVIATIONS` says what each of them is.
 
 Coordinates are those of the height map (`[y, x]`, +y toward higher rows, origin in the middle of the DOE). Rotation and
 magnification of a mask, and the wafer's non-uniformity, act about the middle of the wafer.
@@ -18,12 +18,12 @@ from fab.errors import InputError
 from fab.levels import Levels
 from fab.units import MM, UM
 
-__all__ = ["ERRORS", "Defects", "Disc", "Error", "MaskDisc", "Process", "Spread", "Variation", "error_names"]
+__all__ = ["DEVIATIONS", "Defects", "Deviation", "Disc", "MaskDisc", "Normal", "Process", "Variation", "error_names"]
 
 Unit = Literal["1", "m", "rad"]
 
 
-class Error(NamedTuple):
+class Deviation(NamedTuple):
     """One kind of error.
 
     Attributes:
@@ -41,29 +41,35 @@ class Error(NamedTuple):
     meaning: str
 
 
-ERRORS: Mapping[str, Error] = MappingProxyType(
+DEVIATIONS: Mapping[str, Deviation] = MappingProxyType(
     {
-        "common_depth_scale": Error("depth", "1", False, False, "all etches too deep by this share"),
-        "depth_scale": Error("depth", "1", True, False, "this etch too deep by this share, besides the common one"),
-        "radial_nonuniformity": Error("uniformity", "1", False, False, "depth gained from wafer centre to edge (r^2)"),
-        "linear_nonuniformity_y": Error("uniformity", "1", False, False, "depth gained along y per wafer radius"),
-        "linear_nonuniformity_x": Error("uniformity", "1", False, False, "depth gained along x per wafer radius"),
-        "overlay_y_m": Error("overlay", "m", True, False, "mask shifted toward +y"),
-        "overlay_x_m": Error("overlay", "m", True, False, "mask shifted toward +x"),
-        "rotation_rad": Error("overlay", "rad", True, False, "mask turned from +x toward +y about the wafer's centre"),
-        "magnification": Error("overlay", "1", True, False, "mask too large by this share about the wafer's centre"),
-        "common_cd_bias_m": Error("cd", "m", False, False, "every etched area grows by this at every edge"),
-        "cd_bias_m": Error("cd", "m", True, False, "the same for one mask, besides the common one"),
-        "corner_radius_m": Error("corners", "m", False, True, "radius to which square corners are rounded"),
-        "sidewall_rad": Error(
+        "common_depth_scale": Deviation("depth", "1", False, False, "all etches too deep by this share"),
+        "depth_scale": Deviation("depth", "1", True, False, "this etch too deep by this share, besides the common one"),
+        "radial_nonuniformity": Deviation(
+            "uniformity", "1", False, False, "depth gained from wafer centre to edge (r^2)"
+        ),
+        "linear_nonuniformity_y": Deviation("uniformity", "1", False, False, "depth gained along y per wafer radius"),
+        "linear_nonuniformity_x": Deviation("uniformity", "1", False, False, "depth gained along x per wafer radius"),
+        "overlay_y_m": Deviation("overlay", "m", True, False, "mask shifted toward +y"),
+        "overlay_x_m": Deviation("overlay", "m", True, False, "mask shifted toward +x"),
+        "rotation_rad": Deviation(
+            "overlay", "rad", True, False, "mask turned from +x toward +y about the wafer's centre"
+        ),
+        "magnification": Deviation(
+            "overlay", "1", True, False, "mask too large by this share about the wafer's centre"
+        ),
+        "common_cd_bias_m": Deviation("cd", "m", False, False, "every etched area grows by this at every edge"),
+        "cd_bias_m": Deviation("cd", "m", True, False, "the same for one mask, besides the common one"),
+        "corner_radius_m": Deviation("corners", "m", False, True, "radius to which square corners are rounded"),
+        "sidewall_rad": Deviation(
             "sidewalls", "rad", False, True, "tilt of etched walls from the vertical, floors narrower"
         ),
-        "etch_lag": Error("lag", "1", False, True, "share of depth lost per unit of depth / opening width"),
-        "roughness_m": Error("roughness", "m", False, True, "rms height of the surface's roughness"),
-        "correlation_m": Error("roughness", "m", False, True, "its correlation length, exp(-r^2 / length^2)"),
-        "chrome_y_m": Error("chrome", "m", False, False, "chrome opening shifted toward +y"),
-        "chrome_x_m": Error("chrome", "m", False, False, "chrome opening shifted toward +x"),
-        "chrome_diameter_m": Error("chrome", "m", False, False, "chrome opening too wide by this"),
+        "etch_lag": Deviation("lag", "1", False, True, "share of depth lost per unit of depth / opening width"),
+        "roughness_m": Deviation("roughness", "m", False, True, "rms height of the surface's roughness"),
+        "correlation_m": Deviation("roughness", "m", False, True, "its correlation length, exp(-r^2 / length^2)"),
+        "chrome_y_m": Deviation("chrome", "m", False, False, "chrome opening shifted toward +y"),
+        "chrome_x_m": Deviation("chrome", "m", False, False, "chrome opening shifted toward +x"),
+        "chrome_diameter_m": Deviation("chrome", "m", False, False, "chrome opening too wide by this"),
     }
 )
 
@@ -90,7 +96,7 @@ class Variation:
     """The errors of one plate; all zero is a plate exactly as drawn.
 
     A per-mask error is empty (zero for every mask) or has one value per mask, mask 0 first; the other values mean what
-    `ERRORS` says.
+    `DEVIATIONS` says.
 
     Attributes:
         repeats: how often each mask was etched more than once: -1 missed, 1 doubled; empty for none.
@@ -144,17 +150,17 @@ def _split(name: str) -> tuple[str, int | None]:
 
 
 def error_names(masks: int, *errors: str) -> tuple[str, ...]:
-    """Flat names of some errors (all by default): "corner_radius_m", "overlay_x_m[0]", ... in the order of `ERRORS`."""
-    chosen = errors or tuple(ERRORS)
+    """Flat names of some errors (all by default), such as "overlay_x_m[0]", in the order of `DEVIATIONS`."""
+    chosen = errors or tuple(DEVIATIONS)
     return tuple(
         name
-        for key, error in ERRORS.items()
+        for key, error in DEVIATIONS.items()
         if key in chosen
         for name in ([f"{key}[{k}]" for k in range(masks)] if error.per_mask else [key])
     )
 
 
-class Spread(NamedTuple):
+class Normal(NamedTuple):
     """How an error is distributed: normal with this mean and standard deviation."""
 
     mean: float = 0.0
@@ -216,7 +222,7 @@ class Process:
 
     levels: Levels
     order: tuple[int, ...] = ()
-    spreads: Mapping[str, Spread] = field(default_factory=dict, hash=False)
+    spreads: Mapping[str, Normal] = field(default_factory=dict, hash=False)
     defects: Defects = Defects()
     tone: Literal["clear", "dark"] = "clear"
     minimum_line_m: float = 0.0
@@ -257,7 +263,7 @@ class Process:
                 raise InputError(f"process.errors.{name}", "must be a known error", name, f"One of {', '.join(known)}.")
             if not (math.isfinite(spread.mean) and 0 <= spread.sigma < math.inf):
                 raise InputError(f"process.errors.{name}", "sigma must be finite and not negative", spread, "Mend it.")
-            if spread.mean < 0 and ERRORS[_split(name)[0]].one_sided:
+            if spread.mean < 0 and DEVIATIONS[_split(name)[0]].one_sided:
                 rule = "the mean of an error that is never negative must not be negative"
                 raise InputError(f"process.errors.{name}", rule, spread, "Give 0 or more.")
 

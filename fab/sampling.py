@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import hadamard
 from scipy.stats import norm, qmc
 
-from fab.process import ERRORS, Disc, MaskDisc, Process, Variation, variation_of
+from fab.process import DEVIATIONS, Disc, MaskDisc, Process, Variation, variation_of
 
 __all__ = [
     "corner_scores",
@@ -31,8 +31,8 @@ _ALL_CORNERS = 6  # errors up to which every combination of signs is tried
 
 
 def varying(process: Process) -> tuple[str, ...]:
-    """Flat names of the errors with a standard deviation above zero, in the order of `ERRORS`."""
-    keys = list(ERRORS)
+    """Flat names of the errors with a standard deviation above zero, in the order of `DEVIATIONS`."""
+    keys = list(DEVIATIONS)
     names = [name for name, spread in process.spreads.items() if spread.sigma > 0]
     return tuple(sorted(names, key=lambda name: (keys.index(_key(name)), name)))
 
@@ -43,7 +43,7 @@ def _key(name: str) -> str:
 
 def source_of(name: str) -> str:
     """Group of a flat error name, such as "overlay"."""
-    return ERRORS[_key(name)].source
+    return DEVIATIONS[_key(name)].source
 
 
 def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **rest: object) -> Variation:
@@ -61,7 +61,7 @@ def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **res
     values = {}
     for name, spread in process.spreads.items():
         value = spread.mean + strayed.get(name, 0.0) * spread.sigma
-        values[name] = abs(value) if ERRORS[_key(name)].one_sided else value
+        values[name] = abs(value) if DEVIATIONS[_key(name)].one_sided else value
     return variation_of(process.masks, values, seed=seed, **rest)
 
 

@@ -16,7 +16,7 @@ from math import radians
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from fab.process import ERRORS
+from fab.process import DEVIATIONS
 
 __all__ = ["IDEAL", "STOCK", "Figure", "Number", "Source", "Stock", "Typical"]
 
@@ -41,7 +41,7 @@ class Figure(NamedTuple):
 
 
 class Typical(NamedTuple):
-    """Mean and standard deviation of one error, in the unit of `ERRORS`, and their source."""
+    """Mean and standard deviation of one error, in the unit of `DEVIATIONS`, and their source."""
 
     mean: float
     sigma: float
@@ -52,7 +52,7 @@ class Number(NamedTuple):
     """A number of a stock process, ready to be printed.
 
     Attributes:
-        name: what it is a number of; an error's name as in `ERRORS`, or an attribute of `Stock` or `Defects`.
+        name: what it is a number of; an error's name as in `DEVIATIONS`, or an attribute of `Stock` or `Defects`.
         kind: "mean", "sigma" or "value".
         value: the number, SI units.
         source: where it comes from.
@@ -75,7 +75,7 @@ class Stock:
     Attributes:
         name: its key in `STOCK`.
         title: what it is, in words.
-        errors: errors by their name in `ERRORS`; what is missing is zero.
+        errors: errors by their name in `DEVIATIONS`; what is missing is zero.
         minimum_line_m: narrowest line.
         minimum_space_m: narrowest gap.
         wafer_radius_m: radius of the wafers it takes.
@@ -93,8 +93,8 @@ class Stock:
     tone: Literal["clear", "dark"] = "clear"
 
     def numbers(self) -> Iterator[Number]:
-        """Yield every number with its source, errors first, in the order of `ERRORS`."""
-        for name in ERRORS:
+        """Yield every number with its source, errors first, in the order of `DEVIATIONS`."""
+        for name in DEVIATIONS:
             if typical := self.errors.get(name):
                 if typical.mean:
                     yield Number(name, "mean", typical.mean, typical.source)

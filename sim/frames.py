@@ -26,7 +26,7 @@ _CHANNELS = ("red", "green", "blue")
 _CURE = "Write the file again from its source."
 
 
-class Frame(NamedTuple):
+class CameraFrame(NamedTuple):
     """One exposure as its file holds it.
 
     Attributes:
@@ -46,7 +46,7 @@ class Frame(NamedTuple):
 
 def read_frame(
     path: str | Path, *, channel: Channel | None = None, pixel_m: float | None = None, allow_8bit: bool = False
-) -> Frame:
+) -> CameraFrame:
     """Read one exposure.
 
     Args:
@@ -73,7 +73,7 @@ def read_frame(
     return frame
 
 
-def _guarded(path: Path, read: Callable[[], Frame]) -> Frame:
+def _guarded(path: Path, read: Callable[[], CameraFrame]) -> CameraFrame:
     try:
         return read()
     except InputError:
@@ -88,7 +88,7 @@ def _guarded(path: Path, read: Callable[[], Frame]) -> Frame:
         raise InputError(str(path), "the file must be whole and hold one image", got, _CURE) from error
 
 
-def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> Frame:
+def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> CameraFrame:
     from sim.store import read_bank
 
     # Of a foreign file only the values are wanted; its pitch is whatever was given.
@@ -105,7 +105,7 @@ def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> Fra
     return _frame(counts[0], clipped_at=None)
 
 
-def _read_tiff(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+def _read_tiff(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
@@ -121,7 +121,7 @@ def _read_tiff(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
     return _frame(_deep_enough(path, values, allow_8bit)[::-1])
 
 
-def _read_png(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+def _read_png(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
     from PIL import Image
 
     with Image.open(path, formats=["PNG"]) as image:
@@ -136,7 +136,7 @@ def _read_png(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
     return _frame(_deep_enough(path, narrow, allow_8bit)[::-1])
 
 
-def _read_raw(path: Path, channel: Channel | None, allow_8bit: bool) -> Frame:
+def _read_raw(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
     try:
         import rawpy
     except ImportError as error:
@@ -179,14 +179,14 @@ def _frame(
     valid: Bool[np.ndarray, "y x"] | None = None,
     clipped_at: float | None = None,
     black: float = 0.0,
-) -> Frame:
+) -> CameraFrame:
     step = 0.0
     if values.dtype.kind == "u":
         # Converters of 12 bits often fill the upper bits of 16.
         step = float(np.gcd.reduce(np.unique(values)) or 1)
         clipped_at = clipped_at or _implied_clip(values, valid)
     counts = np.ascontiguousarray(values, dtype=np.float32)
-    return Frame(counts, np.ones(counts.shape, bool) if valid is None else valid, clipped_at, black, step)
+    return CameraFrame(counts, np.ones(counts.shape, bool) if valid is None else valid, clipped_at, black, step)
 
 
 def _implied_clip(values: Num[np.ndarray, "y x"], valid: Bool[np.ndarray, "y x"] | None) -> float:

@@ -15,10 +15,10 @@ from jaxtyping import Complex, Float
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
 from sim.propagation.pupil import SurfaceRows, surface_pupil
 from sim.psf_bank import pixel_energy, plan_propagation, surface_energy
-from sim.surface import Surface
+from sim.surface import FabricatedDoe
 
 
-def mean_transmission(surface: Surface) -> Complex[np.ndarray, " w"]:
+def mean_transmission(surface: FabricatedDoe) -> Complex[np.ndarray, " w"]:
     """Mean transmission c0 over the open aperture, weighted by every cell's open share, per wavelength."""
     coverage = np.asarray(surface.coverage, np.float64)
     return _over(np.asarray(surface.means), coverage) / coverage.sum()
@@ -28,12 +28,12 @@ def _over(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     return np.einsum("wyx,yx->w", values, coverage, dtype=np.complex128)
 
 
-def zeroth_order(surface: Surface) -> Float[np.ndarray, " w"]:
+def zeroth_order(surface: FabricatedDoe) -> Float[np.ndarray, " w"]:
     """Fraction |<t>|^2 of the light that passes as if the plate were flat, per wavelength."""
     return np.abs(mean_transmission(surface)) ** 2
 
 
-def strehl(surface: Surface, nominal: Surface) -> Float[np.ndarray, " w"]:
+def strehl(surface: FabricatedDoe, nominal: FabricatedDoe) -> Float[np.ndarray, " w"]:
     """Overlap |<t conj(t_nominal)>|^2 with the field the design means to make, per wavelength.
 
     Args:
@@ -73,7 +73,7 @@ class SplitPsf(NamedTuple):
         return float(np.max(np.abs(self.interference) - most) / np.max(self.total))
 
 
-def split_psf(camera: Camera, surface: Surface, colour: Colour, depth_m: float) -> SplitPsf:
+def split_psf(camera: Camera, surface: FabricatedDoe, colour: Colour, depth_m: float) -> SplitPsf:
     """Split the PSF of one colour and depth into the light that leaked and the light that was diffracted.
 
     Args:

@@ -20,7 +20,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter, label
 
 from fab.errors import InputError
-from sim.frames import Frame
+from sim.frames import CameraFrame
 
 _BORDER = 0.05  # of the shorter side: where a frame should hold background alone
 _SEARCH = 1024  # samples per side on which the light is looked for
@@ -59,9 +59,9 @@ class MeasuredPsf(NamedTuple):
 
 
 def merge_exposures(
-    frames: Sequence[Frame],
+    frames: Sequence[CameraFrame],
     exposures: Sequence[float],
-    darks: Sequence[Frame | float],
+    darks: Sequence[CameraFrame | float],
     noise: Noise,
     *,
     clipped_at: float | None = None,
@@ -111,7 +111,7 @@ _SHORTER = "Add a shorter exposure, or check `saturation`."
 
 
 def _without_dark(
-    frame: Frame, dark: Frame | float, noise: Noise, dark_count: int, name: str
+    frame: CameraFrame, dark: CameraFrame | float, noise: Noise, dark_count: int, name: str
 ) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
     """Counts above black, and their variance without light."""
     read = (noise.read_e / noise.gain_e) ** 2 + frame.step**2 / 12

@@ -16,7 +16,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import plan_hankel, ring_source_waves
 from sim.propagation.pupil import PhaseRows, PupilRows, SurfaceRows, phase_pupil, surface_pupil
-from sim.surface import Surface
+from sim.surface import FabricatedDoe
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
 
@@ -119,7 +119,7 @@ def psf_bank(
 
 def surface_bank(
     camera: Camera,
-    surface: Surface,
+    surface: FabricatedDoe,
     depths_m: Sequence[float],
     *,
     field_rad: tuple[float, float] = (0.0, 0.0),
@@ -152,7 +152,7 @@ def surface_bank(
 
 
 def surface_energy(
-    plan: FarField | DirectPath, camera: Camera, surface: Surface, wavelength_m: float, source_waves: Array
+    plan: FarField | DirectPath, camera: Camera, surface: FabricatedDoe, wavelength_m: float, source_waves: Array
 ) -> Float[np.ndarray, "v u"]:
     """Pixel energies of a plate for one wavelength and source, without Fresnel loss.
 

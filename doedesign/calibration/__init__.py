@@ -28,10 +28,10 @@ from jaxtyping import Float
 
 from doedesign.calibration.explanations import Explanation, Family, Targets, explanations
 from doedesign.calibration.fit import Fit, search
-from doedesign.calibration.forward_model import Bench, probe_camera
+from doedesign.calibration.forward_model import ForwardModel, probe_camera
 from doedesign.calibration.measurement import Measurement, MeasurementSpec, load_measurement, load_shots
-from doedesign.calibration.objective import Question
-from doedesign.calibration.target import Shot, likeness, target_of
+from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.target import MeasuredImage, likeness, target_of
 from doedesign.calibration.uncertainty import (
     DETERMINED,
     EXPLAINED,
@@ -45,7 +45,7 @@ from doedesign.calibration.uncertainty import (
 )
 from doedesign.calibration.unknowns import Unknowns, unknowns_of
 from doedesign.prediction import Drawn
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 
 __all__ = [
     "DETERMINED",
@@ -54,13 +54,13 @@ __all__ = [
     "Explanation",
     "Family",
     "Fit",
+    "FitObjective",
     "LeftOut",
+    "MeasuredImage",
     "Measurement",
     "MeasurementSpec",
     "Posterior",
-    "Question",
     "Reading",
-    "Shot",
     "Targets",
     "Unknowns",
     "calibrate",
@@ -86,7 +86,7 @@ class Calibration:
         remarks: what a user must know before believing any of it, in sentences.
     """
 
-    question: Question
+    question: FitObjective
     fit: Fit
     known: Posterior
     process: Process
@@ -137,11 +137,11 @@ def calibrate(
     fill = drawn.camera.fill if spec.fill_factor is None else spec.fill_factor
     camera = probe_camera(drawn.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
     unknowns = unknowns_of(process, errors, camera.grid.pitch_m)
-    bench = Bench(drawn.level, camera, process, unknowns, tuple(shot.depth_m for shot in measurement.shots))
+    bench = ForwardModel(drawn.level, camera, process, unknowns, tuple(shot.depth_m for shot in measurement.shots))
     believed = bench.plate(unknowns.start)
     expected = [believed.image(i, np.zeros(3)) for i in range(len(measurement.shots))]
     each = zip(measurement.shots, expected, strict=True)
-    question = Question(bench, tuple(target_of(shot, measurement.window, image) for shot, image in each))
+    question = FitObjective(bench, tuple(target_of(shot, measurement.window, image) for shot, image in each))
     fit = search(question, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model)
     known = posterior(question, fit)
     others = left_out(question, fit, known) if len(question.targets) > 1 else []
@@ -154,12 +154,12 @@ def calibrate(
 
 def _estimate(process: Process, unknowns: Unknowns, known: Posterior) -> Process:
     found = {
-        name: Spread(float(value), float(sigma))
+        name: Normal(float(value), float(sigma))
         for name, value, sigma in zip(unknowns.names, known.values, known.sigma, strict=True)
     }
     # The others' places are relative to mask 0.
     references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if unknowns.relative(name)}
-    still = {name: Spread(process.spreads.get(name, Spread()).mean, 0.0) for name in references}
+    still = {name: Normal(process.spreads.get(name, Normal()).mean, 0.0) for name in references}
     spreads = MappingProxyType({**process.spreads, **still, **found})
     return replace(process, spreads=spreads, name=f"{process.name}, calibrated")
 

@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 from doedesign.calibration.unknowns import ASSUMED, chosen_names, definite_means
 from doedesign.prediction import Drawn, predict
 from fab.errors import InputError
-from fab.process import ERRORS, Process, variation_of
+from fab.process import DEVIATIONS, Process, variation_of
 from sim.camera import Colour
 
 _DEFAULT = (
@@ -149,7 +149,7 @@ class _Walk:
 
     def _row(self, scores: Mapping[str, float]) -> dict[str, Any] | None:
         values = self.values(scores)
-        if any(value < 0 and ERRORS[name.partition("[")[0]].one_sided for name, value in values.items()):
+        if any(value < 0 and DEVIATIONS[name.partition("[")[0]].one_sided for name, value in values.items()):
             return None
         means = definite_means(self.process)
         try:

@@ -20,10 +20,10 @@ from jaxtyping import Float
 
 from doedesign.calibration.objective import (
     WIDEST_STEP,
-    Lens,
-    Look,
+    Evaluation,
+    FitObjective,
+    Linearization,
     OnModel,
-    Question,
     Weights,
     difference_steps,
     linearised,
@@ -51,13 +51,13 @@ class Fit(NamedTuple):
         models: plates that were computed.
     """
 
-    lens: Lens
+    lens: Linearization
     weights: Weights
     models: int
 
 
 def search(
-    question: Question,
+    question: FitObjective,
     *,
     evaluations: int = 0,
     polish: int = 0,
@@ -103,18 +103,18 @@ def search(
     return Fit(lens, weights, next(counted) - 1)
 
 
-def _objective(question: Question, weights: Weights, at: Look) -> float:
+def _objective(question: FitObjective, weights: Weights, at: Evaluation) -> float:
     return at._replace(matches=matched(question, weights, at.images)).objective
 
 
-def _renewed(question: Question, errors: Sequence[float], at: Look) -> Weights:
+def _renewed(question: FitObjective, errors: Sequence[float], at: Evaluation) -> Weights:
     """Weights from the model's own images."""
     each = zip(question.targets, at.matches, at.images, errors, strict=True)
     return tuple(weights_at(t, m.gain * image, e, max(m.background, 0.0)) for t, m, image, e in each)
 
 
 def _global(
-    question: Question,
+    question: FitObjective,
     weights: Weights,
     scores: Float[np.ndarray, " s"],
     evaluations: int,
@@ -149,8 +149,8 @@ def _global(
 
 
 def _gauss_newton(
-    question: Question, errors: Sequence[float], weights: Weights, scores: Float[np.ndarray, " s"], tell: OnModel
-) -> tuple[Lens, Weights]:
+    question: FitObjective, errors: Sequence[float], weights: Weights, scores: Float[np.ndarray, " s"], tell: OnModel
+) -> tuple[Linearization, Weights]:
     """Damped Gauss-Newton steps until they no longer matter; returns the last linearised model and its weights."""
     at, damping = look(question, weights, scores), 1e-3
     steps = np.full(len(scores), WIDEST_STEP)
@@ -179,7 +179,7 @@ def _gauss_newton(
     return linearised(question, weights, at, slopes_at(question, at, steps, tell)), weights
 
 
-def _bounded_step(question: Question, lens: Lens, damping: float) -> Float[np.ndarray, " s"]:
+def _bounded_step(question: FitObjective, lens: Linearization, damping: float) -> Float[np.ndarray, " s"]:
     """Minimum of the linearised objective, damped, within the range of every error."""
     scores = lens.look.scores
     half = lens.half_hessian
@@ -200,7 +200,7 @@ def _bounded_step(question: Question, lens: Lens, damping: float) -> Float[np.nd
     return turn @ _slsqp(objective, level, steep @ turn, 200, 1e-6)
 
 
-def _range(question: Question, scores: Float[np.ndarray, " s"]) -> tuple[np.ndarray, np.ndarray]:
+def _range(question: FitObjective, scores: Float[np.ndarray, " s"]) -> tuple[np.ndarray, np.ndarray]:
     """The ends of the errors' range as level + steep @ step <= 0, in standard deviations."""
     unknowns, errors = question.bench.unknowns, question.errors
     side = np.concatenate([np.eye(errors), -np.eye(errors)]) / np.tile(unknowns.sigma, 2)[:, None]
@@ -210,7 +210,7 @@ def _range(question: Question, scores: Float[np.ndarray, " s"]) -> tuple[np.ndar
     return side @ question.values(scores) - ends, steep
 
 
-def _polish(question: Question, weights: Weights, lens: Lens, steps: int, tell: OnModel) -> Look:
+def _polish(question: FitObjective, weights: Weights, lens: Linearization, steps: int, tell: OnModel) -> Evaluation:
     """Follow the exact gradient from a linearised model, in scores turned so that its Hessian is the identity."""
     start = lens.look.scores
     turn = np.linalg.cholesky(np.linalg.inv(lens.half_hessian))

@@ -30,7 +30,7 @@ from sim.surface import as_fabricated
 MOTIONS = ("shift_y", "shift_x", "defocus")  # pixels, pixels, 1/m
 
 
-class Plate(NamedTuple):
+class VariedDoe(NamedTuple):
     """What light meets.
 
     Attributes:
@@ -75,12 +75,12 @@ def _pupil(rows: _Rows, shared: tuple[Array, Array]) -> Complex[Array, "row x"]:
     return rows.coverage * rows.transmission * cis(waves)
 
 
-def _rows(optic: _Optic, plate: Plate) -> _Rows:
+def _rows(optic: _Optic, plate: VariedDoe) -> _Rows:
     return _Rows(plate.transmission, plate.coverage, optic.source_waves, optic.axis)
 
 
 @eqx.filter_jit
-def _energy(optic: _Optic, plate: Plate, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
+def _energy(optic: _Optic, plate: VariedDoe, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
     return optic.factor * optic.plan.energy(_pupil, _rows(optic, plate), (optic.axis, optic.rates * motion))
 
 
@@ -91,7 +91,7 @@ def probe_camera(camera: Camera, wavelength_m: float, pixel_m: float, window: in
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class ForwardModel:
     """A plate in front of a camera, images of point sources at some depths.
 
     Attributes:
@@ -114,21 +114,21 @@ class Bench:
         """The probe's."""
         return self.camera.colours[0].wavelengths_m[0]
 
-    def _surface(self, values: Any) -> tuple[Plate, Grid]:
+    def _surface(self, values: Any) -> tuple[VariedDoe, Grid]:
         variation = self.unknowns.variation(values)
         surface = as_fabricated(self.level, self.camera, self.process, variation, (self.wavelength_m,))
-        return Plate(surface.transmission[0], surface.coverage), surface.grid
+        return VariedDoe(surface.transmission[0], surface.coverage), surface.grid
 
-    def plate(self, values: Float[np.ndarray, " p"]) -> "Seen":
+    def plate(self, values: Float[np.ndarray, " p"]) -> "DoeImages":
         """The plate with some errors."""
-        return Seen(self, *self._surface([float(v) for v in values]))
+        return DoeImages(self, *self._surface([float(v) for v in values]))
 
     def plate_and_pull(
         self, values: Float[np.ndarray, " p"]
-    ) -> tuple["Seen", Callable[[Plate], Float[np.ndarray, " p"]]]:
+    ) -> tuple["DoeImages", Callable[[VariedDoe], Float[np.ndarray, " p"]]]:
         """The plate, and the function that turns a gradient with respect to it into one with respect to the errors."""
         plate, pull, grid = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
-        return Seen(self, plate, grid), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
+        return DoeImages(self, plate, grid), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
 
     def optic(self, depth_m: float, grid: Grid) -> _Optic:
         """Plan and source of a depth for a plate of some cells; made once."""
@@ -148,11 +148,11 @@ class Bench:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class DoeImages:
     """A plate and the images of it."""
 
-    bench: Bench
-    plate: Plate
+    bench: ForwardModel
+    plate: VariedDoe
     grid: Grid
 
     def image(self, index: int, motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "y x"]:
@@ -161,11 +161,13 @@ class Seen:
 
     def image_and_pull(
         self, index: int, motion: Float[np.ndarray, "3"]
-    ) -> tuple[Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[Plate, Float[np.ndarray, "3"]]]]:
+    ) -> tuple[
+        Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[VariedDoe, Float[np.ndarray, "3"]]]
+    ]:
         """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
         image, pull = jax.vjp(partial(_energy, self._optic(index)), self.plate, jnp.asarray(motion, jnp.float32))
 
-        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[Plate, Float[np.ndarray, "3"]]:
+        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[VariedDoe, Float[np.ndarray, "3"]]:
             to_plate, to_motion = pull(jnp.asarray(gradient, jnp.float32))
             return to_plate, np.asarray(to_motion, np.float64)
 
@@ -179,7 +181,7 @@ class Seen:
         """Share of the light that passes as if the plate were flat."""
         return float(abs(self.mean(self.plate)) ** 2)
 
-    def mean(self, plate: Plate) -> complex:
+    def mean(self, plate: VariedDoe) -> complex:
         """Mean transmission over the clear aperture."""
         light = np.asarray(jnp.sum(plate.transmission * self.plate.coverage, axis=1), np.complex128).sum()
         return complex(light) / (np.pi * (self.bench.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)

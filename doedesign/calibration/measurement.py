@@ -29,16 +29,16 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError
 
-from doedesign.calibration.target import Shot
+from doedesign.calibration.target import MeasuredImage
 from doedesign.spec import explain, spec_error
-from doedesign.spec.errors import Problem
-from doedesign.spec.table import Table
+from doedesign.spec.errors import SpecMistake
+from doedesign.spec.table import SpecTable
 from doedesign.spec.values import FROM_TOML, FarDepth, Pitch, Positive, Wavelength, broken, length
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file
 from fab.units import MM
 from sim.camera import Camera
-from sim.frames import Channel, Frame, read_frame
+from sim.frames import CameraFrame, Channel, read_frame
 from sim.measured import (
     MeasuredPsf,
     Noise,
@@ -66,7 +66,7 @@ Exposure = Annotated[float, BeforeValidator(_seconds)]
 Share = Annotated[float, Field(strict=True, gt=0, le=1)]
 
 
-class ImageSpec(Table, frozen=True):
+class ImageSpec(SpecTable, frozen=True):
     """One image: a point source at one depth.
 
     Attributes:
@@ -102,7 +102,7 @@ class ImageSpec(Table, frozen=True):
         return self.name or Path(self.files[0]).stem
 
 
-class MeasurementSpec(Table, frozen=True):
+class MeasurementSpec(SpecTable, frozen=True):
     """How images were taken.
 
     Attributes:
@@ -149,7 +149,7 @@ class Measurement(NamedTuple):
     """
 
     spec: MeasurementSpec
-    shots: tuple[Shot, ...]
+    shots: tuple[MeasuredImage, ...]
     window: int
     digests: dict[str, str]
     full: dict[str, int]
@@ -177,24 +177,26 @@ def load_measurement(path: Path) -> MeasurementSpec:
     return spec
 
 
-def _problems(spec: MeasurementSpec) -> list[Problem]:
+def _problems(spec: MeasurementSpec) -> list[SpecMistake]:
     found, names = [], [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)
         if len(image.exposures) != count and not (count == 1 and not image.exposures):
             rule = f"must have one entry per file, {count} here"
-            found.append(Problem(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
+            found.append(SpecMistake(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
         if len(image.dark) not in (0, 1, count):
             rule = f"must name one dark frame per file, {count} here, or one for all"
-            found.append(Problem(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
+            found.append(SpecMistake(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
         if image.dark and image.black_level is not None:
-            found.append(Problem(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
+            found.append(SpecMistake(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
         if names.index(image.called) != i:
             cure = "Add `name` to one of them."
-            found.append(Problem(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure))
+            found.append(
+                SpecMistake(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure)
+            )
         if image.incident is not None and not image.exposures:
             rule = "counts per second mean nothing without an exposure"
-            found.append(Problem(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
+            found.append(SpecMistake(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
     return found
 
 
@@ -212,7 +214,7 @@ def load_shots(path: Path, camera: Camera, on_file: Callable[[str], None] = lamb
     spec = load_measurement(path)
     digests = {path.name: sha256_file(path)}
 
-    def read(name: str) -> Frame:
+    def read(name: str) -> CameraFrame:
         on_file(name)
         file = path.parent / name
         digests[name] = sha256_file(file)
@@ -237,7 +239,7 @@ def _turned(spec: MeasurementSpec, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.rot90(picture[:, ::-1] if spec.mirrored else picture, -spec.quarter_turns))
 
 
-def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], Frame]) -> MeasuredPsf:
+def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], CameraFrame]) -> MeasuredPsf:
     frames = [read(name) for name in image.files]
     files = [read(name) for name in image.dark]
     black = image.black_level
@@ -253,7 +255,7 @@ def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], Frame
     )
 
 
-def _shot(spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int) -> Shot:
+def _shot(spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int) -> MeasuredImage:
     if min(psf.rate.shape) < window:
         rule = f"an image must have at least the window's {window} pixels per side"
         raise InputError(image.called, rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
@@ -263,7 +265,7 @@ def _shot(spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Cam
     size = min(2 * window, *psf.rate.shape)
     cut, rest = cut_window(clean, centre, size)
     bend = image.depth_sigma_m / image.depth_m**2 if math.isfinite(image.depth_m) else 0.0
-    return Shot(
+    return MeasuredImage(
         name=image.called,
         depth_m=image.depth_m,
         psf=cut,

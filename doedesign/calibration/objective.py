@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.forward_model import Bench, Plate, Seen
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, VariedDoe
 from doedesign.calibration.target import Match, Target, match, projected
 from doedesign.calibration.unknowns import Unknowns
 
@@ -32,10 +32,10 @@ OnModel = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class FitObjective:
     """Measured images and the bench that should explain them."""
 
-    bench: Bench
+    bench: ForwardModel
     targets: tuple[Target, ...]
 
     @property
@@ -81,7 +81,7 @@ class Question:
         return {self.errors + k: (kind, units[kind]) for k, (index, kind) in enumerate(self.motions) if index == image}
 
 
-class Look(NamedTuple):
+class Evaluation(NamedTuple):
     """The model at some scores beside the measurement.
 
     Attributes:
@@ -93,7 +93,7 @@ class Look(NamedTuple):
     """
 
     scores: Float[np.ndarray, " s"]
-    seen: Seen
+    seen: DoeImages
     images: tuple[Float[np.ndarray, "y x"], ...]
     matches: tuple[Match, ...]
 
@@ -108,7 +108,7 @@ class Look(NamedTuple):
         return self.squares + float(self.scores @ self.scores)
 
 
-class Slopes(NamedTuple):
+class Jacobian(NamedTuple):
     """How the model changes with every score.
 
     Attributes:
@@ -120,7 +120,7 @@ class Slopes(NamedTuple):
     zeroth_order: Float[np.ndarray, " s"]
 
 
-class Lens(NamedTuple):
+class Linearization(NamedTuple):
     """The model linearised at some scores.
 
     Attributes:
@@ -130,8 +130,8 @@ class Lens(NamedTuple):
         descents: `[image]` half the negative gradient of each image's squares.
     """
 
-    look: Look
-    slopes: Slopes
+    look: Evaluation
+    slopes: Jacobian
     hessians: tuple[Float[np.ndarray, "s s"], ...]
     descents: tuple[Float[np.ndarray, " s"], ...]
 
@@ -146,21 +146,21 @@ class Lens(NamedTuple):
         return np.sqrt(np.diag(np.linalg.inv(self.half_hessian)))
 
 
-def look(question: Question, weights: Weights, scores: Float[np.ndarray, " s"]) -> Look:
+def look(question: FitObjective, weights: Weights, scores: Float[np.ndarray, " s"]) -> Evaluation:
     """Evaluate the model."""
     seen = question.bench.plate(question.values(scores))
     images = tuple(seen.image(i, question.motion(scores, i)) for i in range(len(question.targets)))
-    return Look(scores, seen, images, matched(question, weights, images))
+    return Evaluation(scores, seen, images, matched(question, weights, images))
 
 
-def matched(question: Question, weights: Weights, images: Sequence[np.ndarray]) -> tuple[Match, ...]:
+def matched(question: FitObjective, weights: Weights, images: Sequence[np.ndarray]) -> tuple[Match, ...]:
     """Match every image of a model with its measurement."""
     return tuple(match(*each) for each in zip(question.targets, weights, images, strict=True))
 
 
 def look_and_gradient(
-    question: Question, weights: Weights, scores: Float[np.ndarray, " s"]
-) -> tuple[Look, Float[np.ndarray, " s"]]:
+    question: FitObjective, weights: Weights, scores: Float[np.ndarray, " s"]
+) -> tuple[Evaluation, Float[np.ndarray, " s"]]:
     """Evaluate the model and the gradient of the objective."""
     seen, pull = question.bench.plate_and_pull(question.values(scores))
     gradient, images, matches, total = 2 * scores, [], [], None
@@ -172,10 +172,10 @@ def look_and_gradient(
             gradient[place] += unit * to_motion[kind]
         images.append(image)
         matches.append(found)
-        total = to_plate if total is None else Plate(*(a + b for a, b in zip(total, to_plate, strict=True)))
+        total = to_plate if total is None else VariedDoe(*(a + b for a, b in zip(total, to_plate, strict=True)))
     assert total is not None  # there is at least one image
     gradient[: question.errors] += question.bench.unknowns.root.T @ pull(total)
-    return Look(scores, seen, tuple(images), tuple(matches)), gradient
+    return Evaluation(scores, seen, tuple(images), tuple(matches)), gradient
 
 
 def difference_steps(spread: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
@@ -184,8 +184,8 @@ def difference_steps(spread: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]
 
 
 def slopes_at(
-    question: Question, at: Look, steps: Float[np.ndarray, " s"], on_model: OnModel = lambda _: None
-) -> Slopes:
+    question: FitObjective, at: Evaluation, steps: Float[np.ndarray, " s"], on_model: OnModel = lambda _: None
+) -> Jacobian:
     """Derivatives of all images with respect to all scores, by central differences.
 
     Args:
@@ -218,14 +218,14 @@ def slopes_at(
     # A plate keeps one core busy.
     with ThreadPoolExecutor(min(len(scores), os.cpu_count() or 1, _MOST_THREADS)) as pool:
         list(pool.map(difference, range(len(scores))))
-    return Slopes(columns, zeroth)
+    return Jacobian(columns, zeroth)
 
 
-def linearised(question: Question, weights: Weights, at: Look, slopes: Slopes) -> Lens:
+def linearised(question: FitObjective, weights: Weights, at: Evaluation, slopes: Jacobian) -> Linearization:
     """Objective's slopes from those of the images."""
     each = zip(question.targets, weights, at.images, at.matches, slopes.images, strict=True)
     halves = [projected(*one) for one in each]
-    return Lens(at, slopes, tuple(h for h, _ in halves), tuple(d for _, d in halves))
+    return Linearization(at, slopes, tuple(h for h, _ in halves), tuple(d for _, d in halves))
 
 
 def _within(unknowns: Unknowns, values: Float[np.ndarray, " p"]) -> bool:

@@ -16,7 +16,7 @@ from fab.errors import InputError
 from sim.measured import MeasuredPsf, cut_window, smoothed
 
 
-class Shot(NamedTuple):
+class MeasuredImage(NamedTuple):
     """A measured image as it came.
 
     Attributes:
@@ -75,7 +75,7 @@ class Match(NamedTuple):
     squares: float
 
 
-def target_of(shot: Shot, window: int, model: Float[np.ndarray, "y x"]) -> Target:
+def target_of(shot: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
     """Cut a shot to the window and find its centre by comparison with a model.
 
     Args:
@@ -104,7 +104,7 @@ def target_of(shot: Shot, window: int, model: Float[np.ndarray, "y x"]) -> Targe
     return Target(shot.name, shot.depth_m, unit, scale, shift, gain, shot.defocus_sigma)
 
 
-def _window(shot: Shot, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
+def _window(shot: MeasuredImage, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
     try:
         psf, rest = cut_window(shot.psf, centre, window)
     except InputError as error:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.calibration.fit import Fit
-from doedesign.calibration.objective import Question, look
+from doedesign.calibration.objective import FitObjective, look
 from doedesign.calibration.target import Target, match
 from fab.grid import Grid
 from sim.aperture import circle_coverage
@@ -59,7 +59,7 @@ class Posterior(NamedTuple):
     inflation: float
 
 
-def posterior(question: Question, fit: Fit) -> Posterior:
+def posterior(question: FitObjective, fit: Fit) -> Posterior:
     """Covariance of the scores and the errors."""
     lens, unknowns, count = fit.lens, question.bench.unknowns, question.errors
     images = sum(lens.hessians, np.zeros_like(lens.half_hessian))
@@ -91,7 +91,7 @@ def posterior(question: Question, fit: Fit) -> Posterior:
     )
 
 
-def _scatter(question: Question, fit: Fit) -> Float[np.ndarray, "s s"]:
+def _scatter(question: FitObjective, fit: Fit) -> Float[np.ndarray, "s s"]:
     """Sum over blocks of pixels of the outer product of their slopes."""
     total = np.zeros_like(fit.lens.half_hessian)
     for target, weights, image, found, columns in zip(
@@ -139,7 +139,7 @@ class LeftOut(NamedTuple):
     moved: tuple[float, str]
 
 
-def left_out(question: Question, fit: Fit, known: Posterior) -> list[LeftOut]:
+def left_out(question: FitObjective, fit: Fit, known: Posterior) -> list[LeftOut]:
     """Predict every image from the others: one Gauss-Newton step on their part of the objective.
 
     Its own motion, gain and background stay what they were, for they say nothing of the plate.
@@ -178,7 +178,7 @@ class Reading(NamedTuple):
     predicted: tuple[float, float]
 
 
-def readings(question: Question, fit: Fit, known: Posterior) -> list[Reading]:
+def readings(question: FitObjective, fit: Fit, known: Posterior) -> list[Reading]:
     """What a lab reads off every image, and the plate's zeroth order.
 
     Pixels that say nothing are taken from the model. Ring and disc are told apart as in `sim.metrics.ring_to_disc`,
@@ -226,7 +226,7 @@ def _spread(known: Posterior, slope: Float[np.ndarray, " s"]) -> float:
     return float(np.sqrt(max(slope @ known.covariance @ slope, 0.0)))
 
 
-def rises(question: Question, fit: Fit, known: Posterior) -> list[float]:
+def rises(question: FitObjective, fit: Fit, known: Posterior) -> list[float]:
     """By how much the objective rises one standard deviation to either side along the least known directions.
 
     One everywhere if the posterior is the normal distribution that is claimed. Directions that end at the end of an

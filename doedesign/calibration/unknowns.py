@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.process import ERRORS, Process, Spread, Variation, error_names, variation_of
+from fab.process import DEVIATIONS, Normal, Process, Variation, error_names, variation_of
 
 DEFAULT = ("common_depth_scale", "common_cd_bias_m", "overlay_y_m", "overlay_x_m")
 
@@ -103,7 +103,7 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
 
     Args:
         process: the process, with what is believed of its errors.
-        errors: names of `fab.process.ERRORS`, with or without unit, flat names, or sources such as "overlay"; by
+        errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names, or sources such as "overlay"; by
             default depth and line width common to all masks, and overlay.
         pitch_m: pitch of the DOE's cells, which bounds what can be followed.
 
@@ -128,7 +128,7 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
     reach = _REACH * np.sqrt(np.diag(covariance))
     limits = np.array([_limit(name, names, process, pitch_m) for name in names])
     low, high = np.maximum(mean - reach, -limits), np.minimum(mean + reach, limits)
-    one_sided = np.array([ERRORS[_key(name)].one_sided for name in names])
+    one_sided = np.array([DEVIATIONS[_key(name)].one_sided for name in names])
     low = np.where(one_sided, np.maximum(low, 0.0), low)
     # What a rounded corner does grows with its radius squared: at zero nothing says which way is better.
     start = np.clip(np.where(one_sided & (mean < sigma / 2), sigma / 2, mean), low, high)
@@ -141,7 +141,7 @@ def definite_means(process: Process) -> dict[str, float]:
 
     Which roughness a plate has cannot be known; of light at this wavelength a usual one takes a ten-thousandth.
     """
-    return {n: s.mean for n, s in process.spreads.items() if ERRORS[_key(n)].source != "roughness"}
+    return {n: s.mean for n, s in process.spreads.items() if DEVIATIONS[_key(n)].source != "roughness"}
 
 
 def _key(name: str) -> str:
@@ -150,12 +150,12 @@ def _key(name: str) -> str:
 
 def _relative(name: str) -> bool:
     """Whether an error is known only relative to mask 0."""
-    error = ERRORS[_key(name)]
+    error = DEVIATIONS[_key(name)]
     return error.source == "overlay" and error.per_mask
 
 
-def _belief(process: Process, name: str) -> Spread:
-    return process.spreads.get(name, Spread())
+def _belief(process: Process, name: str) -> Normal:
+    return process.spreads.get(name, Normal())
 
 
 def _plain(key: str) -> str:
@@ -163,11 +163,11 @@ def _plain(key: str) -> str:
 
 
 def _keys(error: str) -> tuple[str, ...]:
-    """Keys of `ERRORS` that are meant by one word."""
+    """Keys of `DEVIATIONS` that are meant by one word."""
     bare = _key(error)
-    keys = tuple(k for k, e in ERRORS.items() if bare in (k, _plain(k), e.source) and k in ASSUMED)
+    keys = tuple(k for k, e in DEVIATIONS.items() if bare in (k, _plain(k), e.source) and k in ASSUMED)
     if not keys:
-        choices = [_plain(k) for k in ASSUMED] + sorted({ERRORS[k].source for k in ASSUMED})
+        choices = [_plain(k) for k in ASSUMED] + sorted({DEVIATIONS[k].source for k in ASSUMED})
         close = get_close_matches(bare, choices, n=1)
         cure = f"Did you mean {close[0]}?" if close else f"One of {', '.join(choices)}."
         raise InputError("--errors", "must be an error that a plate has in a definite way", error, cure)
@@ -175,11 +175,11 @@ def _keys(error: str) -> tuple[str, ...]:
 
 
 def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
-    """Flat names of the errors that are meant by some words, in the order of `ERRORS`.
+    """Flat names of the errors that are meant by some words, in the order of `DEVIATIONS`.
 
     Args:
         masks: number of masks.
-        errors: names of `fab.process.ERRORS`, with or without unit, flat names such as "overlay_x[2]", or sources.
+        errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names such as "overlay_x[2]", or sources.
 
     Raises:
         InputError: an unknown error, one that no single plate has in a definite way, or a mask that is not there.
@@ -199,9 +199,9 @@ def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
 def _limit(name: str, names: Sequence[str], process: Process, pitch_m: float) -> float:
     """Largest size of an error that the model follows."""
     key = _key(name)
-    if ERRORS[key].source == "cd":
+    if DEVIATIONS[key].source == "cd":
         # The common bias and a mask's own add up.
-        both = len({_key(n) for n in names if ERRORS[_key(n)].source == "cd"})
+        both = len({_key(n) for n in names if DEVIATIONS[_key(n)].source == "cd"})
         return _WIDEST_BIAS * pitch_m / both
     if key in ("overlay_y_m", "overlay_x_m"):
         return _LARGEST_SHIFT * pitch_m

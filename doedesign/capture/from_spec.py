@@ -20,14 +20,14 @@ from fab.units import parse_angle, parse_length
 from sim.camera import Camera
 from sim.imaging.occlusion import Model, Outside
 from sim.metrics import mean_wavelength_m
-from sim.obstruction import OBSTRUCTIONS, Kind
+from sim.obstruction import OBSTRUCTIONS, ObstructionKind
 from sim.sensor import Sensor
 
 # Luminance of linear sRGB (IEC 61966-2-1).
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
-def occlusion_of(spec: Spec, source: str, given: str | None = None) -> Model:
+def occlusion_from_spec(spec: Spec, source: str, given: str | None = None) -> Model:
     """The occlusion model to use.
 
     Args:
@@ -51,12 +51,12 @@ def occlusion_of(spec: Spec, source: str, given: str | None = None) -> Model:
     return cast("Model", model)
 
 
-def outside_of(kind: Kind) -> Outside:
+def outside_from_kind(kind: ObstructionKind) -> Outside:
     """What eq. 10 takes for an obstruction's picture where there is none: for drops nothing, as in the public code."""
     return "nothing" if "raindrop" in str(getattr(kind, "name", "")) else "scene"
 
 
-def sensor_of(spec: Spec) -> Sensor:
+def sensor_from_spec(spec: Spec) -> Sensor:
     """The sensor of a spec, with the usual values of `sim.sensor` where the spec says nothing."""
     given = spec.sensor
     said = {
@@ -77,7 +77,7 @@ def sensor_of(spec: Spec) -> Sensor:
         raise InputError("sensor", rule.replace("`", ""), got, "Change it in [sensor].") from error
 
 
-def obstruction_of(spec: Spec, source: str, given: str | None = None) -> Kind:
+def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> ObstructionKind:
     """What stands before the scene.
 
     Its distance is that of the options; otherwise it lies between the nearest and the farthest of `scene.near`, for
@@ -131,7 +131,7 @@ def _at(kind: Any, depth_m: tuple[float, float]) -> Any:
     return replace(kind, **inner)
 
 
-def _parameters(kind: type[Kind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Options of a spec as parameters in SI."""
     known = {f.name.removesuffix("_m").removesuffix("_rad"): f for f in fields(cast("Any", kind)) if f.init}
     found = {}
@@ -172,7 +172,7 @@ def plain_parameters(kind: Any) -> dict[str, Any]:
     }
 
 
-def seen_in(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarray, "c y x"]:
+def channels_from_rgb(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarray, "c y x"]:
     """Light of red, green and blue in the colours of a camera: by wavelength, or its luminance where there is one.
 
     Raises:
@@ -188,8 +188,8 @@ def seen_in(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarr
     return np.ascontiguousarray(light[np.argsort(longest_first)])
 
 
-def shown_as(light: Float[np.ndarray, "c y x"], camera: Camera) -> Float[np.ndarray, "3 y x"]:
-    """Inverse of `seen_in`, for pictures: the longest wavelength is red; one colour becomes grey."""
+def rgb_from_channels(light: Float[np.ndarray, "c y x"], camera: Camera) -> Float[np.ndarray, "3 y x"]:
+    """Inverse of `channels_from_rgb`, for pictures: the longest wavelength is red; one colour becomes grey."""
     if len(camera.colours) == 1:
         return np.repeat(light, 3, axis=0)
     longest_first = sorted(range(3), key=lambda c: -mean_wavelength_m(camera.colours[c]))

@@ -28,10 +28,10 @@ from jaxtyping import Float
 
 from doedesign.capture.images import Pictures, crop, linear_light
 from fab.errors import InputError
-from sim.obstruction import Kind, View
+from sim.obstruction import CameraView, ObstructionKind
 
 
-class Item(NamedTuple):
+class SceneItem(NamedTuple):
     """One scene.
 
     Attributes:
@@ -51,8 +51,8 @@ class Item(NamedTuple):
     name: str
 
 
-class Batch(NamedTuple):
-    """Several scenes; see `Item`. The first axis counts them.
+class SceneBatch(NamedTuple):
+    """Several scenes; see `SceneItem`. The first axis counts them.
 
     Attributes:
         step: number of the batch since the beginning of the first epoch.
@@ -84,8 +84,8 @@ class SceneData:
     """
 
     pictures: Pictures
-    kind: Kind
-    view: View
+    kind: ObstructionKind
+    view: CameraView
     far_m: tuple[float, float]
     seed: int = 0
     batch: int = 1
@@ -107,7 +107,7 @@ class SceneData:
         if not len(self.pictures):
             raise ValueError("`pictures` must hold one, but got none")
 
-    def item(self, epoch: int, index: int) -> Item:
+    def item(self, epoch: int, index: int) -> SceneItem:
         """Make one scene.
 
         Args:
@@ -128,7 +128,7 @@ class SceneData:
             error.add_note(f"while preparing scene {index} of epoch {epoch} from {name}")
             raise
         mask, radiance = np.asarray(near.mask), np.asarray(near.radiance)
-        return Item(background, mask, radiance, float(near.depth_m), float(far), name)
+        return SceneItem(background, mask, radiance, float(near.depth_m), float(far), name)
 
     def _picture(self, epoch: int, index: int) -> tuple[str, np.ndarray]:
         turn = _order(self.seed, epoch, len(self.pictures))
@@ -142,7 +142,7 @@ class SceneData:
         )
 
     @contextmanager
-    def batches(self, start: int = 0, stop: int | None = None) -> Iterator[Iterator[Batch]]:
+    def batches(self, start: int = 0, stop: int | None = None) -> Iterator[Iterator[SceneBatch]]:
         """Open the stream.
 
         Args:
@@ -158,8 +158,8 @@ class SceneData:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _stream(self, pool: ThreadPoolExecutor, start: int, stop: int | None) -> Iterator[Batch]:
-        waiting: deque[tuple[int, list[Future[Item]]]] = deque()
+    def _stream(self, pool: ThreadPoolExecutor, start: int, stop: int | None) -> Iterator[SceneBatch]:
+        waiting: deque[tuple[int, list[Future[SceneItem]]]] = deque()
         asked = start
         while True:
             while len(waiting) <= self.ahead and (stop is None or asked < stop):
@@ -179,8 +179,8 @@ def _order(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch,))).permutation(count)
 
 
-def _joined(items: list[Item], step: int) -> Batch:
+def _joined(items: list[SceneItem], step: int) -> SceneBatch:
     """Stack scenes."""
     arrays = [np.stack(values) for values in zip(*((i.background, i.mask, i.radiance) for i in items), strict=True)]
     depths = [np.array(values, np.float32) for values in zip(*((i[3], i[4]) for i in items), strict=True)]
-    return Batch(arrays[0], arrays[1], arrays[2], depths[0], depths[1], tuple(item.name for item in items), step)
+    return SceneBatch(arrays[0], arrays[1], arrays[2], depths[0], depths[1], tuple(item.name for item in items), step)

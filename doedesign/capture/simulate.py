@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from doedesign.capture.from_spec import seen_in
-from doedesign.capture.scenes import Item
+from doedesign.capture.from_spec import channels_from_rgb
+from doedesign.capture.scenes import SceneItem
 from doedesign.prediction import Drawn
 from fab.process import Process, Variation
 from sim.camera import Camera
@@ -21,7 +21,7 @@ from sim.imaging.disc import disc_window
 from sim.imaging.formation import Optics, capture, lost_share, own_margin_px
 from sim.imaging.occlusion import Model, Outside
 from sim.imaging.scene import Obstruction, Scene
-from sim.obstruction import Kind
+from sim.obstruction import ObstructionKind
 from sim.psf_bank import psf_bank, surface_bank
 from sim.sensor import Sensor, demosaiced, developed, expose
 from sim.surface import as_fabricated
@@ -29,7 +29,7 @@ from sim.surface import as_fabricated
 Psfs = Callable[[float], Float[np.ndarray, "c y x"]]
 
 
-class Bench(NamedTuple):
+class CameraPair(NamedTuple):
     """Both cameras.
 
     Attributes:
@@ -59,7 +59,7 @@ class Bench(NamedTuple):
         return own_margin_px(self.camera.window, self.shadow_px, self.model) if self.border == "own" else 0
 
 
-class Captured(NamedTuple):
+class SimulatedCapture(NamedTuple):
     """What one item shows, colours as the camera has them.
 
     Attributes:
@@ -79,7 +79,7 @@ class Captured(NamedTuple):
     depth_m: Float[np.ndarray, "y x"]
 
 
-def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
+def captured(item: SceneItem, bench: CameraPair, key: Key[Array, ""]) -> SimulatedCapture:
     """Photograph one scene with both cameras.
 
     Args:
@@ -88,8 +88,8 @@ def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
         key: key of the noise, which differs from camera to camera.
     """
     camera = bench.camera
-    near = Obstruction(item.mask, seen_in(item.radiance, camera), item.depth_m)
-    scene = Scene(seen_in(item.background, camera), item.background_depth_m, (near,))
+    near = Obstruction(item.mask, channels_from_rgb(item.radiance, camera), item.depth_m)
+    scene = Scene(channels_from_rgb(item.background, camera), item.background_depth_m, (near,))
     with_plate, without = (_optics(psfs, bench, item) for psfs in (bench.with_plate, bench.without))
     conventional, doe = (
         _recorded(scene, optics, bench, jax.random.fold_in(key, k)) for k, optics in enumerate((without, with_plate))
@@ -98,10 +98,10 @@ def captured(item: Item, bench: Bench, key: Key[Array, ""]) -> Captured:
     seen = within(item, bench.margin_px)
     depth = np.where(seen.mask >= 0.5, np.float32(item.depth_m), np.float32(item.background_depth_m))
     clean, alpha = (_within(np.asarray(image), bench.margin_px) for image in (scene.background, alpha))
-    return Captured(clean, conventional, doe, seen.mask, alpha, depth)
+    return SimulatedCapture(clean, conventional, doe, seen.mask, alpha, depth)
 
 
-def within(item: Item, margin_px: int) -> Item:
+def within(item: SceneItem, margin_px: int) -> SceneItem:
     """The middle of a scene: `margin_px` smaller along each axis."""
     names = ("background", "mask", "radiance")
     return item._replace(**{name: _within(getattr(item, name), margin_px) for name in names})
@@ -148,17 +148,17 @@ def depth_range_m(kind: Any) -> tuple[float, float]:
     return min(low for low, _ in inner), max(high for _, high in inner)
 
 
-def shadow_window(kind: Kind, camera: Camera) -> int:
+def shadow_window(kind: ObstructionKind, camera: Camera) -> int:
     """Window that holds the shadow disc at every depth, so that all items share one compiled capture."""
     return disc_window(camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * depth_range_m(kind)[0]))
 
 
-def _optics(psfs: Psfs, bench: Bench, item: Item) -> Optics:
+def _optics(psfs: Psfs, bench: CameraPair, item: SceneItem) -> Optics:
     camera, psf = bench.camera, np.stack([psfs(item.background_depth_m), psfs(item.depth_m)])
     return Optics(psf, camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, bench.shadow_px)
 
 
-def _recorded(scene: Scene, optics: Optics, bench: Bench, key: Array) -> Float[np.ndarray, "c y x"]:
+def _recorded(scene: Scene, optics: Optics, bench: CameraPair, key: Array) -> Float[np.ndarray, "c y x"]:
     """The developed capture."""
     light = capture(scene, optics, bench.model, border=bench.border, outside=bench.outside)
     raw = np.asarray(expose(light, bench.sensor, key))

@@ -66,11 +66,11 @@ def train(
         hosts: Number of hosts; each runs this command, and all see the same folders.
         host: Number of this host, from 0.
     """
-    from doedesign.commands.train import Request
+    from doedesign.commands.train import TrainingSettings
     from doedesign.commands.train import train as work
 
     several = coordinator, hosts, host
-    request = Request(
+    request = TrainingSettings(
         images, validation, set_, lpips_weights, licence, tensorboard, devices, occlusion, obstruction, *several
     )
     folder = work(run, out, request, say)
@@ -112,11 +112,11 @@ def finetune(
         linear: Whether PNG and TIFF hold linear light; by default those of 8 and 16 bits hold display values.
         mirror: Exchange left and right at random, of captures and PSFs.
     """
-    from doedesign.commands.finetune import Request
+    from doedesign.commands.finetune import FinetuneSettings
     from doedesign.commands.finetune import finetune as work
 
     choice = _psf_choice(psf, pixel, near_depth, far_depth)
-    request = Request(choice, steps, learning_rate, seed, validation, size, lpips_weights, linear, mirror)
+    request = FinetuneSettings(choice, steps, learning_rate, seed, validation, size, lpips_weights, linear, mirror)
     folder = work(run, pairs, out, request, say)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
@@ -152,12 +152,14 @@ def reconstruct(
     """
     from dataclasses import replace
 
-    from doedesign.commands.reconstruct import Request, model_and_captures
+    from doedesign.commands.reconstruct import ReconstructionSettings, model_and_captures
     from doedesign.commands.reconstruct import reconstruct as work
 
     model, files = model_and_captures([run, *captures])
     ending = None if kind is None else f".{kind.lower().removeprefix('.')}"
-    request = Request(_psf_choice(psf, pixel, near_depth, far_depth), linear=linear, kind=ending, beside=beside)
+    request = ReconstructionSettings(
+        _psf_choice(psf, pixel, near_depth, far_depth), linear=linear, kind=ending, beside=beside
+    )
     given = {name: value for name, value in (("tile", tile), ("overlap", overlap)) if value is not None}
     paths = work(model, files, out, replace(request, **given), say=say)
     print_paths(paths, json_)

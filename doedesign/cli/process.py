@@ -48,14 +48,14 @@ def tolerance(
         scheduler: Address of a Dask scheduler whose workers are taken instead.
         out: Folder; RUN/tolerance by default. The same command resumes a stopped study.
     """
-    from doedesign.commands.tolerance import Plan, one_draw
+    from doedesign.commands.tolerance import StudyPlan, one_draw
     from doedesign.commands.tolerance import tolerance as work
 
     settings = {"process": process, "limits": limit or None, "seed": seed, "masks": masks, "scheduler": scheduler}
     if draw is not None:
         print_text(one_draw(run, draw, json_, **settings).rstrip())
         return
-    plan = Plan(draws, sensitivity, sobol, corners, budget, yield_)
+    plan = StudyPlan(draws, sensitivity, sobol, corners, budget, yield_)
     folder = work(run, plan, out, say, workers=workers, **settings)
     print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
 

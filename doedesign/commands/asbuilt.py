@@ -6,14 +6,14 @@ from typing import Any
 
 from doedesign.build import process_for
 from doedesign.commands.psf import Say, require_own
-from doedesign.lab.as_built import Plate, compared, gratings_compared, plate_of
+from doedesign.lab.as_built import AsBuiltDoe, compared, gratings_compared, plate_of
 from doedesign.prediction import Drawn, drawn_of, predict
 from doedesign.report.pictures import draw_psfs
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
-from fab.process import ERRORS, Process
+from fab.process import DEVIATIONS, Process
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.store import write_bank
 
@@ -68,7 +68,7 @@ def as_built(
     return folder
 
 
-def _told(plate: Plate) -> str:
+def _told(plate: AsBuiltDoe) -> str:
     """Say how much of the plate is known."""
     count = {source: 0 for source in ("measured", "process mean", "not measured, taken as 0")}
     for one in plate.taken:
@@ -77,7 +77,7 @@ def _told(plate: Plate) -> str:
 
 
 def _write(
-    folder: Path, drawn: Drawn, process: Process, measured: AsBuilt, plate: Plate, file: Path
+    folder: Path, drawn: Drawn, process: Process, measured: AsBuilt, plate: AsBuiltDoe, file: Path
 ) -> list[dict[str, Any]]:
     try:
         prediction = predict(drawn, process, plate.variation)
@@ -90,7 +90,7 @@ def _write(
         "level_map_sha256": drawn.digest(),
         "units": "SI; a depth of null is infinity; null in a comparison is what the sheet does not say",
         "notes": dict(measured.notes),
-        "errors": [{**one._asdict(), "unit": ERRORS[one.error.partition("[")[0]].unit} for one in plate.taken],
+        "errors": [{**one._asdict(), "unit": DEVIATIONS[one.error.partition("[")[0]].unit} for one in plate.taken],
         "etch_lag_per_nm": plate.lag_per_nm,
         "comparison": rows,
         "gratings": gratings_compared(measured, process, plate.variation, drawn.camera.material),

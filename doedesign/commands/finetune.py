@@ -30,22 +30,22 @@ from jaxtyping import Float
 
 from doedesign import __version__
 from doedesign.commands.psf import Say
-from doedesign.recon.model import Model, PsfChoice, Psfs, open_model, psfs_of, shown
+from doedesign.recon.model import Model, ModelPsfs, PsfChoice, open_model, psfs_of, shown
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs.folder import CHECKPOINT, alone_in
-from doedesign.runtime.stopping import Stop, stoppable
+from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
 from doedesign.training.checkpoint import settled, write_checkpoint
 from doedesign.training.crops import PairBatch, PairData, Pairs, crop_shape, cut
-from doedesign.training.evaluation import Found, judge
-from doedesign.training.finetune import State, Tuner
+from doedesign.training.evaluation import EvaluationResult, judge
+from doedesign.training.finetune import FinetuneState, Tuner
 from doedesign.training.history import HISTORY_NAME, read_history
-from doedesign.training.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
+from doedesign.training.loop import Callbacks, FolderLock, Schedule, is_done, perceptual_of, resumed, seal, take_steps
 from doedesign.training.pairs import PairSplit, find_pairs, pairs_digest, split_pairs
 from doedesign.training.perceptual import Lpips
-from doedesign.training.validation import Look
+from doedesign.training.validation import ValidationSample
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, write_atomic
 from sim.light import srgb_from_linear
@@ -58,7 +58,7 @@ _OPTIONS = ("steps", "batch", "learning_rate", "seed", "l1", "perceptual", "mask
 
 
 @dataclass(frozen=True)
-class Request:
+class FinetuneSettings:
     """How to fine-tune.
 
     Attributes:
@@ -84,7 +84,7 @@ class Request:
     mirrored: bool = True
 
 
-class Work(NamedTuple):
+class FinetuneInputs(NamedTuple):
     """One fine-tuning, before its folder is looked at.
 
     Attributes:
@@ -99,7 +99,7 @@ class Work(NamedTuple):
     """
 
     model: Model
-    psfs: Psfs
+    psfs: ModelPsfs
     tuner: Tuner
     data: PairData
     held_out: Pairs
@@ -107,10 +107,10 @@ class Work(NamedTuple):
     settings: dict[str, Any]
     names: dict[str, Any]
 
-    def claim(self) -> Claim:
+    def claim(self) -> FolderLock:
         """Whose a folder of this fine-tuning is."""
         others = "one with another model, PSFs, settings or pairs"
-        return Claim(FORMAT, sha256_bytes(canonical_json(self.settings)), "fine-tuning", others, ("pairs.json",))
+        return FolderLock(FORMAT, sha256_bytes(canonical_json(self.settings)), "fine-tuning", others, ("pairs.json",))
 
     @property
     def title(self) -> str:
@@ -122,7 +122,7 @@ def finetune(
     model_folder: Path,
     pairs: Path,
     out: Path | None = None,
-    request: Request | None = None,
+    request: FinetuneSettings | None = None,
     say: Say = lambda _: None,
 ) -> Path:
     """Fine-tune a model on real pairs, or go on where an earlier call was stopped.
@@ -144,7 +144,7 @@ def finetune(
     """
     folder = out or model_folder / "finetuned"
     with stoppable() as stop:
-        work = _prepared(model_folder, pairs, request or Request(), say)
+        work = _prepared(model_folder, pairs, request or FinetuneSettings(), say)
         claim = work.claim()
         with alone_in(folder):
             if is_done(folder, claim):
@@ -159,7 +159,7 @@ def finetune(
     return folder
 
 
-def _prepared(model_folder: Path, folder: Path, request: Request, say: Say) -> Work:
+def _prepared(model_folder: Path, folder: Path, request: FinetuneSettings, say: Say) -> FinetuneInputs:
     model = open_model(model_folder)
     psfs, options = psfs_of(model, request.psf), _options(model, request)
     split = split_pairs(find_pairs(folder), request.validation, request.seed, str(folder))
@@ -189,10 +189,12 @@ def _prepared(model_folder: Path, folder: Path, request: Request, say: Say) -> W
         "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
     }
     data = PairData(training, shape, options.seed, options.batch, request.mirrored)
-    return Work(model, psfs, Tuner.of(psfs, options, perceptual), data, held_out, lpips, settings, _names(split))
+    return FinetuneInputs(
+        model, psfs, Tuner.of(psfs, options, perceptual), data, held_out, lpips, settings, _names(split)
+    )
 
 
-def _options(model: Model, request: Request) -> TrainSpec:
+def _options(model: Model, request: FinetuneSettings) -> TrainSpec:
     """How the model was trained, with what is asked for now.
 
     Raises:
@@ -217,12 +219,12 @@ def _names(split: PairSplit) -> dict[str, Any]:
     return {**named, "with_mask": [pair.name for pairs in split[:2] for pair in pairs if pair.mask is not None]}
 
 
-def _manifest(work: Work) -> dict[str, Any]:
+def _manifest(work: FinetuneInputs) -> dict[str, Any]:
     said = {"settings_sha256": work.claim().digest, "state": "running", "version": __version__}
     return {**work.settings, **said}
 
 
-def _iterate(folder: Path, work: Work, state: State, stop: Stop, say: Say) -> State:
+def _iterate(folder: Path, work: FinetuneInputs, state: FinetuneState, stop: StopRequest, say: Say) -> FinetuneState:
     """Take the remaining steps."""
     tuner, options = work.tuner, work.tuner.options
     if state.step == 0:
@@ -230,27 +232,27 @@ def _iterate(folder: Path, work: Work, state: State, stop: Stop, say: Say) -> St
     if state.step == options.steps:
         return state
 
-    def step(state: State, batch: PairBatch) -> tuple[State, dict[str, Any]]:
+    def step(state: FinetuneState, batch: PairBatch) -> tuple[FinetuneState, dict[str, Any]]:
         rate = tuner.rate(state.step)
         state, record = tuner.step(state, batch)
         return state, {**record._asdict(), "learning_rates": {"network": rate}}
 
-    def save(state: State) -> None:
+    def save(state: FinetuneState) -> None:
         write_checkpoint(folder / CHECKPOINT, state, state.step, work.claim().digest)
 
     return take_steps(
         folder,
         state,
         work.data.batches(state.step, options.steps),
-        Doings(step, lambda state: _look(folder, work, state), save),
-        Pace(options.steps, options.validate_every, options.checkpoint_every),
+        Callbacks(step, lambda state: _look(folder, work, state), save),
+        Schedule(options.steps, options.validate_every, options.checkpoint_every),
         title="fine-tuning",
         stop=stop,
         say=say,
     )
 
 
-def _look(folder: Path, work: Work, state: State) -> dict[str, Any]:
+def _look(folder: Path, work: FinetuneInputs, state: FinetuneState) -> dict[str, Any]:
     """Look at held-out pairs; draw them, and return their scores."""
     found = _judged(work, state)
     title, words = f"{work.title}, fine-tuned by {state.step} steps", "middle of real pairs never trained on; PSNR"
@@ -260,8 +262,8 @@ def _look(folder: Path, work: Work, state: State) -> dict[str, Any]:
     return found.means
 
 
-def _judged(work: Work, state: State) -> Found:
-    def looks() -> Iterator[Look]:
+def _judged(work: FinetuneInputs, state: FinetuneState) -> EvaluationResult:
+    def looks() -> Iterator[ValidationSample]:
         for k, files in enumerate(work.held_out.files):
             pair = cut(work.held_out.get(k), work.data.shape)
             pictures = {
@@ -269,7 +271,7 @@ def _judged(work: Work, state: State) -> Found:
                 "reconstruction": work.tuner.reconstruct(state, pair.capture),
             }
             clipped = {name: np.clip(picture, 0, 1) for name, picture in pictures.items()}
-            yield Look(files.name, clipped, np.clip(pair.reference, 0, 1), pair.mask)
+            yield ValidationSample(files.name, clipped, np.clip(pair.reference, 0, 1), pair.mask)
 
     def to_rgb(image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "3 y x"]:
         picture = shown(image, work.model)
@@ -278,7 +280,7 @@ def _judged(work: Work, state: State) -> Found:
     return judge(looks(), work.lpips, to_rgb)
 
 
-def _finish(folder: Path, work: Work, state: State) -> None:
+def _finish(folder: Path, work: FinetuneInputs, state: FinetuneState) -> None:
     """Write the results, and mark it all as done."""
     before, after = (_judged(work, each) for each in (work.tuner.initial(work.model.network), state))
     metrics = {**after.means, "before": before.means["reconstruction"], "scenes": after.scenes}

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.build import camera_of, matching, process_of, wafer_of
-from doedesign.lab.predictions import PROBE_M, Foretold, foretold
+from doedesign.build import camera_from_spec, matching, process_from_spec, wafer_from_spec
+from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
@@ -29,10 +29,10 @@ from fab.order.write import write_order
 from fab.process import Process, Variation
 from fab.rules.check import Rules, check
 from fab.rules.repair import repaired
-from fab.runsheet.tables import Die, PlateFile, RunSheet
+from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
 from fab.runsheet.write import write_run_sheet
 from fab.solids.patch import Patch
-from fab.verification.verify import Report, verify_order
+from fab.verification.verify import VerificationReport, verify_order
 
 Say = Callable[[str], None]
 
@@ -48,7 +48,7 @@ def write_masks(
     process_file: Path | None = None,
     wafer_file: Path | None = None,
     say: Say = lambda _: None,
-) -> tuple[Path, Report]:
+) -> tuple[Path, VerificationReport]:
     """Write and prove the mask order of a level map.
 
     Args:
@@ -109,7 +109,7 @@ def write_masks(
         origin,
         chrome=chrome,
         process=process,
-        wafer=wafer_of(filled),
+        wafer=wafer_from_spec(filled),
         patch=patch,
         add=add,
         say=say,
@@ -146,7 +146,7 @@ def _run_sheet(
     moves_m = [move * dbu_m for move in order.edge_moves()]
     told = None if spec is None else _foretold(spec, order, moves_m, probe_m, say)
     files = {
-        plate.name: PlateFile(
+        plate.name: PhotomaskFile(
             file=f"{order.plate_stem(plate)}.gds",
             sha256=sha256_file(folder / f"{order.plate_stem(plate)}.gds"),
             cell=order.plate_stem(plate),
@@ -174,13 +174,13 @@ def _run_sheet(
     return sheet, None if told is None else told.picture
 
 
-def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, say: Say) -> Foretold | None:
+def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, say: Say) -> SheetPrediction | None:
     from doedesign.prediction import Drawn
 
-    camera, scene = camera_of(spec), spec.scene
+    camera, scene = camera_from_spec(spec), spec.scene
     drawn = Drawn(spec.name, order.level_map, order.levels, camera, scene.near_m, scene.far_m)
     try:
-        return foretold(drawn, order.process, spec.optics.design_wavelength_m, probe_m, moves_m)
+        return predict_sheet(drawn, order.process, spec.optics.design_wavelength_m, probe_m, moves_m)
     except InputError as error:
         say(f"warning: the run sheet says nothing of the light: {error}")
         return None
@@ -189,10 +189,10 @@ def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, sa
 def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     """The process of a file or a spec; for other levels than a spec's (`--levels`) what it says of the lithography."""
     if file is not None:
-        return matching(levels, process_of(load_process(file), levels), str(file))
+        return matching(levels, process_from_spec(load_process(file), levels), str(file))
     if spec is None:
         return Process(levels)
-    made = process_of(spec.process)
+    made = process_from_spec(spec.process)
     if made.levels == levels:
         return made
     said = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
@@ -206,7 +206,7 @@ def _fixed(
     levels = drawing.levels
     rate = 1 / (levels.count * levels.step_m)
     if spec is not None:
-        rate = camera_of(spec).waves_per_metre(spec.optics.design_wavelength_m)
+        rate = camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m)
     say("repairing the level map")
     fixed, cost = repaired(level, levels, drawing.grid, drawing.aperture_m, rules, rate)
     left = f", {cost.broken_after} of {cost.broken_before} broken places are left" if cost.broken_after else ""
@@ -226,7 +226,7 @@ def _psf_cost(
     """What light does with the map before and after a repair, colour by colour and depth by depth."""
     from doedesign.prediction import Drawn, predict
 
-    camera, scene = camera_of(spec), spec.scene
+    camera, scene = camera_from_spec(spec), spec.scene
     rows = [
         predict(Drawn(spec.name, level, levels, camera, scene.near_m, scene.far_m), Process(levels), Variation()).rows
         for level in (before, after)
@@ -241,6 +241,6 @@ def _psf_cost(
     return told
 
 
-def verify(folder: Path) -> Report:
+def verify(folder: Path) -> VerificationReport:
     """Prove a mask order from its files alone; see `fab.verification.verify.verify_order`."""
     return verify_order(folder)

@@ -9,8 +9,16 @@ import numpy as np
 
 from doedesign.design.etch_depths import heights_of, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
-from doedesign.design.optimize import Design, State, finished_design, initial_state, learns_depths, optimiser_of, steps
-from doedesign.design.problem import Problem, Scene, problem_of
+from doedesign.design.optimize import (
+    Design,
+    OptimizationState,
+    finished_design,
+    initial_state,
+    learns_depths,
+    optimiser_of,
+    steps,
+)
+from doedesign.design.problem import Problem, SourceSet, problem_of
 from doedesign.report.pictures import draw_encircled, draw_height, draw_history, draw_mtf, draw_pattern, draw_psfs
 from doedesign.runs.folder import (
     Run,
@@ -73,8 +81,8 @@ def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), s
 
 
 def _resume(
-    run: Run, problem: Problem, scene: Scene, files: dict[str, Path], say: Say
-) -> tuple[State, list[dict[str, Any]]]:
+    run: Run, problem: Problem, scene: SourceSet, files: dict[str, Path], say: Say
+) -> tuple[OptimizationState, list[dict[str, Any]]]:
     from doedesign.runs.level_maps import read_any_height
 
     optimiser = optimiser_of(run.spec)
@@ -94,7 +102,7 @@ def _resume(
     say(f"resuming after step {step}")
     radians, *stretch = (jax.numpy.asarray(a) for a in arrays[: len(shapes)])
     adam = jax.tree.unflatten(tree, [jax.numpy.asarray(a) for a in arrays[len(shapes) :]])
-    return State(radians, adam, step, *stretch), history
+    return OptimizationState(radians, adam, step, *stretch), history
 
 
 def ring_shape(problem: Problem) -> int:
@@ -105,8 +113,8 @@ def ring_shape(problem: Problem) -> int:
 
 
 def _iterate(
-    run: Run, problem: Problem, scene: Scene, state: State, history: list[dict[str, Any]]
-) -> tuple[State, list[dict[str, Any]]]:
+    run: Run, problem: Problem, scene: SourceSet, state: OptimizationState, history: list[dict[str, Any]]
+) -> tuple[OptimizationState, list[dict[str, Any]]]:
     total, every = run.spec.optimize.steps, run.spec.optimize.checkpoint_every
     names = [term.name for term in problem.terms]
     with meter("optimising", total, state.step) as progress:

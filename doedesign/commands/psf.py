@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.build import camera_of
+from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
 from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
 from doedesign.runs.folder import Run, alone_in, open_run
@@ -78,7 +78,7 @@ def psf(
         CheckFailed: the masks draw something else than the design, or light disagrees.
     """
     run = open_run(run_folder)
-    camera = camera_of(run.spec)
+    camera = camera_from_spec(run.spec)
     near, far = _near_and_far(run.spec, depths_m)
     designs = designs_of(run, masks, say)
     total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.commands.psf import Say
-from doedesign.recon.model import Model, PsfChoice, Psfs, in_camera, open_model, psfs_of, released_model, shown
+from doedesign.recon.model import Model, ModelPsfs, PsfChoice, in_camera, open_model, psfs_of, released_model, shown
 from doedesign.recon.photos import PHOTO_FILES, WRITTEN_FILES, Photo, read_capture, write_reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles, reconstruct_tiled
 from doedesign.runs.folder import alone_in
@@ -32,7 +32,7 @@ FORMAT = "doedesign reconstructions 1"
 
 
 @dataclass(frozen=True)
-class Request:
+class ReconstructionSettings:
     """How to reconstruct.
 
     Attributes:
@@ -68,7 +68,7 @@ def reconstruct(
     model_folder: Path,
     captures: Sequence[Path],
     out: Path | None = None,
-    request: Request | None = None,
+    request: ReconstructionSettings | None = None,
     *,
     say: Say = lambda _: None,
 ) -> list[Path]:
@@ -88,7 +88,7 @@ def reconstruct(
         InputError: a model, capture, PSF or number that cannot be used; PSFs of another pitch or other colours; a
             folder that holds something else.
     """
-    request, folder = request or Request(), out or Path("reconstructed")
+    request, folder = request or ReconstructionSettings(), out or Path("reconstructed")
     names = _names(captures, request.kind)
     _require_own(folder, captures, names)
     model = open_model(model_folder)
@@ -113,7 +113,7 @@ def reconstruct(
 
 
 def _through(
-    model: Model, light: Float[np.ndarray, "c y x"], psfs: Psfs, request: Request, name: str
+    model: Model, light: Float[np.ndarray, "c y x"], psfs: ModelPsfs, request: ReconstructionSettings, name: str
 ) -> Float[np.ndarray, "c y x"]:
     multiple = model.network.layout.multiple
     plan = plan_tiles((light.shape[1], light.shape[2]), request.tile, request.overlap, multiple)
@@ -130,7 +130,7 @@ def _through(
         )
 
 
-def _require_tiles(request: Request, model: Model) -> None:
+def _require_tiles(request: ReconstructionSettings, model: Model) -> None:
     try:
         plan_tiles((1, 1), request.tile, request.overlap, model.network.layout.multiple)
     except ValueError as error:
@@ -199,7 +199,7 @@ def _bits(photo: Photo, ending: str) -> int | None:
     return photo.bits or 16
 
 
-def _said(capture: Path, model: Model, psfs: Psfs, request: Request) -> dict[str, Any]:
+def _said(capture: Path, model: Model, psfs: ModelPsfs, request: ReconstructionSettings) -> dict[str, Any]:
     """What a result was made from."""
     return {
         "capture": capture.name,

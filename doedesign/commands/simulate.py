@@ -25,11 +25,18 @@ import jax
 import numpy as np
 
 from doedesign.build import process_for
-from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, plain_parameters, sensor_of, shown_as
+from doedesign.capture.from_spec import (
+    obstruction_from_spec,
+    occlusion_from_spec,
+    outside_from_kind,
+    plain_parameters,
+    rgb_from_channels,
+    sensor_from_spec,
+)
 from doedesign.capture.image_files import Stored, read_image, write_image
 from doedesign.capture.images import Pictures, picture_files, told_skips
-from doedesign.capture.scenes import Item, SceneData
-from doedesign.capture.simulate import Bench, Captured, captured, flat_psfs, plate_psfs, shadow_window
+from doedesign.capture.scenes import SceneData, SceneItem
+from doedesign.capture.simulate import CameraPair, SimulatedCapture, captured, flat_psfs, plate_psfs, shadow_window
 from doedesign.commands.fabricated import errors_of_plate
 from doedesign.commands.psf import Say
 from doedesign.prediction import Drawn, drawn_of, process_with_moves
@@ -43,7 +50,7 @@ from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, s
 from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.imaging.occlusion import follows_light
-from sim.obstruction import Kind, View
+from sim.obstruction import CameraView, ObstructionKind
 
 FORMAT = "doedesign simulation 1"
 
@@ -54,7 +61,7 @@ _FREE = ("scene", "sensor", "obstruction")
 
 
 @dataclass(frozen=True)
-class Request:
+class SimulationSettings:
     """What to simulate.
 
     Attributes:
@@ -95,7 +102,7 @@ class Fabrication:
     draw: str = "normal/0"
 
 
-class Done(NamedTuple):
+class SimulationResult(NamedTuple):
     """What a simulation left behind.
 
     Attributes:
@@ -112,12 +119,12 @@ class Done(NamedTuple):
 def simulate(
     run_folder: Path,
     out: Path | None = None,
-    request: Request | None = None,
+    request: SimulationSettings | None = None,
     *,
     masks: Path | None = None,
     fabrication: Fabrication | None = None,
     say: Say = lambda _: None,
-) -> Done:
+) -> SimulationResult:
     """Write simulated captures of a run.
 
     Args:
@@ -131,12 +138,12 @@ def simulate(
     Raises:
         InputError: a run, picture, mask or number that cannot be used, or no occlusion model.
     """
-    request = request or Request()
+    request = request or SimulationSettings()
     run = open_run(run_folder)
     source = str(run.path("spec.toml"))
     spec = spec_with(run, request.overrides, _FREE)
-    model = occlusion_of(spec, source, request.occlusion)
-    kind = obstruction_of(spec, source, request.obstruction)
+    model = occlusion_from_spec(spec, source, request.occlusion)
+    kind = obstruction_from_spec(spec, source, request.obstruction)
     drawn = drawn_of(run, masks)
     camera = replace(drawn.camera, window=drawn.camera.window | 1)  # odd: the capture lies on the scene
     view = _view(spec, camera, request.size)
@@ -149,7 +156,7 @@ def simulate(
     made_by, errors, plate = _plate(drawn, run.spec, fabrication)
     plate_at, flat_at = plate_psfs(drawn, camera, made_by, errors), flat_psfs(camera)
     window = shadow_window(kind, camera)
-    bench = Bench(camera, plate_at, flat_at, model, outside_of(kind), sensor_of(spec), window)
+    bench = CameraPair(camera, plate_at, flat_at, model, outside_from_kind(kind), sensor_from_spec(spec), window)
     settings = _settings(run, spec, request, drawn, plate, kind, bench, pictures, view)
     if errors is not None:
         settings["variation"] = variation_to_toml(errors)
@@ -159,16 +166,16 @@ def simulate(
         names = _work(folder, data, count, bench, settings, request.png, say)
     if told := told_skips(pictures):
         say(told)
-    return Done(folder, names, {str(path): why for path, why in sorted(pictures.skipped.items())})
+    return SimulationResult(folder, names, {str(path): why for path, why in sorted(pictures.skipped.items())})
 
 
-def _view(spec: Spec, camera: Camera, size: int | None) -> View:
+def _view(spec: Spec, camera: Camera, size: int | None) -> CameraView:
     width, height = (n // spec.sensor.binning for n in spec.sensor.resolution)
     side = min(_USUAL_SIDE, width, height) if size is None else size
     if not 16 <= side <= min(width, height):
         rule = f"must lie from 16 to the {min(width, height)} binned pixels of the sensor's shorter side"
         raise InputError("--size", rule, side, "Choose another size.")
-    return View((side, side), camera.pixel_m, camera.sensor_distance_m)
+    return CameraView((side, side), camera.pixel_m, camera.sensor_distance_m)
 
 
 def _plate(drawn: Drawn, spec: Spec, fabrication: Fabrication | None) -> tuple[Process | None, Variation | None, str]:
@@ -184,13 +191,13 @@ def _plate(drawn: Drawn, spec: Spec, fabrication: Fabrication | None) -> tuple[P
 def _settings(
     run: Run,
     spec: Spec,
-    request: Request,
+    request: SimulationSettings,
     drawn: Drawn,
     plate: str,
-    kind: Kind,
-    bench: Bench,
+    kind: ObstructionKind,
+    bench: CameraPair,
     pictures: Pictures,
-    view: View,
+    view: CameraView,
 ) -> dict[str, Any]:
     """Everything that an item depends on, but for its number."""
     return {
@@ -216,7 +223,7 @@ def _settings(
 
 
 def _work(
-    folder: Path, data: SceneData, count: int, bench: Bench, settings: dict[str, Any], png: bool, say: Say
+    folder: Path, data: SceneData, count: int, bench: CameraPair, settings: dict[str, Any], png: bool, say: Say
 ) -> tuple[str, ...]:
     """Make every item that is not there yet, and the sheet."""
     digest = sha256_bytes(canonical_json(settings))
@@ -277,7 +284,7 @@ def _finished(folder: Path, digest: str) -> dict[int, str]:
     return found
 
 
-def _make(folder: Path, data: SceneData, number: int, bench: Bench, digest: str, png: bool) -> str:
+def _make(folder: Path, data: SceneData, number: int, bench: CameraPair, digest: str, png: bool) -> str:
     """Make one item; return the name of its folder."""
     item = data.item(*divmod(number, len(data.pictures)))
     name = f"{number:04d}_{''.join(c if c.isalnum() or c in '-_' else '-' for c in Path(item.name).stem)[:40]}"
@@ -299,11 +306,13 @@ def _make(folder: Path, data: SceneData, number: int, bench: Bench, digest: str,
     return name
 
 
-def _write_images(folder: Path, found: Captured, item: Item, bench: Bench, png: bool) -> dict[str, Stored]:
+def _write_images(
+    folder: Path, found: SimulatedCapture, item: SceneItem, bench: CameraPair, png: bool
+) -> dict[str, Stored]:
     colours = ("R", "G", "B") if len(found.clean) == 3 else ("Y",)
 
     def light(image: np.ndarray) -> np.ndarray:
-        return shown_as(image, bench.camera) if len(image) == 3 else image
+        return rgb_from_channels(image, bench.camera) if len(image) == 3 else image
 
     most = max(1.0, bench.sensor.most_light(len(found.clean)))
     share = colours if len(found.alpha) == len(colours) else ("A",)
@@ -321,7 +330,7 @@ def _write_images(folder: Path, found: Captured, item: Item, bench: Bench, png: 
     }
 
 
-def _row(folder: Path, bench: Bench) -> ContactRow:
+def _row(folder: Path, bench: CameraPair) -> ContactRow:
     """An item as the sheet shows it, read back from its files."""
     described = read_json(folder / MANIFEST_NAME)
     images = {name: read_image(folder, stored) for name, stored in described["images"].items()}
@@ -336,7 +345,7 @@ def _row(folder: Path, bench: Bench) -> ContactRow:
     return ContactRow(label, clean, conventional, doe, images["mask"][0], alpha)
 
 
-def _words(bench: Bench, settings: dict[str, Any]) -> str:
+def _words(bench: CameraPair, settings: dict[str, Any]) -> str:
     sensor = bench.sensor
     noise = (
         f"full well {sensor.full_well_e:g} electrons, white at {100 * sensor.exposure:g} % of it, read noise "

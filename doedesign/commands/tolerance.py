@@ -21,18 +21,18 @@ from doedesign.spec import variation_to_toml
 from doedesign.tolerancing.analysis import QUANTITIES, limit_text, obeys, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
-from doedesign.tolerancing.pool import Beyond, Work, evaluate_here, predicted_bank
+from doedesign.tolerancing.pool import OutOfModel, Work, evaluate_here, predicted_bank
 from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
-from fab.process import ERRORS, error_names
+from fab.process import DEVIATIONS, error_names
 from fab.units import format_length
 
 Say = Callable[[str], None]
 
 
-class Plan(NamedTuple):
+class StudyPlan(NamedTuple):
     """What is asked about a process.
 
     Attributes:
@@ -67,7 +67,7 @@ class Plan(NamedTuple):
         return list(dict.fromkeys(keys))
 
 
-class Found(NamedTuple):
+class StudyFindings(NamedTuple):
     """The answers; None to what was not asked."""
 
     nominal: Plates
@@ -79,9 +79,9 @@ class Found(NamedTuple):
     budget: Budget | None
 
 
-def _found(asked: Study, plan: Plan) -> Found:
+def _found(asked: Study, plan: StudyPlan) -> StudyFindings:
     asked.plates(plan.keys(asked))  # all at once, so that no worker waits between two questions
-    return Found(
+    return StudyFindings(
         asked.plates([NOMINAL]),
         asked.plates([EXPECTED]),
         asked.monte_carlo(plan.draws),
@@ -94,7 +94,7 @@ def _found(asked: Study, plan: Plan) -> Found:
 
 def tolerance(
     run_folder: Path,
-    plan: Plan,
+    plan: StudyPlan,
     out: Path | None = None,
     say: Say = lambda _: None,
     **settings: Any,
@@ -145,7 +145,7 @@ def one_draw(run_folder: Path, key: str, as_json: bool, **settings: Any) -> str:
     variation = asked.variation(key)
     asked.plates([key])
     kept = asked.journal.finished[key]
-    rows = [] if isinstance(kept, Beyond) else kept
+    rows = [] if isinstance(kept, OutOfModel) else kept
     if as_json:
         return json.dumps({"key": key, "variation": vars(variation), "rows": rows}, sort_keys=True)
     lines = [f"draw {key} of {asked.drawn.name}, seed {asked.seed}"]
@@ -166,7 +166,7 @@ def _forget_results(folder: Path) -> None:
         (folder / MANIFEST_NAME).unlink()
 
 
-def _results(asked: Study, plan: Plan, found: Found) -> dict[str, Any]:
+def _results(asked: Study, plan: StudyPlan, found: StudyFindings) -> dict[str, Any]:
     """Everything that was found, as JSON."""
     out: dict[str, Any] = {
         "format": FORMAT,
@@ -221,7 +221,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _write(folder: Path, asked: Study, plan: Plan, found: Found, results: Mapping[str, Any]) -> None:
+def _write(folder: Path, asked: Study, plan: StudyPlan, found: StudyFindings, results: Mapping[str, Any]) -> None:
     keys = plan.keys(asked)
     write_atomic(folder / "draws.csv", _csv(_draw_lines(asked, keys)))
     write_atomic(folder / "errors.csv", _csv(_error_lines(asked, keys)))
@@ -232,7 +232,7 @@ def _write(folder: Path, asked: Study, plan: Plan, found: Found, results: Mappin
     write_atomic(folder / MANIFEST_NAME, canonical_json(manifest))
 
 
-def _draw(folder: Path, asked: Study, found: Found) -> list[str]:
+def _draw(folder: Path, asked: Study, found: StudyFindings) -> list[str]:
     """Draw what was found; returns the names of the pictures."""
     drawn, plates = asked.drawn, found.plates
     draw_histograms(folder / "histograms.png", drawn.camera, plates.table, found.nominal.table, asked.limits)
@@ -259,12 +259,12 @@ def _draw(folder: Path, asked: Study, found: Found) -> list[str]:
 def _draw_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]:
     """One line per plate, colour and depth, with every number that was found; empty where a row has no such number."""
     plates = asked.journal.finished
-    rows = (row for key in keys if not isinstance(found := plates[key], Beyond) for row in found)
+    rows = (row for key in keys if not isinstance(found := plates[key], OutOfModel) for row in found)
     numbers = sorted({name for row in rows for name in row} - {"colour", "depth_m"})
     yield ("key", "colour", "depth_m", *numbers)
     for key in keys:
         found = plates[key]
-        for row in [] if isinstance(found, Beyond) else found:
+        for row in [] if isinstance(found, OutOfModel) else found:
             depth = "inf" if row["depth_m"] is None else row["depth_m"]
             values = ("inf" if row.get(name, "") is None else row.get(name, "") for name in numbers)
             yield (key, row["colour"], depth, *values)
@@ -272,7 +272,7 @@ def _draw_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]
 
 def _error_lines(asked: Study, keys: Sequence[str]) -> Iterable[Sequence[object]]:
     """One line per plate with every error in SI units, and the number of rare events."""
-    names = error_names(asked.process.masks, *ERRORS)
+    names = error_names(asked.process.masks, *DEVIATIONS)
     yield ("key", *names, "missed_etches", "doubled_etches", "particles", "pinholes", "roughness_seed")
     for key in keys:
         plate = asked.variation(key)
@@ -286,7 +286,7 @@ def _csv(lines: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode()
 
 
-def summary(asked: Study, plan: Plan, found: Found, results: Mapping[str, Any]) -> str:
+def summary(asked: Study, plan: StudyPlan, found: StudyFindings, results: Mapping[str, Any]) -> str:
     """What was found, on one line."""
     quantity = "strehl"
     if asked.limits:
@@ -321,7 +321,7 @@ def _sigmas(budget: Budget) -> str:
 
 def _sigma_text(key: str, sigma: float) -> str:
     rounded = float(f"{sigma:.3g}")
-    match ERRORS[key].unit:
+    match DEVIATIONS[key].unit:
         case "m":
             return format_length(rounded)
         case "rad":

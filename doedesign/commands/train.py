@@ -29,32 +29,32 @@ from typing import Any, NamedTuple
 import jax
 
 from doedesign import __version__
-from doedesign.build import camera_of
-from doedesign.capture.from_spec import obstruction_of, occlusion_of, plain_parameters
+from doedesign.build import camera_from_spec
+from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, plain_parameters
 from doedesign.capture.images import Pictures, told_skips
-from doedesign.capture.scenes import Batch, SceneData
+from doedesign.capture.scenes import SceneBatch, SceneData
 from doedesign.commands.psf import Say
 from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs.folder import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
-from doedesign.runtime.stopping import Stop, stoppable
+from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec import Spec, spec_digest, spec_to_toml
 from doedesign.training.checkpoint import settled, write_checkpoint
 from doedesign.training.history import HISTORY_NAME, read_history, require_tensorboard
 from doedesign.training.hosts import gathered, join_hosts
-from doedesign.training.joint import State, Trainer, devices_mesh, layout_of, rates_at
-from doedesign.training.loop import Claim, Doings, Pace, is_done, perceptual_of, resumed, seal, take_steps
+from doedesign.training.joint import JointState, Trainer, devices_mesh, layout_of, rates_at
+from doedesign.training.loop import Callbacks, FolderLock, Schedule, is_done, perceptual_of, resumed, seal, take_steps
 from doedesign.training.results import HeldOut, height_at_rest_m, heights_before, validate, write_results
 from doedesign.training.validation import SCENE_SEED, split_pictures
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
-from sim.obstruction import Kind, View
+from sim.obstruction import CameraView, ObstructionKind
 
 _FREE = ("scene", "sensor", "obstruction", "network", "train")
 _MOST_THREADS = 8
 
 
 @dataclass(frozen=True)
-class Request:
+class TrainingSettings:
     """What to train on.
 
     Attributes:
@@ -86,7 +86,7 @@ class Request:
     host: int | None = None
 
 
-class Work(NamedTuple):
+class TrainingInputs(NamedTuple):
     """One training, before its folder is looked at.
 
     Attributes:
@@ -101,7 +101,7 @@ class Work(NamedTuple):
 
     run: Run
     trainer: Trainer
-    kind: Kind
+    kind: ObstructionKind
     data: SceneData
     held_out: HeldOut
     settings: dict[str, Any]
@@ -111,13 +111,15 @@ class Work(NamedTuple):
         """SHA-256 of the settings."""
         return sha256_bytes(canonical_json(self.settings))
 
-    def claim(self) -> Claim:
+    def claim(self) -> FolderLock:
         """Whose a folder of this training is."""
         others = "one with another run, spec, occlusion model, perceptual loss or other pictures"
-        return Claim(TRAINING, self.digest(), "training", others, ("spec.toml", "pictures.json"))
+        return FolderLock(TRAINING, self.digest(), "training", others, ("spec.toml", "pictures.json"))
 
 
-def train(run_folder: Path, out: Path | None = None, request: Request | None = None, say: Say = lambda _: None) -> Path:
+def train(
+    run_folder: Path, out: Path | None = None, request: TrainingSettings | None = None, say: Say = lambda _: None
+) -> Path:
     """Train a run's network, or go on where an earlier call was stopped.
 
     Args:
@@ -134,7 +136,7 @@ def train(run_folder: Path, out: Path | None = None, request: Request | None = N
             that is no longer finite.
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
-    request = request or Request()
+    request = request or TrainingSettings()
     if request.tensorboard:
         require_tensorboard()
     if request.coordinator is not None and request.devices is not None:
@@ -166,14 +168,14 @@ def train(run_folder: Path, out: Path | None = None, request: Request | None = N
     return folder
 
 
-def _prepared(run: Run, request: Request, say: Say) -> Work:
+def _prepared(run: Run, request: TrainingSettings, say: Say) -> TrainingInputs:
     source = str(run.path("spec.toml"))
     run = replace(run, spec=spec_with(run, request.overrides, _FREE))
     spec, options = run.spec, run.spec.train
-    model = occlusion_of(spec, source, request.occlusion)
-    kind = obstruction_of(spec, source, request.obstruction)
-    camera = camera_of(spec)
-    view = View((options.size, options.size), camera.pixel_m, camera.sensor_distance_m)
+    model = occlusion_from_spec(spec, source, request.occlusion)
+    kind = obstruction_from_spec(spec, source, request.obstruction)
+    camera = camera_from_spec(spec)
+    view = CameraView((options.size, options.size), camera.pixel_m, camera.sensor_distance_m)
     lpips, perceptual = perceptual_of(options, options.size, f"{source}: train.size", request.lpips_weights, say)
     _require_possible(spec, source)
     split = split_pictures(request.images, request.validation, options.validation, options.seed)
@@ -210,7 +212,7 @@ def _prepared(run: Run, request: Request, say: Say) -> Work:
             ("held_out", split.held_out, request.validation or request.images),
         )
     }
-    return Work(run, trainer, kind, data, looks, settings, names)
+    return TrainingInputs(run, trainer, kind, data, looks, settings, names)
 
 
 def _name(path: Path, folder: Path | None) -> str:
@@ -234,38 +236,40 @@ def _require_possible(spec: Spec, source: str) -> None:
         raise InputError(f"{source}: network", rule.replace("`", ""), got, "Change [network].") from error
 
 
-def _manifest(work: Work) -> dict[str, Any]:
+def _manifest(work: TrainingInputs) -> dict[str, Any]:
     said = {"settings_sha256": work.digest(), "state": "running", "version": __version__}
     return {**work.settings, **said, "licence": work.names["licence"]}
 
 
-def _begin(folder: Path, work: Work, request: Request) -> None:
+def _begin(folder: Path, work: TrainingInputs, request: TrainingSettings) -> None:
     write_atomic(folder / MANIFEST_NAME, canonical_json(_manifest(work)))
     comments = ["every default filled in", *(f"--set {override}" for override in request.overrides)]
     write_atomic(folder / "spec.toml", spec_to_toml(work.run.spec, comments).encode())
     write_atomic(folder / "pictures.json", canonical_json(work.names))
 
 
-def _iterate(folder: Path, work: Work, state: State, request: Request, stop: Stop, say: Say) -> State:
+def _iterate(
+    folder: Path, work: TrainingInputs, state: JointState, request: TrainingSettings, stop: StopRequest, say: Say
+) -> JointState:
     """Take the remaining steps."""
     options, trainer = work.run.spec.train, work.trainer
     if state.step == options.steps:
         return state
 
-    def step(state: State, batch: Batch) -> tuple[State, dict[str, Any]]:
+    def step(state: JointState, batch: SceneBatch) -> tuple[JointState, dict[str, Any]]:
         rates = rates_at(options, state.step)
         state, record = trainer.step(state, _part(batch))
         return state, {**record._asdict(), "learning_rates": rates._asdict()}
 
-    def save(state: State) -> None:
+    def save(state: JointState) -> None:
         write_checkpoint(folder / CHECKPOINT, state, state.step, work.digest())
 
     return take_steps(
         folder,
         state,
         work.data.batches(state.step, options.steps),
-        Doings(step, lambda state: _look(folder, work, state), save),
-        Pace(options.steps, options.validate_every, options.checkpoint_every),
+        Callbacks(step, lambda state: _look(folder, work, state), save),
+        Schedule(options.steps, options.validate_every, options.checkpoint_every),
         title="training",
         stop=stop,
         say=say,
@@ -274,7 +278,7 @@ def _iterate(folder: Path, work: Work, state: State, request: Request, stop: Sto
     )
 
 
-def _part(batch: Batch) -> Batch:
+def _part(batch: SceneBatch) -> SceneBatch:
     """This host's part of a batch."""
     hosts, here = jax.process_count(), jax.process_index()
     if hosts == 1:
@@ -284,7 +288,7 @@ def _part(batch: Batch) -> Batch:
     return batch._replace(**{name: getattr(batch, name)[own] for name in batch._fields if name != "step"})
 
 
-def _look(folder: Path, work: Work, state: State) -> dict[str, Any]:
+def _look(folder: Path, work: TrainingInputs, state: JointState) -> dict[str, Any]:
     """Look at held-out scenes; draw them, and return their scores."""
     found = validate(work.trainer, state, work.held_out)
     if jax.process_index() == 0:
@@ -295,7 +299,7 @@ def _look(folder: Path, work: Work, state: State) -> dict[str, Any]:
     return found.means
 
 
-def _finish(folder: Path, work: Work, state: State) -> None:
+def _finish(folder: Path, work: TrainingInputs, state: JointState) -> None:
     """Write the results, and mark the training done; the checkpoint is no longer needed."""
     about = {**work.settings, "steps": state.step, "pictures": work.names, "version": __version__}
     names = write_results(folder, work.run, work.trainer, state, work.held_out, work.kind, about)

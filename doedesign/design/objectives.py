@@ -1,6 +1,6 @@
 """What a design is judged by: small functions from PSFs to one number that is minimised.
 
-An objective takes a `View` and its options and returns a scalar. A user's own is named `module:function` in the
+An objective takes a `PsfSet` and its options and returns a scalar. A user's own is named `module:function` in the
 spec and has the same signature:
 
     def dark_centre(view: View, *, power: float = 1.0) -> Array:
@@ -28,7 +28,7 @@ from sim.camera import Camera
 from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_radius_m
 
 
-class View(eqx.Module):
+class PsfSet(eqx.Module):
     """What an objective sees in one step.
 
     Attributes:
@@ -44,7 +44,7 @@ class View(eqx.Module):
     camera: Camera = eqx.field(static=True)
 
 
-Objective = Callable[[View], Array]
+Objective = Callable[[PsfSet], Array]
 
 
 class Term(NamedTuple):
@@ -63,13 +63,13 @@ def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
     )
 
 
-def far_spot(view: View) -> Array:
+def far_spot(view: PsfSet) -> Array:
     """Share of the scene's light that misses the sharp spot, 0-1, averaged over colours and far depths."""
     inside = jnp.einsum("wfyx,wyx->wf", view.far, spot_weights(view.camera))
     return 1.0 - jnp.mean(inside)
 
 
-def near_spread(view: View) -> Array:
+def near_spread(view: PsfSet) -> Array:
     """Concentration of near PSFs relative to the plain lens: sum p² / sum p_lens², 1 for no effect.
 
     The coherent part of the light cannot tell depths apart, so a design with far-spot energy s keeps at least s² of
@@ -78,7 +78,7 @@ def near_spread(view: View) -> Array:
     return jnp.mean(participation(view.near) / view.lens_participation)
 
 
-def window_loss(view: View) -> Array:
+def window_loss(view: PsfSet) -> Array:
     """Share of the light that misses the sensor window, 0-1, averaged over colours and depths.
 
     Without it `near_spread` and `far_spot` agree on sending unwanted light to angles beyond the window, where it
@@ -88,7 +88,7 @@ def window_loss(view: View) -> Array:
     return 1.0 - jnp.mean(jnp.sum(images, axis=(-2, -1)))
 
 
-def handcrafted(view: View, *, near_weight: float = 1.0) -> Array:
+def handcrafted(view: PsfSet, *, near_weight: float = 1.0) -> Array:
     """The paper's hand-crafted variant (§4): far PSF towards a point, near PSF towards an even window.
 
     Squared distances, each relative to its target's: |p_far - delta|² where delta is all light in the far spot,
@@ -104,7 +104,7 @@ def handcrafted(view: View, *, near_weight: float = 1.0) -> Array:
     return jnp.mean(far) + near_weight * jnp.mean(jnp.log1p(near))
 
 
-def target_pattern(view: View, *, target: Float[np.ndarray, "y x"]) -> Array:
+def target_pattern(view: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     """Squared distance of every far PSF from a target that holds all light, relative to the target's own square."""
     return jnp.mean(jnp.sum((view.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
 

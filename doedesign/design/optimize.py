@@ -5,8 +5,8 @@ fraction of a pixel; all follow from the seed and the step number, so a run that
 with the same bytes as one that was not.
 
 Where the depths of the etches are to be chosen, they are further parameters of the same optimisation
-(`doedesign.design.parametrize.Staircase.depths_m`): which level a cell takes is straight-through as ever, and how high
-that level stands has a true gradient.
+(`doedesign.design.parametrize.LevelParametrization.depths_m`): which level a cell takes is straight-through as ever,
+and how high that level stands has a true gradient.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from doedesign.design.etch_depths import choose_depths, heights_of, held
 from doedesign.design.parametrize import softness_at
-from doedesign.design.problem import Look, Problem, Scene, judge_height, losses, view_of
+from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
 from doedesign.design.starts import start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import START_NAMES, Spec
@@ -37,7 +37,7 @@ Start = Callable[[Path], Float[np.ndarray, "y x"]]
 Free = Array | tuple[Array, Array]
 
 
-class State(NamedTuple):
+class OptimizationState(NamedTuple):
     """Everything a step changes.
 
     Attributes:
@@ -45,7 +45,7 @@ class State(NamedTuple):
         adam: Adam's moments of all that is free.
         step: number of steps done.
         stretch: `[mask]` logarithm of every etch's depth over its first one, in units of
-            `doedesign.design.parametrize.PACE`; None where the depths are given.
+            `doedesign.design.parametrize.DEPTH_SCALE`; None where the depths are given.
     """
 
     radians: Array
@@ -59,7 +59,7 @@ class State(NamedTuple):
         return self.radians if self.stretch is None else (self.radians, self.stretch)
 
 
-class Record(NamedTuple):
+class StepRecord(NamedTuple):
     """One line of the history: the loss of a step before its update, and every term's value."""
 
     step: int
@@ -87,7 +87,9 @@ def optimiser_of(spec: Spec) -> optax.GradientTransformation:
     return optax.adam(schedule)
 
 
-def initial_state(spec: Spec, problem: Problem, scene: Scene, files: Mapping[str, Path], read_start: Start) -> State:
+def initial_state(
+    spec: Spec, problem: Problem, scene: SourceSet, files: Mapping[str, Path], read_start: Start
+) -> OptimizationState:
     """Parameters and moments before the first step.
 
     Args:
@@ -131,7 +133,7 @@ def initial_state(spec: Spec, problem: Problem, scene: Scene, files: Mapping[str
     radians = jnp.asarray(problem.staircase.radians_of(heights))
     stretch = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
     free = radians if stretch is None else (radians, stretch)
-    return State(radians, optimiser_of(spec).init(free), 0, stretch)
+    return OptimizationState(radians, optimiser_of(spec).init(free), 0, stretch)
 
 
 def learns_depths(spec: Spec) -> bool:
@@ -139,7 +141,7 @@ def learns_depths(spec: Spec) -> bool:
     return spec.process.chooses_depths and spec.optimize.quantisation != "none"
 
 
-def _loss(free: Free, problem: Problem, look: Look, softness: Array) -> tuple[Array, Array]:
+def _loss(free: Free, problem: Problem, look: StepSources, softness: Array) -> tuple[Array, Array]:
     staircase = problem.staircase
     if isinstance(free, tuple):
         radians, stretch = free
@@ -149,12 +151,12 @@ def _loss(free: Free, problem: Problem, look: Look, softness: Array) -> tuple[Ar
     return losses(problem, view_of(problem, height, look))
 
 
-Constants = tuple[Problem, Look, Array]
+Constants = tuple[Problem, StepSources, Array]
 Update = Callable[[Constants, tuple[Free, optax.OptState]], tuple[tuple[Free, optax.OptState], Array, Array]]
 
 
 def make_update(spec: Spec) -> Update:
-    """The compiled update (constants, (free, adam)) -> ((free, adam), loss, terms); see `State.free`.
+    """The compiled update (constants, (free, adam)) -> ((free, adam), loss, terms); see `OptimizationState.free`.
 
     It reuses the memory of the state it is given.
     """
@@ -169,13 +171,15 @@ def make_update(spec: Spec) -> Update:
     return compiled_step(update)
 
 
-def constants_at(spec: Spec, problem: Problem, scene: Scene, step: int) -> Constants:
+def constants_at(spec: Spec, problem: Problem, scene: SourceSet, step: int) -> Constants:
     """What the update of step number `step` is given besides the state."""
     softness = softness_at(spec.optimize.quantisation, step, spec.optimize.steps)
     return problem, scene.look(spec.optimize.seed, step), jnp.float32(softness)
 
 
-def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[tuple[State, Record]]:
+def steps(
+    spec: Spec, problem: Problem, scene: SourceSet, state: OptimizationState
+) -> Iterator[tuple[OptimizationState, StepRecord]]:
     """Run the remaining steps one by one.
 
     Yields:
@@ -189,8 +193,8 @@ def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[
         constants = constants_at(spec, problem, scene, step)
         (free, adam), loss, terms = update(constants, (state.free, state.adam))
         radians, stretch = free if isinstance(free, tuple) else (free, None)
-        state = State(radians, adam, step + 1, stretch)
-        record = Record(step, float(loss), tuple(float(t) for t in terms))
+        state = OptimizationState(radians, adam, step + 1, stretch)
+        record = StepRecord(step, float(loss), tuple(float(t) for t in terms))
         if not np.isfinite(record.loss):
             raise InputError(
                 f"optimize, step {step}", "the loss must stay finite", record.loss, "Lower optimize.learning_rate."
@@ -198,7 +202,7 @@ def steps(spec: Spec, problem: Problem, scene: Scene, state: State) -> Iterator[
         yield state, record
 
 
-def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
+def finished_design(spec: Spec, problem: Problem, state: OptimizationState) -> Design:
     """Height maps of the parameters."""
     staircase, grid = problem.staircase, problem.camera.grid
     continuous = np.asarray(staircase.continuous_m(state.radians))
@@ -214,7 +218,9 @@ def finished_design(spec: Spec, problem: Problem, state: State) -> Design:
     return Design(drawn, continuous, levels)
 
 
-def _levels_of(spec: Spec, problem: Problem, state: State, continuous_m: Float[np.ndarray, "y x"]) -> Levels:
+def _levels_of(
+    spec: Spec, problem: Problem, state: OptimizationState, continuous_m: Float[np.ndarray, "y x"]
+) -> Levels:
     """The staircase that was chosen, as a recipe holds it: the one learnt, or that which suits the heights best."""
     start = problem.staircase.levels
     if state.stretch is not None:

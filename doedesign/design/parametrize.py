@@ -26,10 +26,10 @@ from sim.material import full_wave_height_m
 Quantisation = Literal["straight_through", "annealed", "none"]
 
 # A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
-PACE = 0.1
+DEPTH_SCALE = 0.1
 
 
-class Staircase(eqx.Module):
+class LevelParametrization(eqx.Module):
     """How parameters become heights.
 
     Attributes:
@@ -41,9 +41,9 @@ class Staircase(eqx.Module):
     levels: Levels = eqx.field(static=True)
 
     @staticmethod
-    def at(material: str, design_wavelength_m: float, levels: Levels) -> "Staircase":
+    def at(material: str, design_wavelength_m: float, levels: Levels) -> "LevelParametrization":
         """The staircase of a substrate at a design wavelength."""
-        return Staircase(full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels)
+        return LevelParametrization(full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels)
 
     def continuous_m(self, radians: Float[Array, "*s"]) -> Float[Array, "*s"]:
         """Wrapped height before quantisation, 0 up to L steps, metres."""
@@ -97,7 +97,7 @@ class Staircase(eqx.Module):
 
     def depths_m(self, stretch: Float[Array, " k"]) -> Float[Array, " k"]:
         """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""
-        return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(PACE * stretch)
+        return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(DEPTH_SCALE * stretch)
 
     def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Parameters that make a given height, float32."""

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from doedesign.build import camera_of, levels_of
-from doedesign.design.objectives import Term, View, terms_of
-from doedesign.design.parametrize import Staircase
+from doedesign.build import camera_from_spec, levels_from_spec
+from doedesign.design.objectives import PsfSet, Term, terms_of
+from doedesign.design.parametrize import LevelParametrization
 from doedesign.spec import Spec
 from fab.levels import Levels
 from sim.aperture import circle_coverage
@@ -24,7 +24,7 @@ from sim.propagation.pupil import PhaseRows, phase_pupil
 from sim.psf_bank import psf_bank
 
 
-class Line(eqx.Module):
+class WavelengthPlan(eqx.Module):
     """One wavelength of one colour.
 
     Attributes:
@@ -40,7 +40,7 @@ class Line(eqx.Module):
     colour: int = eqx.field(static=True)
 
 
-class Look(NamedTuple):
+class StepSources(NamedTuple):
     """What one evaluation of the loss looks at.
 
     Attributes:
@@ -68,9 +68,9 @@ class Problem(eqx.Module):
     """
 
     camera: Camera = eqx.field(static=True)
-    staircase: Staircase = eqx.field(static=True)
+    staircase: LevelParametrization = eqx.field(static=True)
     terms: tuple[Term, ...] = eqx.field(static=True)
-    lines: tuple[Line, ...]
+    lines: tuple[WavelengthPlan, ...]
     coverage: Float[Array, "y x"] | None
 
     @property
@@ -79,7 +79,7 @@ class Problem(eqx.Module):
         return self.coverage is None
 
 
-class Scene(NamedTuple):
+class SourceSet(NamedTuple):
     """Everything a step may look at: source waves of every line and depth, and the plain lens.
 
     Attributes:
@@ -94,7 +94,7 @@ class Scene(NamedTuple):
     lens: Float[np.ndarray, "w n"]
     displacement_m: float
 
-    def look(self, seed: int, step: int) -> Look:
+    def look(self, seed: int, step: int) -> StepSources:
         """What step number `step` looks at; depends on the two numbers alone, so a resumed run repeats it.
 
         Depths come in shuffled rounds, so each is seen equally often.
@@ -111,20 +111,20 @@ class Scene(NamedTuple):
         if self.displacement_m > 0:
             shift = np.random.default_rng((seed, 2, step)).uniform(-1.0, 1.0, 2) * self.displacement_m
             offset = jnp.asarray(shift, jnp.float32)
-        return Look(
+        return StepSources(
             tuple(tuple(line[i] for i in near) for line in self.near),
             tuple(tuple(line[i] for i in far) for line in self.far),
             jnp.asarray(self.lens[:, near]),
             offset,
         )
 
-    def first_look(self) -> Look:
+    def first_look(self) -> StepSources:
         """The first near and far depth, with the image on the axis."""
         near, far = (tuple(line[:1] for line in lines) for lines in (self.near, self.far))
-        return Look(near, far, jnp.asarray(self.lens[:, :1]), None)
+        return StepSources(near, far, jnp.asarray(self.lens[:, :1]), None)
 
 
-def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
+def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSet]:
     """Prepare plans, sources and objectives of a spec.
 
     Raises:
@@ -138,7 +138,7 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, Scene]:
         for depths in (spec.scene.near_m, spec.scene.far_m)
     )
     lens = lens_participation(camera, spec.scene.near_m)
-    return problem, Scene(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
+    return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
 
 
 def _is_sparse(spec: Spec) -> bool:
@@ -150,9 +150,9 @@ def _is_sparse(spec: Spec) -> bool:
 
 def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
     """Prepare plans and objectives alone, for those who bring sources of their own; see `problem_of`."""
-    camera, process = camera_of(spec), spec.process
+    camera, process = camera_from_spec(spec), spec.process
     # Depths that are to be chosen begin at 2^k steps.
-    levels = levels_of(process, Levels(process.levels, process.level_step_m))
+    levels = levels_from_spec(process, Levels(process.levels, process.level_step_m))
     radial = spec.optimize.parametrization == "radial"
     direct = spec.optics.propagation == "fresnel"
     sparse = _is_sparse(spec)
@@ -167,10 +167,10 @@ def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
             else:
                 plan = plan_far_field(camera, wavelength, sampling=1.0 if sparse else None)
             rate = jnp.float32(camera.waves_per_metre(wavelength))
-            lines.append(Line(plan, rate, weight * camera.transmission(wavelength), index))
+            lines.append(WavelengthPlan(plan, rate, weight * camera.transmission(wavelength), index))
     return Problem(
         camera=camera,
-        staircase=Staircase.at(camera.material, spec.optics.design_wavelength_m, levels),
+        staircase=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=terms,
         lines=tuple(lines),
         coverage=None if radial else jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)),
@@ -189,7 +189,9 @@ def lens_participation(camera: Camera, near_m: tuple[float, ...]) -> Float[np.nd
     return np.asarray(participation(jnp.asarray(bank.energy)))
 
 
-def _line_energy(problem: Problem, line: Line, height_m: Array, source: Array, offset_m: Array | None) -> Array:
+def _line_energy(
+    problem: Problem, line: WavelengthPlan, height_m: Array, source: Array, offset_m: Array | None
+) -> Array:
     plan = line.plan
     if isinstance(plan, Hankel):
         return line.factor * plan.energy(height_m, source, line.rate)
@@ -199,7 +201,7 @@ def _line_energy(problem: Problem, line: Line, height_m: Array, source: Array, o
     return line.factor * plan.energy(phase_pupil, PhaseRows(height_m, source, problem.coverage), line.rate)
 
 
-def view_of(problem: Problem, height_m: Array, look: Look) -> View:
+def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
     """PSFs of a height map (or profile) for the sources of a look, as objectives see them."""
     size = problem.camera.window
 
@@ -210,20 +212,20 @@ def view_of(problem: Problem, height_m: Array, look: Look) -> View:
             colours[line.colour].append(jnp.stack(images) if images else jnp.zeros((0, size, size)))
         return jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in colours])
 
-    return View(bank(look.near), bank(look.far), look.lens, problem.camera)
+    return PsfSet(bank(look.near), bank(look.far), look.lens, problem.camera)
 
 
-def losses(problem: Problem, view: View) -> tuple[Array, Array]:
+def losses(problem: Problem, view: PsfSet) -> tuple[Array, Array]:
     """The loss, and the value of every term."""
     values = jnp.stack([term.value(view) for term in problem.terms])
     return jnp.dot(jnp.asarray([term.weight for term in problem.terms]), values), values
 
 
 @eqx.filter_jit
-def _judge(problem: Problem, height_m: Array, look: Look) -> Array:
+def _judge(problem: Problem, height_m: Array, look: StepSources) -> Array:
     return losses(problem, view_of(problem, height_m, look))[0]
 
 
-def judge_height(problem: Problem, scene: Scene, height_m: Float[np.ndarray, "*s"]) -> float:
+def judge_height(problem: Problem, scene: SourceSet, height_m: Float[np.ndarray, "*s"]) -> float:
     """Loss of given heights at the first near and far depth, without gradient (for searches over few parameters)."""
     return float(_judge(problem, jnp.asarray(height_m, jnp.float32), scene.first_look()))

@@ -13,7 +13,7 @@ from fab.process import Process, Variation, error_names, variation_of
 from fab.runsheet.as_built import AsBuilt, MaskMeasured
 from fab.units import NM
 
-__all__ = ["Plate", "Taken", "compared", "gratings_compared", "plate_of"]
+__all__ = ["AsBuiltDoe", "Taken", "compared", "gratings_compared", "plate_of"]
 
 _ROUNDS = 20
 _PARTS = {"depth_scale": "common_depth_scale", "cd_bias_m": "common_cd_bias_m"}
@@ -34,7 +34,7 @@ class Taken(NamedTuple):
     source: str
 
 
-class Plate(NamedTuple):
+class AsBuiltDoe(NamedTuple):
     """A plate as it was built.
 
     Attributes:
@@ -123,7 +123,7 @@ def _mask_errors(process: Process, bit: int, mask: MaskMeasured, depth_m: float 
     return found
 
 
-def plate_of(measured: AsBuilt, process: Process) -> Plate:
+def plate_of(measured: AsBuilt, process: Process) -> AsBuiltDoe:
     """Turn measured numbers into the errors of a plate.
 
     Args:
@@ -158,7 +158,7 @@ def plate_of(measured: AsBuilt, process: Process) -> Plate:
     ]
     said = {name: value for name, value in values.items() if value}
     variation = variation_of(process.masks, said, repeats=repeats if any(repeats) else ())
-    return Plate(variation, tuple(taken), None if fit.per_m is None else fit.per_m * NM)
+    return AsBuiltDoe(variation, tuple(taken), None if fit.per_m is None else fit.per_m * NM)
 
 
 def _unmeasured(value: float) -> str:

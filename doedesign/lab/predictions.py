@@ -26,16 +26,16 @@ from doedesign.tolerancing.sensitivity import one_at_a_time
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.process import ERRORS, Process, Spread, Variation
-from fab.runsheet.tables import Grating, Matter, Outlook, Seen
+from fab.process import DEVIATIONS, Normal, Process, Variation
+from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
 from fab.sampling import varying
 from sim.aperture import circle_coverage
 from sim.leakage import strehl, zeroth_order
 from sim.material import full_wave_wavelength_m, refractive_index
 from sim.psf_bank import surface_bank
-from sim.surface import Surface, as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
-__all__ = ["Foretold", "foretold", "grating_orders", "matters_of", "seen_of"]
+__all__ = ["SheetPrediction", "grating_orders", "matters_of", "predict_sheet", "seen_of"]
 
 # A laser of the kind that most optics labs have, and that of the published prototype.
 PROBE_M = 520e-9
@@ -53,7 +53,7 @@ _MEASURED = {
 }
 
 
-def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[Seen, ...]:
+def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
     """Return the rows of a prediction as a run sheet has them; a ratio without any light in the disc is left out."""
     seen = []
     for row in rows:
@@ -61,7 +61,7 @@ def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[Seen, ...]:
         if ratio is not None and not math.isfinite(ratio):
             ratio = None
         shared = {name: row[name] for name in ("colour", "depth_m", "strehl", "zeroth_order", "throughput")}
-        seen.append(Seen(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
+        seen.append(PredictedMetrics(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
     return tuple(seen)
 
 
@@ -99,13 +99,13 @@ def _patch(drawn: Drawn, process: Process) -> tuple[Drawn, Process]:
     return replace(drawn, level=level, camera=small), replace(process, die_m=die_m, wafer_radius_m=on_wafer)
 
 
-def _row(surface: Surface, nominal: Surface) -> dict[str, Any]:
+def _row(surface: FabricatedDoe, nominal: FabricatedDoe) -> dict[str, Any]:
     """Strehl ratio and 0th order of a patch with one wavelength."""
     found = {"strehl": float(strehl(surface, nominal)[0]), "zeroth_order": float(zeroth_order(surface)[0])}
     return {"colour": "", "depth_m": None, **found}
 
 
-def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Matter, ...]:
+def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
     """Rank the numbers that a lab measures by how much of the plates' differences they explain.
 
     Args:
@@ -120,8 +120,8 @@ def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Mat
     Raises:
         InputError: errors beyond what the model describes.
     """
-    known = [name for name in varying(process) if ERRORS[name.partition("[")[0]].source in _MEASURED]
-    kept = replace(process, spreads={n: s if n in known else Spread(s.mean) for n, s in process.spreads.items()})
+    known = [name for name in varying(process) if DEVIATIONS[name.partition("[")[0]].source in _MEASURED]
+    kept = replace(process, spreads={n: s if n in known else Normal(s.mean) for n, s in process.spreads.items()})
     if not known:
         return ()
     small, there = _patch(drawn, kept)
@@ -138,7 +138,7 @@ def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Mat
             of[name] = of.get(name, 0.0) + change.variance
     totals = {quantity: sum(of.values()) or 1.0 for quantity, of in variances.items()}
     found = [
-        Matter(name, variance / totals["strehl"], variances["zeroth_order"][name] / totals["zeroth_order"])
+        Importance(name, variance / totals["strehl"], variances["zeroth_order"][name] / totals["zeroth_order"])
         for name, variance in variances["strehl"].items()
     ]
     return tuple(sorted(found, key=lambda matter: (-matter.strehl, matter.measured)))
@@ -147,7 +147,7 @@ def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Mat
 def _measured(error: str) -> str:
     """Name what is measured to find an error: "overlay of mask 3", "depth of every mask"."""
     key, bracket, mask = error.partition("[")
-    name = _MEASURED[ERRORS[key].source]
+    name = _MEASURED[DEVIATIONS[key].source]
     if bracket:
         return f"{name} of mask {int(mask.removesuffix(']')) + 1}"
     return f"{name} of every mask" if key.startswith("common_") else name
@@ -160,19 +160,19 @@ def _full_wave_m(levels: Levels, material: str) -> float | None:
         return None  # the sheet says so
 
 
-class Foretold(NamedTuple):
+class SheetPrediction(NamedTuple):
     """What stands on the sheet, and a PNG picture of the PSFs of the plate with the process's mean errors."""
 
-    outlook: Outlook
+    outlook: Predictions
     picture: bytes
 
 
-def _on_grid_of(plate: Surface, nominal: Surface, aperture_m: float) -> Surface:
+def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float) -> FabricatedDoe:
     """Return the plate as drawn on the raster of another, whose propagation is then compiled already."""
     parts = plate.grid.shape[0] // nominal.grid.shape[0]
     field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
     coverage = jnp.asarray(circle_coverage(plate.grid, aperture_m))
-    return Surface(field, field, coverage, plate.grid, nominal.wavelengths_m)
+    return FabricatedDoe(field, field, coverage, plate.grid, nominal.wavelengths_m)
 
 
 def _predictions(drawn: Drawn, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
@@ -186,13 +186,13 @@ def _predictions(drawn: Drawn, process: Process) -> tuple[Sequence[dict[str, Any
     return plate_rows(drawn, alike, surface_bank(drawn.camera, alike, drawn.depths_m)), expected
 
 
-def foretold(
+def predict_sheet(
     drawn: Drawn,
     process: Process,
     design_m: float,
     probe_m: float = PROBE_M,
     edge_moves_m: Sequence[float] = (),
-) -> Foretold:
+) -> SheetPrediction:
     """Foretell what a lab should see, for one depth: the middle one of the near depths, or else the farthest.
 
     Args:
@@ -217,7 +217,7 @@ def foretold(
         as_drawn, expected = _predictions(drawn, seen)
         matters = ranking.result()
     depths = np.array([levels.etch_depth_m(bit) for bit in range(levels.bits)])
-    outlook = Outlook(
+    outlook = Predictions(
         drawn=seen_of(as_drawn),
         expected=seen_of(expected.rows),
         design_m=design_m,
@@ -232,4 +232,4 @@ def foretold(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "psf.png"
         draw_psfs(path, drawn.camera, expected.bank, drawn.near_m, drawn.far_m)
-        return Foretold(outlook, path.read_bytes())
+        return SheetPrediction(outlook, path.read_bytes())

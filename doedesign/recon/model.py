@@ -26,7 +26,7 @@ from sim.imaging.formation import psf_at
 from sim.psf_bank import PsfBank
 from sim.store import read_bank
 
-__all__ = ["Model", "PsfChoice", "Psfs", "in_camera", "open_model", "psfs_of", "released_model", "shown"]
+__all__ = ["Model", "ModelPsfs", "PsfChoice", "in_camera", "open_model", "psfs_of", "released_model", "shown"]
 
 RELEASED = Path("masks/released")
 
@@ -88,7 +88,7 @@ class Model(NamedTuple):
         return sorted(range(len(self.colours)), key=lambda c: -self.wavelengths_m[c])
 
 
-class Psfs(NamedTuple):
+class ModelPsfs(NamedTuple):
     """What the network is told of the optics.
 
     Attributes:
@@ -152,7 +152,7 @@ def open_model(folder: Path) -> Model:
     return bare._replace(bank=_fitted(bare, bare.bank, home / BANK_NAME))
 
 
-def psfs_of(model: Model, choice: PsfChoice) -> Psfs:
+def psfs_of(model: Model, choice: PsfChoice) -> ModelPsfs:
     """PSFs of the scene and of the obstruction.
 
     Raises:
@@ -206,19 +206,19 @@ def _at(bank: PsfBank, depth_m: float, option: str) -> Float[np.ndarray, "c y x"
         raise InputError(option, error.rule, error.got, error.cure) from error
 
 
-def _ordered(of_scene: PsfBank, of_obstruction: PsfBank, far_m: float, near_m: float) -> Psfs:
+def _ordered(of_scene: PsfBank, of_obstruction: PsfBank, far_m: float, near_m: float) -> ModelPsfs:
     """The PSFs of two depths, the obstruction's before the scene's."""
     far, near = _at(of_scene, far_m, "--far-depth"), _at(of_obstruction, near_m, "--near-depth")
     if not near_m < far_m:
         rule, got = "the obstruction must be nearer than the scene", f"{near_m:g} m before {far_m:g} m"
         raise InputError("--near-depth", rule, got, "Exchange the two, or give --far-depth.")
     if of_obstruction is of_scene:
-        return Psfs(far, near, far_m, near_m, of_scene)
+        return ModelPsfs(far, near, far_m, near_m, of_scene)
     window = max(far.shape[1], near.shape[1]), max(far.shape[2], near.shape[2])
     far, near = _widened(far, window), _widened(near, window)
     energy, depths = np.stack([near, far], axis=1), (near_m, far_m)
     bank = PsfBank(energy, of_scene.colours, depths, of_scene.pixel_m, of_scene.field_rad)
-    return Psfs(far, near, far_m, near_m, bank)
+    return ModelPsfs(far, near, far_m, near_m, bank)
 
 
 def _widened(psf: Float[np.ndarray, "c y x"], window: tuple[int, int]) -> Float[np.ndarray, "c v u"]:

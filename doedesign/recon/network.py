@@ -52,7 +52,7 @@ _RELEASE_LOG_REGULARISER = float(np.log(1e-6))
 
 
 @dataclass(frozen=True)
-class Layout:
+class NetworkShape:
     """Shape of a network; every part can be left out, for the ablations of Table 1.
 
     Attributes:
@@ -162,7 +162,7 @@ class Scale(eqx.Module):
         return image
 
 
-class Rise(eqx.Module):
+class UpBlock(eqx.Module):
     """From one scale to the next finer one.
 
     Attributes:
@@ -200,14 +200,14 @@ class Network(eqx.Module):
     far_log_regulariser: Float[Array, " c"] | None
     down: tuple[Scale, ...]
     bottom: tuple[Block, ...]
-    up: tuple[Rise, ...]
+    up: tuple[UpBlock, ...]
     head: tuple[Block, ...]
     residual: tuple[tuple[Block, Block], ...]
     last: Block | None
-    layout: Layout = eqx.field(static=True)
+    layout: NetworkShape = eqx.field(static=True)
 
     @classmethod
-    def make(cls, layout: Layout, seed: int) -> "Network":
+    def make(cls, layout: NetworkShape, seed: int) -> "Network":
         """Draw a network that all but hands the capture through: its corrections begin near nothing.
 
         Raises:
@@ -234,7 +234,7 @@ class Network(eqx.Module):
         wide = 2 * widths[-1]
         bottom = (Block.make(rng, deepest, wide), Block.make(rng, wide, widths[-1]))
         up = tuple(
-            Rise(
+            UpBlock(
                 _spread(rng, widths[level + 1], widths[level]),
                 Block.make(rng, widths[level] + beside(level), widths[level]),
             )
@@ -331,7 +331,7 @@ class Network(eqx.Module):
         return jax.nn.relu(found) if release else found
 
 
-def _bare(layout: Layout) -> tuple[Scale, ...]:
+def _bare(layout: NetworkShape) -> tuple[Scale, ...]:
     """Scales without features of their own: the capture is filtered."""
     wiener = jnp.full(layout.colours, _LOG_REGULARISER, jnp.float32) if layout.wiener else None
     if wiener is None:

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.recon.network import Layout, Network
+from doedesign.recon.network import Network, NetworkShape
 from doedesign.runs.archive import read_archive, write_archive
 from fab.errors import InputError
 from sim.camera import Camera
@@ -109,15 +109,15 @@ def _named(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(where): leaf for where, leaf in leaves}
 
 
-def _layout(path: Path, said: Any) -> Layout:
+def _layout(path: Path, said: Any) -> NetworkShape:
     try:
-        return Layout(**said)
+        return NetworkShape(**said)
     except (TypeError, ValueError) as error:
         cure = "Use the version that wrote it."
         raise InputError(str(path), "the layout must be one that this version knows", f'"{error}"', cure) from error
 
 
-def _filled(path: Path, layout: Layout, arrays: Mapping[str, np.ndarray]) -> Network:
+def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) -> Network:
     """A network of a layout with the weights of a file."""
     empty = Network.make(layout, 0)
     slots = _named(empty)

@@ -26,7 +26,7 @@ from doedesign.report.canvas import (
     wrapped,
 )
 from doedesign.report.tolerance import error_label
-from fab.process import ERRORS
+from fab.process import DEVIATIONS
 from fab.units import UM
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class _Scale(NamedTuple):
 
 def _scale_of(name: str) -> _Scale:
     key = name.partition("[")[0]
-    unit = ERRORS[key].unit
+    unit = DEVIATIONS[key].unit
     if key == "magnification":
         return _Scale(1e6, "ppm")
     return {"m": _Scale(1e9, "nm"), "rad": _Scale(math.degrees(1.0), "°"), "1": _Scale(100.0, "%")}[unit]

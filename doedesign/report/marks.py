@@ -8,7 +8,7 @@ import numpy as np
 
 from doedesign.report.canvas import CHROME, INK, SERIES, picture
 from fab.layout.geometry import Layer
-from fab.layout.part import Part, Plate
+from fab.layout.part import Part, Photomask
 from fab.units import UM
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _PLATE = "#2b2d31"
 _WIDTH_IN = 9.0
 
 
-def _colour(layer: Layer, plates: Sequence[Plate]) -> str:
+def _colour(layer: Layer, plates: Sequence[Photomask]) -> str:
     plate = next(plate for plate in plates if plate.layer == layer.number)
     if plate.bit is not None:
         return SERIES[plate.bit % len(SERIES)]
@@ -86,7 +86,7 @@ def _frame(axes: "Axes", window_um: tuple[float, float, float, float]) -> None:
 def draw_part(
     path: str | Path,
     part: Part,
-    plates: Sequence[Plate],
+    plates: Sequence[Photomask],
     title: str,
     window_m: tuple[float, float, float, float] | None = None,
 ) -> None:
@@ -117,7 +117,9 @@ def draw_part(
         figure.legend(handles=keys, loc="lower right", ncols=len(keys), borderaxespad=0.2)
 
 
-def draw_view(path: str | Path, part: Part, first: Plate, plate: Plate, title: str, name: str = "finder") -> None:
+def draw_view(
+    path: str | Path, part: Part, first: Photomask, plate: Photomask, title: str, name: str = "finder"
+) -> None:
     """Draw what is seen in a microscope through one plate on the wafer, around the slot of the plate.
 
     Args:

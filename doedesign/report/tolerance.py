@@ -27,10 +27,10 @@ from doedesign.report.canvas import (
     place,
     wrapped,
 )
-from doedesign.tolerancing.analysis import QUANTITIES, Table, Yield, good_plates, yield_of
+from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, Yield, good_plates, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.sensitivity import Change, Share
-from fab.process import ERRORS
+from fab.process import DEVIATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -107,7 +107,7 @@ def _marks(camera: "Camera", **look: Any) -> "list[Line2D]":
 
 
 def draw_histograms(
-    path: str | Path, camera: "Camera", table: Table, nominal: Table, limits: Sequence["LimitSpec"] = ()
+    path: str | Path, camera: "Camera", table: PlateTable, nominal: PlateTable, limits: Sequence["LimitSpec"] = ()
 ) -> None:
     """Draw how every quantity is distributed over the plates: a line per colour, the worst depth of each plate.
 
@@ -171,7 +171,7 @@ def _shade(axes: "Axes", limits: Sequence["LimitSpec"], scale: float) -> None:
                 axes.axvline(scale * bound, color=MARK, lw=1.2)
 
 
-def draw_yield(path: str | Path, table: Table, limits: Sequence["LimitSpec"] = ()) -> None:
+def draw_yield(path: str | Path, table: PlateTable, limits: Sequence["LimitSpec"] = ()) -> None:
     """Draw the yield over where the limit of each quantity lies: its share of plates whose worst row is as good.
 
     Args:
@@ -291,7 +291,7 @@ def draw_shares(path: str | Path, camera: "Camera", shares: Sequence[Share]) -> 
     """
     hues = dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
     quantities = list(dict.fromkeys(one.quantity for one in shares))
-    sources = [s for s in dict.fromkeys(e.source for e in ERRORS.values()) if any(o.source == s for o in shares)]
+    sources = [s for s in dict.fromkeys(e.source for e in DEVIATIONS.values()) if any(o.source == s for o in shares)]
     sources += [s for s in dict.fromkeys(one.source for one in shares) if s not in sources]
     words = "Sobol indices of the worst colour and depth: dark alone, light together with others, with 95 % confidence"
     words += "; marks: totals of single colours"

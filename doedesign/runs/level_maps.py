@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.build import levels_of
+from doedesign.build import levels_from_spec
 from doedesign.runs.folder import Run, open_run
 from doedesign.spec import HEIGHT_FILES
 from fab.errors import InputError
@@ -74,7 +74,7 @@ def read_any_height(
 
 def levels_of_run(run: Run, count: int | None = None) -> LevelMap:
     """What a run draws, or its continuous design rounded to another number of levels over the same full height."""
-    drawn = levels_of(run.spec.process)
+    drawn = levels_from_spec(run.spec.process)
     aperture, name = run.spec.doe.aperture_m, run.spec.name
     if count in (None, drawn.count) and run.spec.optimize.quantisation != "none":
         file = run.path("height.exr")

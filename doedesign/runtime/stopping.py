@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 
-class Stop:
+class StopRequest:
     """Whether someone asked for an end; made by `stoppable`.
 
     Attributes:
@@ -49,9 +49,9 @@ class Stop:
 
 
 @contextmanager
-def stoppable() -> Iterator[Stop]:
+def stoppable() -> Iterator[StopRequest]:
     """Take SIGINT and SIGTERM as questions; both raise KeyboardInterrupt where nothing is said of steps."""
-    stop = Stop()
+    stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread is told of signals
         return

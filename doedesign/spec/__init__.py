@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from doedesign.spec.checks import find_problems, spec_warnings
-from doedesign.spec.errors import Problem, SpecError, explain, key_as_written, spec_error
+from doedesign.spec.errors import SpecError, SpecMistake, explain, key_as_written, spec_error
 from doedesign.spec.models import (
     ColourSpec,
     DoeSpec,
@@ -45,7 +45,7 @@ from doedesign.spec.models import (
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, EtchSpec, LimitSpec, ProcessSpec, SpreadSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
-from doedesign.spec.table import Table, toml_key
+from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
 from doedesign.spec.training import NetworkSpec, TrainSpec, training_problems
 from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
@@ -96,7 +96,7 @@ __all__ = [
     "variation_to_toml",
 ]
 
-_Model = TypeVar("_Model", bound=Table)
+_Model = TypeVar("_Model", bound=SpecTable)
 
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
 
@@ -237,7 +237,7 @@ def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
     files = {key: Path(spec_path).parent / name for key, name in named.items()}
     missing = [
-        Problem(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
+        SpecMistake(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
         for key, file in files.items()
         if not file.is_file()
     ]
@@ -248,7 +248,7 @@ def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
 
 def _checked(spec: Spec, raw: Mapping[str, Any], source: str, overridden: Sequence[str]) -> Spec:
     of_training = training_problems(spec.network, spec.train, len(spec.optics.colours))
-    found = [*find_problems(spec), *(Problem(*told) for told in of_training)]
+    found = [*find_problems(spec), *(SpecMistake(*told) for told in of_training)]
     problems = [problem._replace(key=key_as_written(problem.key, raw)) for problem in found]
     if problems:
         raise spec_error(source, problems, overridden)

@@ -1,13 +1,13 @@
 """Rules that join several values of a spec: the optics must be possible, and what is doubtful is said aloud.
 
-A broken rule is a `Problem`; a doubt is a sentence. Neither changes the spec.
+A broken rule is a `SpecMistake`; a doubt is a sentence. Neither changes the spec.
 """
 
 import math
 import operator
 from collections.abc import Iterator
 
-from doedesign.spec.errors import Problem
+from doedesign.spec.errors import SpecMistake
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import (
     limit_problems,
@@ -26,7 +26,7 @@ _NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 _WAVE_TOLERANCE = 0.02
 
 
-def find_problems(spec: Spec) -> list[Problem]:
+def find_problems(spec: Spec) -> list[SpecMistake]:
     """Return every rule between tables that a spec breaks.
 
     Args:
@@ -51,14 +51,14 @@ def find_problems(spec: Spec) -> list[Problem]:
     return [problem for rule in rules for problem in rule(spec)]
 
 
-def _process(spec: Spec) -> Iterator[Problem]:
+def _process(spec: Spec) -> Iterator[SpecMistake]:
     return process_problems(spec.process)
 
 
-def _opening(spec: Spec) -> Iterator[Problem]:
+def _opening(spec: Spec) -> Iterator[SpecMistake]:
     overlap, aperture = spec.process.chrome_overlap_m, spec.doe.aperture_m
     if aperture - 2 * overlap < 2 * spec.doe.pitch_m:
-        yield Problem(
+        yield SpecMistake(
             "process.chrome_overlap",
             f"twice the overlap must leave an opening in an aperture of {format_length(aperture)}",
             format_length(overlap),
@@ -66,10 +66,10 @@ def _opening(spec: Spec) -> Iterator[Problem]:
         )
 
 
-def _sensor(spec: Spec) -> Iterator[Problem]:
+def _sensor(spec: Spec) -> Iterator[SpecMistake]:
     focal, defocus = spec.optics.focal_length_m, spec.sensor.defocus_m
     if defocus <= -focal / 2:
-        yield Problem(
+        yield SpecMistake(
             "sensor.defocus",
             f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens",
             format_length(defocus),
@@ -77,17 +77,17 @@ def _sensor(spec: Spec) -> Iterator[Problem]:
         )
 
 
-def _efficiencies(spec: Spec) -> Iterator[Problem]:
+def _efficiencies(spec: Spec) -> Iterator[SpecMistake]:
     given, colours = len(spec.sensor.quantum_efficiency), len(spec.optics.colours)
     if given not in (0, 1, colours):
         rule = f"must be one number or one per colour, {colours} here"
-        yield Problem("sensor.quantum_efficiency", rule, f"{given}", "Add or remove numbers.")
+        yield SpecMistake("sensor.quantum_efficiency", rule, f"{given}", "Add or remove numbers.")
 
 
-def _mosaic(spec: Spec) -> Iterator[Problem]:
+def _mosaic(spec: Spec) -> Iterator[SpecMistake]:
     means = [sum(map(operator.mul, c.wavelengths_m, c.weights)) for c in spec.optics.colours]
     if spec.sensor.bayer and not (len(means) == 3 and means[0] > means[1] > means[2]):
-        yield Problem(
+        yield SpecMistake(
             "sensor.bayer",
             "a mosaic needs three colours, from the longest wavelength to the shortest",
             ", ".join(colour.name for colour in spec.optics.colours),
@@ -99,7 +99,7 @@ def _wavelengths(spec: Spec) -> list[float]:
     return sorted({w for colour in spec.optics.colours for w in colour.wavelengths_m})
 
 
-def _materials(spec: Spec) -> Iterator[Problem]:
+def _materials(spec: Spec) -> Iterator[SpecMistake]:
     named = [("optics.design_wavelength", spec.optics.design_wavelength_m)]
     for index, colour in enumerate(spec.optics.colours):
         named += [(f"optics.colours[{index}].wavelengths", wavelength_m) for wavelength_m in colour.wavelengths_m]
@@ -107,14 +107,14 @@ def _materials(spec: Spec) -> Iterator[Problem]:
         try:
             refractive_index(spec.doe.material, wavelength_m)
         except InputError as error:
-            yield Problem(key, f"{error.rule} ({spec.doe.material})", str(error.got), error.cure)
+            yield SpecMistake(key, f"{error.rule} ({spec.doe.material})", str(error.got), error.cure)
 
 
-def _colours(spec: Spec) -> Iterator[Problem]:
+def _colours(spec: Spec) -> Iterator[SpecMistake]:
     names = [colour.name for colour in spec.optics.colours]
     for index, name in enumerate(names):
         if name in names[:index]:
-            yield Problem(
+            yield SpecMistake(
                 f"optics.colours[{index}].name",
                 "every colour channel must have its own name",
                 f"{name!r} twice",
@@ -122,12 +122,12 @@ def _colours(spec: Spec) -> Iterator[Problem]:
             )
 
 
-def _aperture(spec: Spec) -> Iterator[Problem]:
+def _aperture(spec: Spec) -> Iterator[SpecMistake]:
     doe = spec.doe
     span_m = doe.samples * doe.pitch_m
     # One part in a million of slack, for values that lie on the limit in decimal.
     if abs(doe.aperture_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
-        yield Problem(
+        yield SpecMistake(
             "doe.aperture",
             f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {format_length(span_m)} "
             "to within half a pitch",
@@ -136,10 +136,10 @@ def _aperture(spec: Spec) -> Iterator[Problem]:
         )
 
 
-def _depth_order(spec: Spec) -> Iterator[Problem]:
+def _depth_order(spec: Spec) -> Iterator[SpecMistake]:
     near, far = spec.scene.near_m, spec.scene.far_m
     if near and max(near) >= min(far):
-        yield Problem(
+        yield SpecMistake(
             "scene.near",
             "every near depth must be smaller than every far depth",
             f"{format_length(max(near))} near and {_depth_text(min(far))} far",
@@ -156,12 +156,12 @@ def _nyquist_length_m(spec: Spec, wavelength_m: float) -> float:
     return spec.doe.samples * spec.doe.pitch_m**2 / wavelength_m
 
 
-def _source_sampling(spec: Spec) -> Iterator[Problem]:
+def _source_sampling(spec: Spec) -> Iterator[SpecMistake]:
     """Check that neighbouring cells see a source less than half a wave apart: the bound of eq. 6 for the depth."""
     shortest_m = _nyquist_length_m(spec, _wavelengths(spec)[0])
     for key, depths in (("scene.near", spec.scene.near_m), ("scene.far", spec.scene.far_m)):
         if depths and min(depths) < shortest_m:
-            yield Problem(
+            yield SpecMistake(
                 key,
                 f"every depth must be at least samples x pitch^2 / wavelength = {_round_length(shortest_m)}, "
                 "or the cells cannot follow the wave of the source",
@@ -175,7 +175,7 @@ def _round_length(length_m: float) -> str:
     return format_length(float(f"{length_m:.4g}"))
 
 
-def _fresnel_sampling(spec: Spec) -> Iterator[Problem]:
+def _fresnel_sampling(spec: Spec) -> Iterator[SpecMistake]:
     if spec.optics.propagation != "fresnel":
         return
     wavelength_m, focal_m = _wavelengths(spec)[0], spec.optics.focal_length_m
@@ -185,7 +185,7 @@ def _fresnel_sampling(spec: Spec) -> Iterator[Problem]:
     span_m = spec.doe.samples * spec.doe.pitch_m
     samples = math.ceil(span_m**2 / (wavelength_m * focal_m))
     samples += samples % 2
-    yield Problem(
+    yield SpecMistake(
         "optics.propagation",
         '"fresnel" needs samples x pitch^2 / wavelength <= focal_length at every wavelength (eq. 6)',
         f"{_round_length(needed_m)} > {format_length(focal_m)} at {format_length(wavelength_m)}",
@@ -194,14 +194,14 @@ def _fresnel_sampling(spec: Spec) -> Iterator[Problem]:
     )
 
 
-def _objectives(spec: Spec) -> Iterator[Problem]:
+def _objectives(spec: Spec) -> Iterator[SpecMistake]:
     if not spec.objectives and spec.optimize.steps > 0:
-        yield Problem(
+        yield SpecMistake(
             "objective", "an optimisation must have something to improve", "no [[objective]]", "Add one, or steps = 0."
         )
     for index, objective in enumerate(spec.objectives):
         if objective.name in _NEAR_OBJECTIVES and not spec.scene.near_m:
-            yield Problem(
+            yield SpecMistake(
                 f"objective[{index}].name",
                 f'"{objective.name}" looks at near depths, so scene.near must hold one',
                 "an empty scene.near",

@@ -13,11 +13,11 @@ from pydantic_core import ErrorDetails
 
 from doedesign.spec.models import Spec
 from doedesign.spec.response import RESPONSE_KEYS
-from doedesign.spec.table import Table, toml_key
+from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.values import nearest
 from fab.errors import InputError
 
-__all__ = ["Problem", "SpecError", "explain", "key_as_written", "spec_error"]
+__all__ = ["SpecError", "SpecMistake", "explain", "key_as_written", "spec_error"]
 
 _SHORT_FORM = 'For example `wavelengths = ["656 nm", "589 nm", "486 nm"]`.'
 _COLOURS_KEY = re.compile(r"optics\.colours(\[\d+\])?.*")
@@ -39,7 +39,7 @@ _RULES = {
 }
 
 
-class Problem(NamedTuple):
+class SpecMistake(NamedTuple):
     """One broken rule of a spec.
 
     Attributes:
@@ -73,7 +73,7 @@ class SpecError(InputError):
         return "\n".join(str(mistake) for mistake in self.mistakes)
 
 
-def spec_error(source: str, problems: Sequence[Problem], overridden: Collection[str] = ()) -> InputError:
+def spec_error(source: str, problems: Sequence[SpecMistake], overridden: Collection[str] = ()) -> InputError:
     """Make the error to raise for a list of problems.
 
     Args:
@@ -93,7 +93,7 @@ def _covered(key: str, overridden: Collection[str]) -> bool:
     return any(f"{dotted}.".startswith(f"{k}.") or k.startswith(f"{dotted}.") for k in overridden)
 
 
-def explain(error: ValidationError, raw: Mapping[str, Any], root: type[Table] = Spec) -> list[Problem]:
+def explain(error: ValidationError, raw: Mapping[str, Any], root: type[SpecTable] = Spec) -> list[SpecMistake]:
     """Translate what pydantic found.
 
     Args:
@@ -107,7 +107,7 @@ def explain(error: ValidationError, raw: Mapping[str, Any], root: type[Table] = 
     return [_problem(d, raw, root) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
 
 
-def _problem(details: ErrorDetails, raw: Mapping[str, Any], root: type[Table]) -> Problem:
+def _problem(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable]) -> SpecMistake:
     location, kind, context = details["loc"], details["type"], details.get("ctx", {})
     key = key_as_written(_dotted(location), raw)
     if kind == "extra_forbidden":
@@ -116,17 +116,17 @@ def _problem(details: ErrorDetails, raw: Mapping[str, Any], root: type[Table]) -
         return _missing(key, location, root)
     got = _shown(details["input"])
     if kind == "spec":
-        return Problem(key, context["rule"], got, context["cure"])
+        return SpecMistake(key, context["rule"], got, context["cure"])
     if kind == "literal_error":
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ",").split(",")]
-        return Problem(key, f"must be one of {', '.join(choices)}", got, nearest(details["input"], choices))
+        return SpecMistake(key, f"must be one of {', '.join(choices)}", got, nearest(details["input"], choices))
     rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
     cure = _example(location, root) or "Change the value."
     if key == "optics.wavelengths":
         cure = _SHORT_FORM
     elif kind == "tuple_type" and _table_at(location, root):
         cure = f"Write [[{key}]] tables."
-    return Problem(key, rule, got, cure)
+    return SpecMistake(key, rule, got, cure)
 
 
 def _dotted(location: Sequence[int | str]) -> str:
@@ -169,9 +169,9 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _table_at(location: Sequence[int | str], root: type[Table]) -> type[Table] | None:
+def _table_at(location: Sequence[int | str], root: type[SpecTable]) -> type[SpecTable] | None:
     """Return the model of the table a location leads into, None where it leads to a value."""
-    table: type[Table] | None = root
+    table: type[SpecTable] | None = root
     for part in location:
         if isinstance(part, int):
             continue
@@ -180,21 +180,21 @@ def _table_at(location: Sequence[int | str], root: type[Table]) -> type[Table] |
     return table
 
 
-def _field(table: type[Table], key: str) -> FieldInfo | None:
+def _field(table: type[SpecTable], key: str) -> FieldInfo | None:
     return next((f for name, f in table.model_fields.items() if key in (name, toml_key(name))), None)
 
 
-def _model_of(field: FieldInfo) -> type[Table] | None:
+def _model_of(field: FieldInfo) -> type[SpecTable] | None:
     candidates = (field.annotation, *get_args(field.annotation))
-    return next((c for c in candidates if isinstance(c, type) and issubclass(c, Table)), None)
+    return next((c for c in candidates if isinstance(c, type) and issubclass(c, SpecTable)), None)
 
 
-def _keys(table: type[Table]) -> list[str]:
+def _keys(table: type[SpecTable]) -> list[str]:
     keys = [toml_key(name) for name in table.model_fields]
     return [*keys, "wavelengths", *RESPONSE_KEYS] if "colours" in keys else keys
 
 
-def _tables(root: type[Table], path: str = "") -> Iterator[tuple[str, type[Table]]]:
+def _tables(root: type[SpecTable], path: str = "") -> Iterator[tuple[str, type[SpecTable]]]:
     """Yield every table below one with its dotted key, outer ones first."""
     inner = [(f"{path}.{toml_key(name)}".removeprefix("."), _model_of(f)) for name, f in root.model_fields.items()]
     found = [(key, model) for key, model in inner if model and not model.inline]
@@ -203,27 +203,29 @@ def _tables(root: type[Table], path: str = "") -> Iterator[tuple[str, type[Table
         yield from _tables(model, key)
 
 
-def _unknown(key: str, location: Sequence[int | str], root: type[Table]) -> Problem:
+def _unknown(key: str, location: Sequence[int | str], root: type[SpecTable]) -> SpecMistake:
     parent = _table_at(location[:-1], root)
     name, keys = str(location[-1]), _keys(parent) if parent else []
     if key == "optics.wavelengths":
-        return Problem(key, "the colours must be stated once", "`wavelengths` and `colours`", "Remove one of the two.")
+        return SpecMistake(
+            key, "the colours must be stated once", "`wavelengths` and `colours`", "Remove one of the two."
+        )
     homes = [home for home, model in _tables(root) if name in _keys(model)]
     cure = nearest(name, keys)
     if homes and not cure.startswith("Did"):
         cure = f"It belongs to [{homes[0]}]."
     where = f"[{key.rpartition('.')[0]}]" if "." in key else "the spec"
-    return Problem(key, f"must be a known key of {where}", f"`{name}`", cure)
+    return SpecMistake(key, f"must be a known key of {where}", f"`{name}`", cure)
 
 
-def _missing(key: str, location: Sequence[int | str], root: type[Table]) -> Problem:
+def _missing(key: str, location: Sequence[int | str], root: type[SpecTable]) -> SpecMistake:
     if isinstance(location[-1], int):
-        return Problem(key, "must be given", "a shorter list", _example(location, root) or "Add the entry.")
+        return SpecMistake(key, "must be given", "a shorter list", _example(location, root) or "Add the entry.")
     cure = _SHORT_FORM if key == "optics.wavelengths" else _example(location, root) or f"Add a table [{key}]."
-    return Problem(key, "must be given", "nothing", cure)
+    return SpecMistake(key, "must be given", "nothing", cure)
 
 
-def _example(location: Sequence[int | str], root: type[Table]) -> str:
+def _example(location: Sequence[int | str], root: type[SpecTable]) -> str:
     """Return a sentence with an example of the value at a location, empty where there is none."""
     names = [part for part in location if isinstance(part, str)]
     parent = _table_at(names[:-1], root) if names else None

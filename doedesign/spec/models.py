@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
-from doedesign.spec.table import Table, unsaid
+from doedesign.spec.table import SpecTable, unsaid
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 
-class ColourSpec(Table, frozen=True):
+class ColourSpec(SpecTable, frozen=True):
     """One colour channel of the camera.
 
     Attributes:
@@ -73,7 +73,7 @@ class ColourSpec(Table, frozen=True):
         return weights if abs(total - 1) < 1e-12 else tuple(weight / total for weight in weights)
 
 
-class OpticsSpec(Table, frozen=True):
+class OpticsSpec(SpecTable, frozen=True):
     """The lens and the light.
 
     Attributes:
@@ -113,7 +113,7 @@ def _colour_name(wavelength: object, index: int) -> str:
     return f"{nanometres:.6g}nm".replace(".", "p").replace("+", "")
 
 
-class DoeSpec(Table, frozen=True):
+class DoeSpec(SpecTable, frozen=True):
     """The plate.
 
     Attributes:
@@ -129,7 +129,7 @@ class DoeSpec(Table, frozen=True):
     material: Material = Field(examples=['"fused_silica"'])
 
 
-class OptimizeSpec(Table, frozen=True):
+class OptimizeSpec(SpecTable, frozen=True):
     """How the height map is found.
 
     Attributes:
@@ -158,7 +158,7 @@ class OptimizeSpec(Table, frozen=True):
     checkpoint_every: Count = 25
 
 
-class ObjectiveSpec(Table, frozen=True):
+class ObjectiveSpec(SpecTable, frozen=True):
     """One term of the objective.
 
     Attributes:
@@ -172,7 +172,7 @@ class ObjectiveSpec(Table, frozen=True):
     options: OptionsTable = Options()
 
 
-class Spec(Table, frozen=True):
+class Spec(SpecTable, frozen=True):
     """Everything that a design depends on.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 Every key besides levels and level step may be left out: `stock` names a set of usual numbers, each key that is given
 replaces one of them, and without a stock process what is not given is zero. `ProcessSpec.filled` says what then holds.
-The keys of `[process.errors]` are those of `fab.process.ERRORS` without the unit.
+The keys of `[process.errors]` are those of `fab.process.DEVIATIONS` without the unit.
 """
 
 import math
@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from doedesign.spec.table import Table, unsaid
+from doedesign.spec.table import SpecTable, unsaid
 from doedesign.spec.values import (
     ChromeOverlap,
     ColourName,
@@ -34,7 +34,7 @@ from doedesign.spec.values import (
     nearest,
     share,
 )
-from fab.process import ERRORS, Error, Spread
+from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK, Stock
 from fab.units import MM, NM, UM
 
@@ -71,7 +71,7 @@ def _etch_depths(value: Any, info: ValidationInfo) -> tuple[float, ...] | Litera
 _EtchDepths = Annotated[Any, PlainValidator(_etch_depths)]
 
 
-class EtchSpec(Table, frozen=True):
+class EtchSpec(SpecTable, frozen=True):
     """One etch.
 
     Attributes:
@@ -85,7 +85,7 @@ class EtchSpec(Table, frozen=True):
     depth_m: Etch | None = unsaid()
 
 
-class SpreadSpec(Table, frozen=True):
+class SpreadSpec(SpecTable, frozen=True):
     """How one error is distributed, in the SI unit that the error's name ends in.
 
     In TOML `overlay_x = "0.5 um"` is short for `overlay_x = { sigma = "0.5 um" }`.
@@ -105,13 +105,13 @@ class SpreadSpec(Table, frozen=True):
     def _sigma_alone(cls, value: Any) -> Any:
         return value if isinstance(value, Mapping | SpreadSpec) else {"sigma": value}
 
-    def spreads(self, count: int) -> tuple[Spread, ...]:
+    def spreads(self, count: int) -> tuple[Normal, ...]:
         """Return mean and standard deviation of each of `count` errors, one per mask or one for the plate."""
         means, sigmas = (value if isinstance(value, tuple) else (value,) * count for value in (self.mean, self.sigma))
-        return tuple(Spread(mean, sigma) for mean, sigma in zip(means, sigmas, strict=True))
+        return tuple(Normal(mean, sigma) for mean, sigma in zip(means, sigmas, strict=True))
 
 
-def quantity_of(error: Error, low: float, high: float) -> Any:
+def quantity_of(error: Deviation, low: float, high: float) -> Any:
     """Return the type of a value of an error between two bounds, SI units."""
     of_unit = {"1": share, "m": length, "rad": angle}[error.unit]
     return Annotated[float, of_unit(low, high)]
@@ -138,7 +138,7 @@ def _for_masks(value_type: Any) -> Any:
     return Annotated[Any, PlainValidator(validate)]
 
 
-def _spread_type(name: str, error: Error) -> type[SpreadSpec]:
+def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:
     largest = _LARGEST_OF.get(name, _LARGEST[error.unit])
     of = _for_masks if error.per_mask else _for_plate
     mean = of(quantity_of(error, 0.0 if error.one_sided else -largest, largest))
@@ -149,15 +149,15 @@ def _spread_type(name: str, error: Error) -> type[SpreadSpec]:
     return model
 
 
-_SPREADS: dict[str, Any] = {name: (_spread_type(name, error) | None, unsaid()) for name, error in ERRORS.items()}
-_Errors = create_model("_Errors", __base__=Table, __module__=__name__, **_SPREADS)
+_SPREADS: dict[str, Any] = {name: (_spread_type(name, error) | None, unsaid()) for name, error in DEVIATIONS.items()}
+_Errors = create_model("_Errors", __base__=SpecTable, __module__=__name__, **_SPREADS)
 
 
 class ErrorsSpec(_Errors, frozen=True):
-    """How far the process strays: a `SpreadSpec` or None for each error of `fab.process.ERRORS`, under its name."""
+    """How far the process strays: a `SpreadSpec` or None for each error of `fab.process.DEVIATIONS`, under its name."""
 
     def given(self) -> dict[str, SpreadSpec]:
-        """Return the errors that are given, by their name in `ERRORS`."""
+        """Return the errors that are given, by their name in `DEVIATIONS`."""
         return self.said()
 
 
@@ -165,7 +165,7 @@ class ErrorsSpec(_Errors, frozen=True):
 _PER_MM2 = {"particles_per_m2": "particles_per_mm2", "pinholes_per_m2": "pinholes_per_mm2"}
 
 
-class DefectsSpec(Table, frozen=True):
+class DefectsSpec(SpecTable, frozen=True):
     """Rare events; see `fab.process.Defects`.
 
     Attributes:
@@ -203,7 +203,7 @@ def _stock_name(name: str) -> str:
     return name
 
 
-class ProcessSpec(Table, frozen=True):
+class ProcessSpec(SpecTable, frozen=True):
     """What the fab lab makes, and how well.
 
     Attributes:
@@ -281,7 +281,7 @@ def _filled_defects(defects: DefectsSpec, stock: Stock) -> DefectsSpec:
     return usual.model_copy(update=defects.said())
 
 
-class LimitSpec(Table, frozen=True):
+class LimitSpec(SpecTable, frozen=True):
     """One condition of a good plate: it must hold for every colour and depth it applies to.
 
     Attributes:

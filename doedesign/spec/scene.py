@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from doedesign.spec.table import Table, unsaid
+from doedesign.spec.table import SpecTable, unsaid
 from doedesign.spec.values import (
     Count,
     Defocus,
@@ -62,7 +62,7 @@ def _kind(name: str) -> str:
     return name
 
 
-class SceneSpec(Table, frozen=True):
+class SceneSpec(SpecTable, frozen=True):
     """Where light comes from, measured from the plate.
 
     Attributes:
@@ -78,7 +78,7 @@ class SceneSpec(Table, frozen=True):
     occlusion: Occlusion | None = unsaid()
 
 
-class ObstructionSpec(Table, frozen=True):
+class ObstructionSpec(SpecTable, frozen=True):
     """What stands before the scene.
 
     Attributes:
@@ -92,7 +92,7 @@ class ObstructionSpec(Table, frozen=True):
     options: OptionsTable = unsaid(Options())
 
 
-class SensorSpec(Table, frozen=True):
+class SensorSpec(SpecTable, frozen=True):
     """The sensor behind the lens. What is said of light is in `sim.sensor`, whose usual values hold where nothing is.
 
     Attributes:

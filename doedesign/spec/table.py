@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Table", "toml_key", "unsaid"]
+__all__ = ["SpecTable", "toml_key", "unsaid"]
 
 # Arrays of tables: one entry is one [[objective]].
 _SINGULAR = {"objectives": "objective", "limits": "limit", "particles": "particle", "pinholes": "pinhole"}
@@ -26,7 +26,7 @@ def unsaid(default: Any = None) -> Any:
     return Field(default=default, exclude_if=lambda value: value == default)
 
 
-class Table(BaseModel, frozen=True):
+class SpecTable(BaseModel, frozen=True):
     """One table of a spec. Unknown keys are refused, values never change.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Any
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process import ProcessSpec, SpreadSpec
-from doedesign.spec.table import Table, toml_key
+from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.values import angle_text
 from doedesign.spec.variation import ProcessFile, variation_file
 from fab.files import canonical_json, sha256_bytes
@@ -49,19 +49,19 @@ def variation_to_toml(variation: Variation, comments: Sequence[str] = ()) -> str
     return _document(variation_file(variation), comments)
 
 
-def _document(table: Table, comments: Sequence[str]) -> str:
+def _document(table: SpecTable, comments: Sequence[str]) -> str:
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
     return "\n".join(lines + _table_lines(table, "")).strip() + "\n"
 
 
-def _table_lines(table: Table, path: str) -> list[str]:
+def _table_lines(table: SpecTable, path: str) -> list[str]:
     values, tables = [], []
     for name, value in table.said().items():
         key = toml_key(name)
         inner = f"{path}.{key}".removeprefix(".")
-        if isinstance(value, Table) and not value.inline:
+        if isinstance(value, SpecTable) and not value.inline:
             tables += ["", f"[{inner}]", *_table_lines(value, inner)]
-        elif isinstance(value, tuple) and value and isinstance(value[0], Table) and not value[0].inline:
+        elif isinstance(value, tuple) and value and isinstance(value[0], SpecTable) and not value[0].inline:
             for item in value:
                 tables += ["", f"[[{inner}]]", *_table_lines(item, inner)]
         elif name == "objectives":
@@ -79,7 +79,7 @@ def _text(name: str, value: Any) -> str:
         # Its parts have the unit of the error they belong to.
         parts = [f"{key} = {_text(name, part)}" for key, part in value.said().items()]
         return f"{{ {', '.join(parts)} }}" if "mean" in value.said() else _text(name, value.sigma)
-    if isinstance(value, Table):
+    if isinstance(value, SpecTable):
         return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.said().items())} }}"
     if isinstance(value, str):
         return _value_text(value)

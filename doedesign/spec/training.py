@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import Table
+from doedesign.spec.table import SpecTable
 from doedesign.spec.values import Count, Positive
 
 __all__ = ["NetworkSpec", "TrainSpec", "training_problems"]
@@ -17,7 +17,7 @@ Share = Annotated[float, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 
 
-class NetworkSpec(Table, frozen=True):
+class NetworkSpec(SpecTable, frozen=True):
     """The reconstruction network (paper section 3.3); each block can be left out, as in the ablations of Table 1.
 
     Attributes:
@@ -40,7 +40,7 @@ class NetworkSpec(Table, frozen=True):
     variant: Literal["paper", "release"] = "paper"
 
 
-class TrainSpec(Table, frozen=True):
+class TrainSpec(SpecTable, frozen=True):
     """How network and optics are trained.
 
     Attributes:

@@ -11,7 +11,7 @@
     y = "-0.3 mm"
     radius = "4 um"
 
-Keys are those of `fab.process.ERRORS` without the unit; what is not said is zero.
+Keys are those of `fab.process.DEVIATIONS` without the unit; what is not said is zero.
 """
 
 import math
@@ -20,9 +20,9 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 
 from doedesign.spec.process import ProcessSpec, quantity_of
-from doedesign.spec.table import Table, unsaid
+from doedesign.spec.table import SpecTable, unsaid
 from doedesign.spec.values import length
-from fab.process import ERRORS, Disc, Error, MaskDisc, Variation
+from fab.process import DEVIATIONS, Deviation, Disc, MaskDisc, Variation
 
 __all__ = ["ProcessFile", "VariationFile", "variation_file"]
 
@@ -30,7 +30,7 @@ Place = Annotated[float, length(-1.0, 1.0)]
 Radius = Annotated[float, length(0.0, 1.0)]
 
 
-class ProcessFile(Table, frozen=True):
+class ProcessFile(SpecTable, frozen=True):
     """A file that holds a process.
 
     Attributes:
@@ -40,17 +40,17 @@ class ProcessFile(Table, frozen=True):
     process: ProcessSpec
 
 
-def _error_type(error: Error) -> tuple[Any, Any]:
+def _error_type(error: Deviation) -> tuple[Any, Any]:
     value = quantity_of(error, 0.0 if error.one_sided else -math.inf, math.inf)
     return (tuple[value, ...], unsaid(())) if error.per_mask else (value, unsaid(0.0))
 
 
-_VALUES: dict[str, Any] = {name: _error_type(error) for name, error in ERRORS.items()}
-_Values = create_model("_Values", __base__=Table, __module__=__name__, **_VALUES)
+_VALUES: dict[str, Any] = {name: _error_type(error) for name, error in DEVIATIONS.items()}
+_Values = create_model("_Values", __base__=SpecTable, __module__=__name__, **_VALUES)
 
 
 class VariationSpec(_Values, frozen=True):
-    """The errors of one plate, under their names in `fab.process.ERRORS`.
+    """The errors of one plate, under their names in `fab.process.DEVIATIONS`.
 
     Attributes, besides these:
         repeats: how often each mask was etched more than once: -1 missed, 1 doubled.
@@ -61,7 +61,7 @@ class VariationSpec(_Values, frozen=True):
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = unsaid(0)
 
 
-class PinholeSpec(Table, frozen=True):
+class PinholeSpec(SpecTable, frozen=True):
     """A pinhole in the chrome; see `fab.process.Disc`."""
 
     x_m: Place = Field(examples=['"0.1 mm"'])
@@ -69,7 +69,7 @@ class PinholeSpec(Table, frozen=True):
     radius_m: Radius = Field(examples=['"2 um"'])
 
 
-class ParticleSpec(Table, frozen=True):
+class ParticleSpec(SpecTable, frozen=True):
     """A particle that kept one etch off a disc; see `fab.process.MaskDisc`."""
 
     mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
@@ -78,7 +78,7 @@ class ParticleSpec(Table, frozen=True):
     radius_m: Radius = Field(examples=['"4 um"'])
 
 
-class VariationFile(Table, frozen=True):
+class VariationFile(SpecTable, frozen=True):
     """A file that holds the errors of one plate.
 
     Attributes:
@@ -109,8 +109,8 @@ def variation_file(variation: Variation) -> VariationFile:
     Raises:
         ValueError: a value that is not finite, or an error below zero that never is.
     """
-    errors = {name: getattr(variation, name) for name in ERRORS}
-    plain = {name: tuple(map(float, v)) if ERRORS[name].per_mask else float(v) for name, v in errors.items()}
+    errors = {name: getattr(variation, name) for name in DEVIATIONS}
+    plain = {name: tuple(map(float, v)) if DEVIATIONS[name].per_mask else float(v) for name, v in errors.items()}
     return VariationFile.model_validate(
         {
             "variation": {**plain, "repeats": tuple(map(int, variation.repeats)), "seed": int(variation.seed)},

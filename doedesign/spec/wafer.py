@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import Table, unsaid
+from doedesign.spec.table import SpecTable, unsaid
 from doedesign.spec.values import length
 from fab.layout.wafer import Wafer
 from fab.units import MM, UM
@@ -19,7 +19,7 @@ Dies = Annotated[int, Field(strict=True, ge=1, le=1000)]
 _USUAL = Wafer()
 
 
-class WaferSpec(Table, frozen=True):
+class WaferSpec(SpecTable, frozen=True):
     """The wafer, its mask blanks, and how it is filled; see `fab.layout.wafer.Wafer`.
 
     Attributes:
@@ -47,7 +47,7 @@ class WaferSpec(Table, frozen=True):
     order_control: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.order_control)
 
 
-class WaferFile(Table, frozen=True):
+class WaferFile(SpecTable, frozen=True):
     """A file that holds a wafer.
 
     Attributes:

@@ -18,7 +18,7 @@ Reading order:
     studies       all of it behind one function
 """
 
-from doedesign.tolerancing.analysis import QUANTITIES, Table, Yield, limit_from_text, limit_text
+from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, Yield, limit_from_text, limit_text
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.sensitivity import Change, Index, Share, source_shares
 from doedesign.tolerancing.studies import Plates, Study, study
@@ -28,10 +28,10 @@ __all__ = [
     "Budget",
     "Change",
     "Index",
+    "PlateTable",
     "Plates",
     "Share",
     "Study",
-    "Table",
     "Yield",
     "limit_from_text",
     "limit_text",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing.pool import Beyond, Rows
+from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
 from fab.units import format_length, parse_length
 
@@ -45,7 +45,7 @@ _WORST = {"high": math.inf, "low": -math.inf}
 
 
 @dataclass(frozen=True)
-class Table:
+class PlateTable:
     """The numbers of some plates.
 
     Attributes:
@@ -86,14 +86,14 @@ class Table:
             beyond |= np.any(values == _WORST[QUANTITIES[name].worse], axis=1)
         return ~beyond
 
-    def of(self, keys: Sequence[str]) -> "Table":
+    def of(self, keys: Sequence[str]) -> "PlateTable":
         """The same of some of the plates."""
         positions = {key: i for i, key in enumerate(self.keys)}
         chosen = [positions[key] for key in keys]
-        return Table(tuple(keys), self.places, {name: values[chosen] for name, values in self.values.items()})
+        return PlateTable(tuple(keys), self.places, {name: values[chosen] for name, values in self.values.items()})
 
 
-def table_of(plates: Mapping[str, Rows | Beyond]) -> Table:
+def table_of(plates: Mapping[str, Rows | OutOfModel]) -> PlateTable:
     """The table of what was found of some plates.
 
     A ring:disc ratio of None, as a plate without any light in the disc has, counts as infinite.
@@ -101,14 +101,14 @@ def table_of(plates: Mapping[str, Rows | Beyond]) -> Table:
     Raises:
         ValueError: no plates with rows, or plates with different rows.
     """
-    first = next((found for found in plates.values() if not isinstance(found, Beyond)), None)
+    first = next((found for found in plates.values() if not isinstance(found, OutOfModel)), None)
     if first is None:
         raise ValueError("`plates` must hold at least one plate with rows, but there is none")
     places = tuple((str(row["colour"]), _depth(row["depth_m"])) for row in first)
     present = [name for name in QUANTITIES if any(name in row for row in first)]
     values = {name: np.full((len(plates), len(places)), np.nan) for name in present}
     for i, (key, rows) in enumerate(plates.items()):
-        if isinstance(rows, Beyond):
+        if isinstance(rows, OutOfModel):
             for name in present:
                 has = [name in row for row in first]
                 values[name][i, has] = _WORST[QUANTITIES[name].worse]
@@ -119,14 +119,14 @@ def table_of(plates: Mapping[str, Rows | Beyond]) -> Table:
             for name in present:
                 if name in row:
                     values[name][i, j] = math.inf if row[name] is None else row[name]
-    return Table(tuple(plates), places, values)
+    return PlateTable(tuple(plates), places, values)
 
 
 def _depth(depth_m: float | None) -> float:
     return math.inf if depth_m is None else float(depth_m)
 
 
-def statistics(table: Table) -> list[dict[str, Any]]:
+def statistics(table: PlateTable) -> list[dict[str, Any]]:
     """Mean, spread and percentiles of every quantity: the worst row of every plate, and every row by itself.
 
     Plates beyond what could be evaluated have no part in it.
@@ -190,7 +190,7 @@ def yield_of(good: Bool[np.ndarray, " plate"]) -> Yield:
     return Yield(count / len(good), float(interval.low), float(interval.high), count, len(good))
 
 
-def obeys(table: Table, limit: LimitSpec) -> Bool[np.ndarray, " plate"]:
+def obeys(table: PlateTable, limit: LimitSpec) -> Bool[np.ndarray, " plate"]:
     """Whether every row of a plate that a limit speaks of obeys it.
 
     Raises:
@@ -207,7 +207,7 @@ def obeys(table: Table, limit: LimitSpec) -> Bool[np.ndarray, " plate"]:
     return np.all((values >= low) & (values <= high), axis=1)
 
 
-def good_plates(table: Table, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, " plate"]:
+def good_plates(table: PlateTable, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, " plate"]:
     """Whether a plate obeys every limit; one beyond what could be evaluated does not."""
     good = table.within
     for limit in limits:
@@ -215,7 +215,7 @@ def good_plates(table: Table, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, "
     return good
 
 
-def worst_plate(table: Table, limits: Sequence[LimitSpec]) -> str:
+def worst_plate(table: PlateTable, limits: Sequence[LimitSpec]) -> str:
     """Key of the plate that is farthest beyond a limit, or nearest to one; of the lowest Strehl without limits.
 
     Plates beyond what could be evaluated are passed over.

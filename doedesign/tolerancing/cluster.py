@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from doedesign import __version__
-from doedesign.tolerancing.pool import Parcel, Work, evaluated, named, opened, packed, single_thread_settings
+from doedesign.tolerancing.pool import Work, WorkerTask, evaluated, named, opened, packed, single_thread_settings
 from fab.errors import InputError
 from fab.process import Variation
 
@@ -134,11 +134,11 @@ def _lost(address: str) -> InputError:
 # What follows runs in a worker.
 
 
-def _held(parcel: Parcel) -> Parcel:
+def _held(parcel: WorkerTask) -> WorkerTask:
     return parcel
 
 
-def _evaluate(parcel: Parcel, variation: Variation, version: str) -> Any:
+def _evaluate(parcel: WorkerTask, variation: Variation, version: str) -> Any:
     if version != __version__:
         cure = "Install the same version everywhere."
         raise InputError("worker", f"must have doedesign {version}", __version__, cure)

@@ -9,8 +9,8 @@
     sobol/overlay/5                     row 5 of the first, with one source of error taken from the second
     budget/overlay/0.5/17               draw 17, with the deviations of some errors halved
 
-Sources of error are those of `fab.process.ERRORS`, and "defects": particles, pinholes, missed and doubled etches. Which
-roughness a plate has, of all with the same statistics, belongs to the source "roughness".
+Sources of error are those of `fab.process.DEVIATIONS`, and "defects": particles, pinholes, missed and doubled etches.
+Which roughness a plate has, of all with the same statistics, belongs to the source "roughness".
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.process import ERRORS, Process, Variation
+from fab.process import DEVIATIONS, Process, Variation
 from fab.sampling import (
     corner_scores,
     draw_at,
@@ -53,13 +53,13 @@ _REACHES = (-1.0, 1.0)
 
 
 def sources_of(process: Process) -> tuple[str, ...]:
-    """Sources of error by which plates of a process differ, in the order of `ERRORS`, "defects" last."""
+    """Sources of error by which plates of a process differ, in the order of `DEVIATIONS`, "defects" last."""
     found = {source_of(name) for name in varying(process)}
     if process.expected().roughness_m > 0:
         found.add(_ROUGHNESS)  # the same statistics, another surface
     defects = process.defects
     rates = (defects.particles_per_m2, defects.pinholes_per_m2, defects.missed, defects.doubled)
-    known = dict.fromkeys(error.source for error in ERRORS.values())
+    known = dict.fromkeys(error.source for error in DEVIATIONS.values())
     return tuple(source for source in known if source in found) + ((DEFECTS,) if any(rates) else ())
 
 
@@ -116,7 +116,7 @@ def one_at_a_time_keys(process: Process) -> list[str]:
         f"one_at_a_time/{name}/{reach:+g}"
         for name in varying(process)
         for reach in _REACHES
-        if reach > 0 or process.spreads[name].mean or not ERRORS[name.partition("[")[0]].one_sided
+        if reach > 0 or process.spreads[name].mean or not DEVIATIONS[name.partition("[")[0]].one_sided
     ]
 
 

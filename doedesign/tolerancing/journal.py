@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from doedesign.runs.folder import alone_in
-from doedesign.tolerancing.pool import Beyond, Rows
+from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, read_json, write_atomic
 
@@ -34,7 +34,7 @@ class Journal:
 
     def __init__(self, folder: Path | None, study: Mapping[str, Any]) -> None:
         self.folder, self.study = folder, study
-        self.finished: dict[str, Rows | Beyond] = {}
+        self.finished: dict[str, Rows | OutOfModel] = {}
         self._file: int | None = None
 
     @contextlib.contextmanager
@@ -61,7 +61,7 @@ class Journal:
                 os.close(self._file)
                 self._file = None
 
-    def add(self, key: str, found: Rows | Beyond) -> None:
+    def add(self, key: str, found: Rows | OutOfModel) -> None:
         """Keep one plate; returns when it is on the disk. An infinite number is kept as None, for JSON has none.
 
         Raises:
@@ -101,7 +101,7 @@ class Journal:
             )
 
 
-def _read(path: Path) -> dict[str, Rows | Beyond]:
+def _read(path: Path) -> dict[str, Rows | OutOfModel]:
     """What was found by key; half a line at the end is cut off the file."""
     try:
         data = path.read_bytes()
@@ -112,7 +112,7 @@ def _read(path: Path) -> dict[str, Rows | Beyond]:
         return {}
     except OSError as error:
         raise explain_os_error(error, path) from error
-    finished: dict[str, Rows | Beyond] = {}
+    finished: dict[str, Rows | OutOfModel] = {}
     for number, line in enumerate(data[:whole].splitlines(), 1):
         try:
             key, found = _plate(json.loads(line))
@@ -124,13 +124,13 @@ def _read(path: Path) -> dict[str, Rows | Beyond]:
     return finished
 
 
-def _record(found: Rows | Beyond) -> dict[str, Any]:
-    if isinstance(found, Beyond):
+def _record(found: Rows | OutOfModel) -> dict[str, Any]:
+    if isinstance(found, OutOfModel):
         return {"beyond": found.reason}
     return {"rows": [{name: None if value == math.inf else value for name, value in row.items()} for row in found]}
 
 
-def _plate(record: dict[str, Any]) -> tuple[str, Rows | Beyond]:
+def _plate(record: dict[str, Any]) -> tuple[str, Rows | OutOfModel]:
     if "beyond" in record:
-        return record["key"], Beyond(record["beyond"])
+        return record["key"], OutOfModel(record["beyond"])
     return record["key"], [dict(row) for row in record["rows"]]

@@ -66,7 +66,7 @@ def predicted_bank(drawn: "Drawn", process: Process, variation: Variation) -> "P
     return predict(drawn, process, variation).bank
 
 
-class Beyond(NamedTuple):
+class OutOfModel(NamedTuple):
     """What is found of a plate whose errors are larger than the evaluation can describe.
 
     Attributes:
@@ -77,14 +77,14 @@ class Beyond(NamedTuple):
 
 
 def evaluated(work: Work, variation: Variation) -> Any:
-    """What is found of one plate; `Beyond` where the evaluation raises `InputError`."""
+    """What is found of one plate; `OutOfModel` where the evaluation raises `InputError`."""
     try:
         return work.evaluate(work.drawn, work.process, variation)
     except InputError as error:
-        return Beyond(f"{error.where}: {error.rule}, but got {error.got}")
+        return OutOfModel(f"{error.where}: {error.rule}, but got {error.got}")
 
 
-class Parcel(NamedTuple):
+class WorkerTask(NamedTuple):
     """Work on its way to a worker: values, and the names of what is to be imported once threads are limited.
 
     Attributes:
@@ -107,7 +107,7 @@ def path_of(thing: Callable[..., Any]) -> str:
     return f"{thing.__module__}:{thing.__qualname__}"
 
 
-def packed(work: Work) -> Parcel:
+def packed(work: Work) -> WorkerTask:
     """Work as it is sent to a worker.
 
     Raises:
@@ -119,13 +119,13 @@ def packed(work: Work) -> Parcel:
     # A read-only mapping cannot be sent.
     process = replace(work.process, spreads=dict(work.process.spreads))
     drawn = work.drawn
-    return Parcel(uuid.uuid4().hex, path_of(work.evaluate), path_of(type(drawn)), dict(vars(drawn)), process)
+    return WorkerTask(uuid.uuid4().hex, path_of(work.evaluate), path_of(type(drawn)), dict(vars(drawn)), process)
 
 
 _OPENED: dict[str, Work] = {}
 
 
-def opened(parcel: Parcel) -> Work:
+def opened(parcel: WorkerTask) -> Work:
     """The work in a parcel; kept, so that a worker opens it once."""
     if parcel.token not in _OPENED:
         work = Work(_found(parcel.evaluate), _found(parcel.design)(**parcel.fields), parcel.process)
@@ -300,10 +300,10 @@ def _sheltered_start(work: Work) -> Iterator[None]:
 
 # What follows runs in a worker.
 
-_HELD: list[Parcel] = []
+_HELD: list[WorkerTask] = []
 
 
-def _begin(parcel: Parcel, parent: Connection) -> None:
+def _begin(parcel: WorkerTask, parent: Connection) -> None:
     # What another worker is just writing cannot be read; it is then compiled here, too.
     warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
     _HELD.append(parcel)

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.tolerancing.analysis import CONFIDENCE, Table
+from doedesign.tolerancing.analysis import CONFIDENCE, PlateTable
 from doedesign.tolerancing.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
-from fab.process import ERRORS, Process
+from fab.process import DEVIATIONS, Process
 from fab.sampling import source_of, varying
 
 # What a normal deviate's absolute value varies by.
@@ -45,7 +45,7 @@ class Change(NamedTuple):
     variance: float
 
 
-def one_at_a_time(process: Process, table: Table) -> list[Change]:
+def one_at_a_time(process: Process, table: PlateTable) -> list[Change]:
     """What every error does alone.
 
     Args:
@@ -77,7 +77,7 @@ def _variance(low: float | None, expected: float, high: float) -> float:
 
 def source_shares(changes: Sequence[Change], quantity: str, colour: str | None = None) -> dict[str, float]:
     """About which share of a quantity's variance each source causes, if errors do not act together; largest first."""
-    variances = dict.fromkeys((error.source for error in ERRORS.values()), 0.0)
+    variances = dict.fromkeys((error.source for error in DEVIATIONS.values()), 0.0)
     for change in changes:
         if (change.quantity, change.colour) == (quantity, colour) and np.isfinite(change.variance):
             variances[change.source] += change.variance
@@ -112,7 +112,7 @@ class Share(NamedTuple):
     total: Index
 
 
-def sobol(process: Process, table: Table, count: int, seed: int = 0) -> list[Share]:
+def sobol(process: Process, table: PlateTable, count: int, seed: int = 0) -> list[Share]:
     """Sobol indices of every source (estimators of Saltelli et al. 2010).
 
     Args:

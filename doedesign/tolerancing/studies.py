@@ -14,7 +14,7 @@ from doedesign.runs.folder import Run, open_run
 from doedesign.runtime.progress import meter
 from doedesign.spec import LimitSpec
 from doedesign.tolerancing.analysis import (
-    Table,
+    PlateTable,
     Yield,
     good_plates,
     limit_from_text,
@@ -39,8 +39,8 @@ from doedesign.tolerancing.draws import (
 )
 from doedesign.tolerancing.journal import Journal
 from doedesign.tolerancing.pool import (
-    Beyond,
     Evaluate,
+    OutOfModel,
     Rows,
     Work,
     default_workers,
@@ -52,7 +52,7 @@ from doedesign.tolerancing.sensitivity import Change, Share, one_at_a_time, sobo
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.levels import Levels
-from fab.process import ERRORS, Process, Spread, Variation, error_names
+from fab.process import DEVIATIONS, Normal, Process, Variation, error_names
 
 if TYPE_CHECKING:
     from doedesign.prediction import Drawn
@@ -69,7 +69,7 @@ class Plates:
         limits: what a good plate obeys.
     """
 
-    table: Table
+    table: PlateTable
     limits: tuple[LimitSpec, ...]
 
     @property
@@ -166,7 +166,7 @@ class Study:
     def beyond(self, keys: Sequence[str]) -> dict[str, str]:
         """Why some of these plates could not be evaluated, by key; they count as bad plates."""
         found = ((key, self.journal.finished.get(key)) for key in keys)
-        return {key: one.reason for key, one in found if isinstance(one, Beyond)}
+        return {key: one.reason for key, one in found if isinstance(one, OutOfModel)}
 
     def _require_some(self, keys: Sequence[str]) -> None:
         beyond = self.beyond(keys)
@@ -184,7 +184,7 @@ class Study:
         work = Work(self.evaluate, self.drawn, self.process)
         with progress as shown, closing(self.run(work, plates)) as finished:  # pyright: ignore[reportArgumentType]
             for count, (key, found) in enumerate(finished):
-                if count == 0 and not isinstance(found, Beyond):
+                if count == 0 and not isinstance(found, OutOfModel):
                     # A limit that speaks of none of the plates' rows is told now, and not after all of them.
                     good_plates(table_of({key: found}), self.limits)
                 self.journal.add(key, found)
@@ -329,7 +329,7 @@ def _drawn_and_spec(design: "str | Path | Run | Drawn", masks: Path | None) -> "
 
 
 def _process(given: "str | Path | Process | None", spec: Any, drawn: "Drawn") -> Process:
-    from doedesign.build import matching, process_for, process_of
+    from doedesign.build import matching, process_for, process_from_spec
     from doedesign.spec import load_process
 
     if isinstance(given, Process):
@@ -338,7 +338,7 @@ def _process(given: "str | Path | Process | None", spec: Any, drawn: "Drawn") ->
         return process_for(drawn.levels, spec.process, None if given is None else Path(given))
     if given is None:
         return Process(drawn.levels)
-    return matching(drawn.levels, process_of(load_process(Path(given)), drawn.levels), str(given))
+    return matching(drawn.levels, process_from_spec(load_process(Path(given)), drawn.levels), str(given))
 
 
 def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
@@ -352,7 +352,7 @@ def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
     from doedesign.spec import ErrorsSpec, explain, process_from_json, spec_error
     from doedesign.spec.values import FROM_TOML
 
-    in_si = {name: value for name, value in errors.items() if name in ERRORS and ERRORS[name].unit != "1"}
+    in_si = {name: value for name, value in errors.items() if name in DEVIATIONS and DEVIATIONS[name].unit != "1"}
     as_toml = {name: value for name, value in errors.items() if name not in in_si}
     try:
         read = ErrorsSpec.model_validate(as_toml, by_alias=True, by_name=False, context=FROM_TOML)
@@ -397,7 +397,7 @@ def identity(drawn: "Drawn", process: Process, seed: int, evaluate: Evaluate) ->
     How many plates are looked at, and the limits they are judged by, are no part of it: a study may grow.
     """
     ny, nx = drawn.level.shape
-    spreads: Mapping[str, Spread] = process.spreads
+    spreads: Mapping[str, Normal] = process.spreads
     return {
         "format": FORMAT,
         "version": __version__,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from doedesign.recon.model import Model
-from doedesign.training.pairs import Pair, PairFiles, read_pair
+from doedesign.training.pairs import CapturePair, PairFiles, read_pair
 from fab.errors import InputError
 
 _LEAST_PX = 16
@@ -57,13 +57,13 @@ class Pairs:
     ) -> None:
         self.files = tuple(files)
         self._model, self._linear = model, linear
-        self._kept: dict[int, Pair] = {}
+        self._kept: dict[int, CapturePair] = {}
         self._room, self._lock = most_bytes, threading.Lock()
 
     def __len__(self) -> int:
         return len(self.files)
 
-    def get(self, index: int) -> Pair:
+    def get(self, index: int) -> CapturePair:
         """One pair.
 
         Raises:
@@ -119,14 +119,14 @@ class PairData(NamedTuple):
         capture, reference, mask = (np.stack(images) for images in zip(*crops, strict=True))
         return PairBatch(capture, reference, mask, np.array(mirrored), names, step)
 
-    def _crop(self, epoch: int, index: int) -> tuple[Pair, bool, str]:
+    def _crop(self, epoch: int, index: int) -> tuple[CapturePair, bool, str]:
         """One item: the crop, whether it is mirrored, and the name of its pair."""
         chosen = int(_turn(self.seed, epoch, len(self.pairs))[index])
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch, index)))
         place, mirror = (float(rng.uniform()), float(rng.uniform())), bool(rng.integers(2)) and self.mirrored
         crop = cut(self.pairs.get(chosen), self.shape, place)
         if mirror:
-            crop = Pair(*(image[..., ::-1] for image in crop))
+            crop = CapturePair(*(image[..., ::-1] for image in crop))
         return crop, mirror, self.pairs.files[chosen].name
 
     @contextmanager
@@ -161,7 +161,7 @@ def _turn(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch,))).permutation(count)
 
 
-def cut(pair: Pair, shape: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)) -> Pair:
+def cut(pair: CapturePair, shape: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)) -> CapturePair:
     """The same crop of everything in a pair.
 
     Args:
@@ -171,7 +171,7 @@ def cut(pair: Pair, shape: tuple[int, int], place: tuple[float, float] = (0.5, 0
     """
     spare = [have - want for have, want in zip(pair.mask.shape, shape, strict=True)]
     y, x = (min(int(share * (most + 1)), most) for share, most in zip(place, spare, strict=True))
-    return Pair(*(image[..., y : y + shape[0], x : x + shape[1]] for image in pair))
+    return CapturePair(*(image[..., y : y + shape[0], x : x + shape[1]] for image in pair))
 
 
 def crop_shape(least: tuple[int, int], size: int, multiple: int, where: str) -> tuple[int, int]:

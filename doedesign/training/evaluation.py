@@ -9,10 +9,10 @@ from jaxtyping import Float
 from doedesign.report.training import ValidationRow
 from doedesign.training.perceptual import Lpips
 from doedesign.training.scores import Scores, scores
-from doedesign.training.validation import Look
+from doedesign.training.validation import ValidationSample
 
 
-class Found(NamedTuple):
+class EvaluationResult(NamedTuple):
     """What a look at held-out scenes found.
 
     Attributes:
@@ -28,11 +28,11 @@ class Found(NamedTuple):
 
 
 def judge(
-    looks: Iterable[Look],
+    looks: Iterable[ValidationSample],
     lpips: Lpips | None,
     to_rgb: Callable[[Float[np.ndarray, "c y x"]], Float[np.ndarray, "3 y x"]],
     most_rows: int = 4,
-) -> Found:
+) -> EvaluationResult:
     """Judge the pictures of scenes.
 
     Args:
@@ -59,7 +59,7 @@ def judge(
         }
         for kind, of_kind in found[0].items()
     }
-    return Found(means, scenes, rows)
+    return EvaluationResult(means, scenes, rows)
 
 
 def _told(found: Scores) -> dict[str, dict[str, float | None]]:

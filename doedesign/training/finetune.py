@@ -15,17 +15,17 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from doedesign.recon.model import Psfs
+from doedesign.recon.model import ModelPsfs
 from doedesign.recon.network import Network
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec.training import TrainSpec
 from doedesign.training.crops import PairBatch
-from doedesign.training.joint import Record, rates_at
+from doedesign.training.joint import TrainingRecord, rates_at
 from doedesign.training.loss import TERMS, Weights, losses
 from fab.errors import InputError
 
 
-class State(NamedTuple):
+class FinetuneState(NamedTuple):
     """Everything a step changes.
 
     Attributes:
@@ -55,7 +55,7 @@ class Tuner(eqx.Module):
     options: TrainSpec = eqx.field(static=True)
 
     @classmethod
-    def of(cls, psfs: Psfs, options: TrainSpec, perceptual: Any = None) -> "Tuner":
+    def of(cls, psfs: ModelPsfs, options: TrainSpec, perceptual: Any = None) -> "Tuner":
         """Prepare fine-tuning.
 
         Args:
@@ -65,15 +65,15 @@ class Tuner(eqx.Module):
         """
         return cls(jnp.asarray(psfs.far), jnp.asarray(psfs.near), perceptual, options)
 
-    def initial(self, network: Network) -> State:
+    def initial(self, network: Network) -> FinetuneState:
         """The state before the first step."""
-        return State(0, network, optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array)))
+        return FinetuneState(0, network, optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array)))
 
     def rate(self, step: int) -> float:
         """Step size of Adam."""
         return rates_at(self.options, step).network
 
-    def step(self, state: State, batch: PairBatch) -> tuple[State, Record]:
+    def step(self, state: FinetuneState, batch: PairBatch) -> tuple[FinetuneState, TrainingRecord]:
         """Take one step.
 
         Args:
@@ -86,13 +86,13 @@ class Tuner(eqx.Module):
         given = Given(*(jnp.asarray(each) for each in batch[:4]))
         constants = self, given, jnp.float32(self.rate(state.step))
         (network, moments), loss, terms = _update()(constants, (state.network, state.moments))
-        record = Record(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
+        record = TrainingRecord(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
         if not np.isfinite(record.loss):
             rule, cure = "the loss must stay finite", "Lower --learning-rate."
             raise InputError(f"finetune, step {state.step}", rule, record.loss, cure)
-        return State(state.step + 1, network, moments), record
+        return FinetuneState(state.step + 1, network, moments), record
 
-    def reconstruct(self, state: State, capture: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "c y x"]:
+    def reconstruct(self, state: FinetuneState, capture: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "c y x"]:
         """One capture through the network, in display values."""
         return np.asarray(_look(state.network, self.far[None], self.near[None], jnp.asarray(capture)[None]))[0]
 

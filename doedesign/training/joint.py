@@ -22,28 +22,37 @@ import optax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Key
 
-from doedesign.build import camera_of, process_of
-from doedesign.capture.from_spec import outside_of, seen_in, sensor_of
-from doedesign.capture.scenes import Batch
+from doedesign.build import camera_from_spec, process_from_spec
+from doedesign.capture.from_spec import channels_from_rgb, outside_from_kind, sensor_from_spec
+from doedesign.capture.scenes import SceneBatch
 from doedesign.capture.simulate import depth_range_m, shadow_window
 from doedesign.design.optimize import Free
 from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import plans_of
-from doedesign.recon.network import Layout, Network
+from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
 from doedesign.spec.training import TrainSpec
 from doedesign.tolerancing.draws import variation_at
 from doedesign.training.hosts import on_all, own_copy, parts_of
 from doedesign.training.loss import TERMS, Weights, losses
-from doedesign.training.optics import Bench, LivePlate, Plate, RingPlate, Seen, Shot, StoredPlate, shots
+from doedesign.training.optics import (
+    Capture,
+    CaptureModel,
+    LivePlate,
+    Plate,
+    RingPlate,
+    StoredPlate,
+    TrainingScene,
+    shots,
+)
 from fab.errors import InputError
 from fab.levels import height_of
 from fab.process import Process
 from sim.camera import Camera
 from sim.imaging.occlusion import Model
 from sim.light import srgb_from_linear
-from sim.obstruction import Kind
+from sim.obstruction import ObstructionKind
 from sim.psf_bank import psf_bank
 from sim.surface import as_fabricated
 
@@ -54,13 +63,14 @@ _SALT_NOISE, _SALT_FIELD, _SALT_LOOK = 1, 2, 3
 _NEAR_DEPTHS, _FAR_DEPTHS = 24, 3
 
 
-class State(NamedTuple):
+class JointState(NamedTuple):
     """Everything a step changes.
 
     Attributes:
         step: number of steps done.
         network: the network.
-        free: what is learnt of the plate (`doedesign.design.optimize.State.free`); None for a plate at rest.
+        free: what is learnt of the plate (`doedesign.design.optimize.OptimizationState.free`); None for a plate at
+            rest.
         network_moments: Adam's moments.
         optics_moments: Adam's moments; None for a plate at rest.
     """
@@ -72,7 +82,7 @@ class State(NamedTuple):
     optics_moments: optax.OptState | None
 
 
-class Record(NamedTuple):
+class TrainingRecord(NamedTuple):
     """One line of the history: the loss of a step before its update.
 
     Attributes:
@@ -108,7 +118,7 @@ class Trainer(eqx.Module):
 
     plate: Plate
     perceptual: Any
-    bench: Bench = eqx.field(static=True)
+    bench: CaptureModel = eqx.field(static=True)
     weights: Weights = eqx.field(static=True)
     process: Process | None = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
@@ -121,7 +131,7 @@ class Trainer(eqx.Module):
         files: Mapping[str, Path],
         source: str,
         model: Model,
-        kind: Kind,
+        kind: ObstructionKind,
         height_m: Float[np.ndarray, "y x"],
         *,
         perceptual: Any = None,
@@ -144,25 +154,25 @@ class Trainer(eqx.Module):
                 the devices do not divide.
         """
         train = spec.train
-        sensor = sensor_of(spec)
+        sensor = sensor_from_spec(spec)
         if sensor.pattern is not None:
             rule = "must be left out for training: demosaicing has no gradient"
             raise InputError(f"{source}: sensor.bayer", rule, f'"{sensor.pattern}"', "Train on pixels of all colours.")
         if mesh is not None and train.batch % mesh.size:
             rule = f"must be a multiple of the {mesh.size} devices"
             raise InputError(f"{source}: train.batch", rule, train.batch, "Change it, or take fewer devices.")
-        camera = replace(camera_of(spec), window=spec.sensor.window | 1)
+        camera = replace(camera_from_spec(spec), window=spec.sensor.window | 1)
         if train.camera == "conventional":
             height_m = np.zeros(camera.grid.shape, np.float32)
         alive = train.moves_optics or train.fabricated or train.field == "random"
         plate = _live_plate(spec, files, source, camera) if alive else resting_plate(spec, camera, kind, height_m)
-        bench = Bench(camera, model, outside_of(kind), sensor, shadow_window(kind, camera))
+        bench = CaptureModel(camera, model, outside_from_kind(kind), sensor, shadow_window(kind, camera))
         weights = Weights(train.l1, train.perceptual, train.masked)
-        process = process_of(spec.process) if train.fabricated else None
+        process = process_from_spec(spec.process) if train.fabricated else None
         plate = plate if mesh is None else on_all(plate, mesh)
         return cls(plate, perceptual, bench, weights, process, spec, mesh)
 
-    def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> State:
+    def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> JointState:
         """The state before the first step.
 
         Args:
@@ -178,11 +188,11 @@ class Trainer(eqx.Module):
         if not isinstance(self.plate, StoredPlate):
             free = jnp.asarray(self.plate.staircase.radians_of(height_m))
             optics_moments = adam.init(free) if self.spec.train.moves_optics else None
-        state = State(0, network, free, moments, optics_moments)
+        state = JointState(0, network, free, moments, optics_moments)
         # Where the step will leave it: otherwise the second step would be compiled anew.
         return state if self.mesh is None else on_all(state, self.mesh)
 
-    def step(self, state: State, batch: Batch) -> tuple[State, Record]:
+    def step(self, state: JointState, batch: SceneBatch) -> tuple[JointState, TrainingRecord]:
         """Take one step.
 
         Args:
@@ -204,13 +214,13 @@ class Trainer(eqx.Module):
         moments = (state.network_moments, state.optics_moments)
         constants = trainer, seen, keys, softness, jnp.asarray(rates, jnp.float32), moves
         (network, free), moments, loss, terms = _update()(constants, (learnt, moments))
-        record = Record(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
+        record = TrainingRecord(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
         if not np.isfinite(record.loss):
             cure = "Lower train.learning_rate or train.optics_learning_rate."
             raise InputError(f"train, step {state.step}", "the loss must stay finite", record.loss, cure)
-        return State(state.step + 1, network, free, *moments), record
+        return JointState(state.step + 1, network, free, *moments), record
 
-    def reconstruct(self, state: State, batch: Batch) -> tuple[Shot, Float[Array, "b c y x"]]:
+    def reconstruct(self, state: JointState, batch: SceneBatch) -> tuple[Capture, Float[Array, "b c y x"]]:
         """Photograph and reconstruct scenes on one device, on the axis and without errors of a process.
 
         Returns:
@@ -222,7 +232,9 @@ class Trainer(eqx.Module):
             network, free, trainer = own_copy((network, free, trainer))
         return _look(network, free, trainer, seen, keys)
 
-    def _seen(self, batch: Batch, seed: int, off_axis: bool, *, part: bool = False) -> tuple[Seen, Key[Array, " b"]]:
+    def _seen(
+        self, batch: SceneBatch, seed: int, off_axis: bool, *, part: bool = False
+    ) -> tuple[TrainingScene, Key[Array, " b"]]:
         """A batch, or this host's part of one, as the compiled step takes it, with a key of noise for every scene."""
         camera, count = self.bench.camera, len(batch.names)
         # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
@@ -232,14 +244,14 @@ class Trainer(eqx.Module):
         for k in range(count):
             angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
             near, far = float(batch.depth_m[k]), float(batch.background_depth_m[k])
-            light = [seen_in(np.asarray(rgb), camera) for rgb in (batch.background[k], batch.radiance[k])]
+            light = [channels_from_rgb(np.asarray(rgb), camera) for rgb in (batch.background[k], batch.radiance[k])]
             sources = [self.plate.source(depth, angles) for depth in (far, near)]
-            items.append(Seen(light[0], batch.mask[k], light[1], np.float32(near), np.float32(far), *sources))
-        seen: Seen = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
+            items.append(TrainingScene(light[0], batch.mask[k], light[1], np.float32(near), np.float32(far), *sources))
+        seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
         root = jax.random.key(seed + (_SALT_NOISE << 32))
         return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + count))
 
-    def _with_errors(self, state: State, step: int) -> "Trainer":
+    def _with_errors(self, state: JointState, step: int) -> "Trainer":
         """The same with a plate that has this step's errors, where the process makes any."""
         if self.process is None or not isinstance(self.plate, LivePlate):
             return self
@@ -264,10 +276,10 @@ def _error_of(transmission: Array, height_m: Array, rate: Array | float) -> Arra
     return transmission * jnp.exp(-2j * np.pi * height_m * rate)
 
 
-def layout_of(spec: Spec, colours: int) -> Layout:
+def layout_of(spec: Spec, colours: int) -> NetworkShape:
     """Shape of a spec's network."""
     given = spec.network
-    return Layout(
+    return NetworkShape(
         colours,
         given.width,
         given.depth,
@@ -326,13 +338,13 @@ def _odd_window(spec: Spec) -> Any:
     return spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
 
 
-def resting_plate(spec: Spec, camera: Camera, kind: Kind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
+def resting_plate(spec: Spec, camera: Camera, kind: ObstructionKind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
     """A plate that stays as it is, by exact PSFs over all depths that scenes may have."""
     bank = psf_bank(camera, height_m, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
     return StoredPlate.of(bank)
 
 
-def resting_depths_m(spec: Spec, kind: Kind) -> tuple[float, ...]:
+def resting_depths_m(spec: Spec, kind: ObstructionKind) -> tuple[float, ...]:
     """Depths at which a plate at rest is computed: those of the obstruction, and those of the background."""
     least, most = depth_range_m(kind)
     near = 1 / np.linspace(1 / most, 1 / least, _NEAR_DEPTHS)
@@ -353,7 +365,9 @@ def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
 Learnt = tuple[Network, Any]
 
 
-def _loss(moving: Any, still: Any, trainer: Trainer, seen: Seen, keys: Array, softness: Array) -> tuple[Array, Array]:
+def _loss(
+    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array
+) -> tuple[Array, Array]:
     network, free = eqx.combine(moving, still)
     train = trainer.spec.train
     found = shots(seen, trainer.plate, free, softness, trainer.bench, keys)
@@ -369,7 +383,7 @@ def _loss(moving: Any, still: Any, trainer: Trainer, seen: Seen, keys: Array, so
 
 
 def _slopes(
-    moving: Any, still: Any, trainer: Trainer, seen: Seen, keys: Array, softness: Array
+    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array
 ) -> tuple[tuple[Array, Array], Any]:
     return eqx.filter_value_and_grad(_loss, has_aux=True)(moving, still, trainer, seen, keys, softness)
 
@@ -381,11 +395,11 @@ def _averaged(trainer: Trainer) -> Callable[..., Any]:
     here, shared = PartitionSpec(AXIS), PartitionSpec()
     arrays, rest = eqx.partition(trainer, eqx.is_array)
 
-    def local(moving: Any, still: Any, arrays: Any, seen: Seen, keys: Array, softness: Array) -> Any:
+    def local(moving: Any, still: Any, arrays: Any, seen: TrainingScene, keys: Array, softness: Array) -> Any:
         found = _slopes(moving, still, eqx.combine(arrays, rest), seen, keys, softness)
         return jax.tree.map(lambda leaf: jax.lax.pmean(leaf, AXIS), found)
 
-    def whole(moving: Any, still: Any, _: Trainer, seen: Seen, keys: Array, softness: Array) -> Any:
+    def whole(moving: Any, still: Any, _: Trainer, seen: TrainingScene, keys: Array, softness: Array) -> Any:
         solid, hollow = eqx.partition(still, eqx.is_array)
         call = jax.shard_map(
             lambda m, s, a, x, k, f: local(m, eqx.combine(s, hollow), a, x, k, f),
@@ -399,7 +413,7 @@ def _averaged(trainer: Trainer) -> Callable[..., Any]:
     return whole
 
 
-Constants = tuple[Trainer, Seen, Array, Array, Array, tuple[bool, bool]]
+Constants = tuple[Trainer, TrainingScene, Array, Array, Array, tuple[bool, bool]]
 
 
 def _take(constants: Constants, changing: tuple[Learnt, tuple[Any, Any]]) -> Any:
@@ -432,6 +446,6 @@ def _update() -> Callable[[Constants, tuple[Learnt, tuple[Any, Any]]], Any]:
 
 
 @eqx.filter_jit
-def _look(network: Network, free: Any, trainer: Trainer, seen: Seen, keys: Array) -> tuple[Shot, Array]:
+def _look(network: Network, free: Any, trainer: Trainer, seen: TrainingScene, keys: Array) -> tuple[Capture, Array]:
     found = shots(seen, trainer.plate, free, jnp.float32(0.0), trainer.bench, keys)
     return found, network(found.capture, found.far, found.near)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from doedesign.runs.folder import CHECKPOINT
 from doedesign.runtime.progress import meter
-from doedesign.runtime.stopping import Stop
+from doedesign.runtime.stopping import StopRequest
 from doedesign.spec.training import TrainSpec
 from doedesign.training.checkpoint import read_checkpoint
 from doedesign.training.history import HISTORY_NAME, open_board, open_history, read_history
@@ -25,7 +25,7 @@ Say = Callable[[str], None]
 
 
 @runtime_checkable
-class Numbered(Protocol):
+class HasStep(Protocol):
     """A state that knows how many steps were done."""
 
     @property
@@ -34,10 +34,10 @@ class Numbered(Protocol):
         ...
 
 
-_State = TypeVar("_State", bound=Numbered)
+_State = TypeVar("_State", bound=HasStep)
 
 
-class Claim(NamedTuple):
+class FolderLock(NamedTuple):
     """Whose a folder is.
 
     Attributes:
@@ -55,7 +55,7 @@ class Claim(NamedTuple):
     first: tuple[str, ...]
 
 
-def is_done(folder: Path, claim: Claim) -> bool:
+def is_done(folder: Path, claim: FolderLock) -> bool:
     """Whether what the folder is claimed for is finished; clear away what a killed one was writing.
 
     Raises:
@@ -129,7 +129,7 @@ def resumed(folder: Path, start: _State, owner: str, say: Say) -> _State:
     return state
 
 
-class Pace(NamedTuple):
+class Schedule(NamedTuple):
     """How many steps to take, and after how many of them to do what.
 
     Attributes:
@@ -143,7 +143,7 @@ class Pace(NamedTuple):
     checkpoint_every: int
 
 
-class Doings(NamedTuple):
+class Callbacks(NamedTuple):
     """What a training does while it runs.
 
     Attributes:
@@ -161,11 +161,11 @@ def take_steps(
     folder: Path,
     state: _State,
     batches: AbstractContextManager[Iterator[Any]],
-    doings: Doings,
-    pace: Pace,
+    doings: Callbacks,
+    pace: Schedule,
     *,
     title: str,
-    stop: Stop,
+    stop: StopRequest,
     say: Say,
     leads: bool = True,
     board: bool = False,

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Key
 
 from doedesign.design.optimize import Free
-from doedesign.design.parametrize import Staircase
-from doedesign.design.problem import Line
+from doedesign.design.parametrize import LevelParametrization
+from doedesign.design.problem import WavelengthPlan
 from sim.camera import Camera
 from sim.imaging.formation import Optics, capture
 from sim.imaging.occlusion import Model, Outside
@@ -42,10 +42,10 @@ class LivePlate(eqx.Module):
         wavelengths_m: of the lines.
     """
 
-    lines: tuple[Line, ...]
+    lines: tuple[WavelengthPlan, ...]
     coverage: Float[Array, "y x"]
     errors: Complex[Array, "line y x"] | None
-    staircase: Staircase = eqx.field(static=True)
+    staircase: LevelParametrization = eqx.field(static=True)
     camera: Camera = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
 
@@ -59,7 +59,7 @@ class LivePlate(eqx.Module):
         grid = self.camera.grid
         y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in ("y", "x"))
 
-        def energy(number: int, line: Line) -> Array:
+        def energy(number: int, line: WavelengthPlan) -> Array:
             errors = None if self.errors is None else self.errors[number]
             rows = SourceRows(height, self.coverage, y_m, jnp.asarray(source.waves_y)[number], errors)
             columns = SourceColumns(
@@ -79,8 +79,8 @@ class LivePlate(eqx.Module):
 class RingPlate(eqx.Module):
     """A profile of rings; see `LivePlate`. Sources lie on the axis."""
 
-    lines: tuple[Line, ...]
-    staircase: Staircase = eqx.field(static=True)
+    lines: tuple[WavelengthPlan, ...]
+    staircase: LevelParametrization = eqx.field(static=True)
     camera: Camera = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
 
@@ -137,21 +137,21 @@ class StoredPlate(eqx.Module):
 Plate = LivePlate | RingPlate | StoredPlate
 
 
-def _height_m(staircase: Staircase, free: Free, softness: Array) -> Array:
+def _height_m(staircase: LevelParametrization, free: Free, softness: Array) -> Array:
     if isinstance(free, tuple):
         radians, stretch = free
         return staircase.height_m(radians, softness, staircase.depths_m(stretch))
     return staircase.height_m(free, softness)
 
 
-def _by_colour(lines: tuple[Line, ...], images: list[Array]) -> Array:
+def _by_colour(lines: tuple[WavelengthPlan, ...], images: list[Array]) -> Array:
     """Sum the lines of every colour."""
     count = 1 + max(line.colour for line in lines)
     colours = [[image for line, image in zip(lines, images, strict=True) if line.colour == c] for c in range(count)]
     return jnp.stack([sum(parts[1:], start=parts[0]) for parts in colours])
 
 
-class Bench(NamedTuple):
+class CaptureModel(NamedTuple):
     """What is the same in every scene, but for the plate.
 
     Attributes:
@@ -169,8 +169,8 @@ class Bench(NamedTuple):
     shadow_px: int
 
 
-class Seen(NamedTuple):
-    """One scene as the training sees it; see `doedesign.capture.scenes.Item`. Colours are the camera's.
+class TrainingScene(NamedTuple):
+    """One scene as the training sees it; see `doedesign.capture.scenes.SceneItem`. Colours are the camera's.
 
     Attributes:
         background: `[c, y, x]` linear light.
@@ -191,7 +191,7 @@ class Seen(NamedTuple):
     near: Any
 
 
-class Shot(NamedTuple):
+class Capture(NamedTuple):
     """A developed capture and the PSFs behind it.
 
     Attributes:
@@ -205,7 +205,9 @@ class Shot(NamedTuple):
     near: Float[Array, "c y x"]
 
 
-def shot(seen: Seen, plate: Plate, free: Free | None, softness: Array, bench: Bench, key: Key[Array, ""]) -> Shot:
+def shot(
+    seen: TrainingScene, plate: Plate, free: Free | None, softness: Array, bench: CaptureModel, key: Key[Array, ""]
+) -> Capture:
     """Photograph a scene through a plate.
 
     Args:
@@ -225,10 +227,12 @@ def shot(seen: Seen, plate: Plate, free: Free | None, softness: Array, bench: Be
     near_m, far_m = (jnp.asarray(depth) for depth in (seen.depth_m, seen.background_depth_m))
     scene = Scene(seen.background, far_m, (Obstruction(seen.mask, seen.radiance, near_m),))
     light = capture(scene, optics, bench.model, outside=bench.outside)
-    return Shot(developed(expose(light, bench.sensor, key), bench.sensor), far, near)
+    return Capture(developed(expose(light, bench.sensor, key), bench.sensor), far, near)
 
 
-def shots(seen: Seen, plate: Plate, free: Free | None, softness: Array, bench: Bench, keys: Key[Array, " b"]) -> Shot:
+def shots(
+    seen: TrainingScene, plate: Plate, free: Free | None, softness: Array, bench: CaptureModel, keys: Key[Array, " b"]
+) -> Capture:
     """Photograph a batch, one scene after the other: every array of `seen`, and `keys`, has a first axis for it."""
     if len(keys) == 1:
         one = shot(jax.tree.map(lambda leaf: leaf[0], seen), plate, free, softness, bench, keys[0])

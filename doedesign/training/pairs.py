@@ -43,7 +43,7 @@ class PairFiles(NamedTuple):
     mask: Path | None
 
 
-class Pair(NamedTuple):
+class CapturePair(NamedTuple):
     """One pair, in the network's colours.
 
     Attributes:
@@ -152,7 +152,7 @@ def pairs_digest(pairs: Sequence[PairFiles]) -> str:
     return sha256_bytes(canonical_json([_digests(pair) for pair in pairs]))
 
 
-def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Pair:
+def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> CapturePair:
     """Read one pair.
 
     Args:
@@ -173,7 +173,7 @@ def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Pai
         if image.shape[-2:] != capture.shape[1:]:
             rule = f"must have the {_size(capture)} pixels of {files.capture.name}"
             raise InputError(str(path), rule, _size(image), "Cut both to the same frame.")
-    return Pair(capture, srgb_from_linear(reference).astype(np.float32), mask)
+    return CapturePair(capture, srgb_from_linear(reference).astype(np.float32), mask)
 
 
 def _size(image: np.ndarray) -> str:

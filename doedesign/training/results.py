@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.capture.from_spec import shown_as
-from doedesign.capture.scenes import Batch, SceneData
+from doedesign.capture.from_spec import rgb_from_channels
+from doedesign.capture.scenes import SceneBatch, SceneData
 from doedesign.capture.simulate import depth_range_m
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import read_any_height
-from doedesign.training.evaluation import Found, judge
-from doedesign.training.joint import State, Trainer, resting_plate
+from doedesign.training.evaluation import EvaluationResult, judge
+from doedesign.training.joint import JointState, Trainer, resting_plate
 from doedesign.training.optics import RingPlate, StoredPlate
 from doedesign.training.perceptual import Lpips
 from doedesign.training.validation import looks
@@ -26,7 +26,7 @@ from fab.files import canonical_json, write_atomic
 from fab.levels import height_of
 from sim.camera import Camera
 from sim.light import srgb_from_linear
-from sim.obstruction import Kind
+from sim.obstruction import ObstructionKind
 from sim.propagation.hankel import radial_profile, revolve, ring_count
 from sim.psf_bank import psf_bank
 from sim.store import write_bank, write_height
@@ -47,8 +47,8 @@ class HeldOut(NamedTuple):
 
 
 def validate(
-    trainer: Trainer, state: State, held_out: HeldOut, most_rows: int = 4, *, baselines: bool = False
-) -> Found:
+    trainer: Trainer, state: JointState, held_out: HeldOut, most_rows: int = 4, *, baselines: bool = False
+) -> EvaluationResult:
     """Look at held-out scenes with the network as it is now.
 
     Args:
@@ -61,10 +61,10 @@ def validate(
     camera = trainer.bench.camera
     trainer, state = _at_rest(trainer, state, held_out.data.kind)
     seen = looks(held_out.data, held_out.scenes, camera, lambda batch: _shown(trainer, state, batch, baselines))
-    return judge(seen, held_out.lpips, lambda image: shown_as(image, camera), most_rows)
+    return judge(seen, held_out.lpips, lambda image: rgb_from_channels(image, camera), most_rows)
 
 
-def _at_rest(trainer: Trainer, state: State, kind: Kind) -> tuple[Trainer, State]:
+def _at_rest(trainer: Trainer, state: JointState, kind: ObstructionKind) -> tuple[Trainer, JointState]:
     """The same with the plate that is to be drawn, and its exact PSFs.
 
     Within a step PSFs are estimates: samples may be sparse, and a near source lights the cells obliquely, which plans
@@ -76,7 +76,9 @@ def _at_rest(trainer: Trainer, state: State, kind: Kind) -> tuple[Trainer, State
     return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
 
 
-def _shown(trainer: Trainer, state: State, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
+def _shown(
+    trainer: Trainer, state: JointState, batch: SceneBatch, baselines: bool
+) -> dict[str, Float[np.ndarray, "c y x"]]:
     """What the camera records of a scene, and what the network and others make of it, in display values."""
     shot, picture = trainer.reconstruct(state, batch)
     light, far, near = (np.asarray(image, np.float32)[0] for image in shot)
@@ -127,14 +129,14 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
     return profile[: ring_count(camera)]
 
 
-def plate_after(run: Run, trainer: Trainer, state: State) -> PlateMaps:
+def plate_after(run: Run, trainer: Trainer, state: JointState) -> PlateMaps:
     """The plate of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
     if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
         return PlateMaps(height_at_rest_m(run, trainer.bench.camera), None)
     return _maps_of(trainer, state)
 
 
-def _maps_of(trainer: Trainer, state: State) -> PlateMaps:
+def _maps_of(trainer: Trainer, state: JointState) -> PlateMaps:
     """What parameters make."""
     plate = trainer.plate
     assert not isinstance(plate, StoredPlate)  # which has none
@@ -150,7 +152,13 @@ def _maps_of(trainer: Trainer, state: State) -> PlateMaps:
 
 
 def write_results(
-    folder: Path, run: Run, trainer: Trainer, state: State, held_out: HeldOut, kind: Kind, about: Mapping[str, Any]
+    folder: Path,
+    run: Run,
+    trainer: Trainer,
+    state: JointState,
+    held_out: HeldOut,
+    kind: ObstructionKind,
+    about: Mapping[str, Any],
 ) -> list[str]:
     """Write network, plate, PSFs and scores.
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.capture.from_spec import seen_in
+from doedesign.capture.from_spec import channels_from_rgb
 from doedesign.capture.images import picture_files
-from doedesign.capture.scenes import Batch, SceneData
+from doedesign.capture.scenes import SceneBatch, SceneData
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file
 from sim.camera import Camera
@@ -75,7 +75,7 @@ def _without(files: Sequence[Path], held_out: Sequence[Path]) -> tuple[Path, ...
         raise explain_os_error(error, str(error.filename)) from error
 
 
-class Look(NamedTuple):
+class ValidationSample(NamedTuple):
     """One held-out scene, in the camera's colours and display values, 0 to 1.
 
     Attributes:
@@ -91,10 +91,10 @@ class Look(NamedTuple):
     mask: Float[np.ndarray, "y x"]
 
 
-Show = Callable[[Batch], Mapping[str, Float[np.ndarray, "c y x"]]]
+Show = Callable[[SceneBatch], Mapping[str, Float[np.ndarray, "c y x"]]]
 
 
-def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[Look]:
+def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[ValidationSample]:
     """Look at held-out scenes one by one.
 
     Args:
@@ -106,5 +106,5 @@ def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[L
     with data.batches(stop=count) as batches:
         for batch in batches:
             shown = {name: np.clip(image, 0, 1) for name, image in show(batch).items()}
-            scene = srgb_from_linear(seen_in(batch.background[0], camera))
-            yield Look(batch.names[0], shown, scene, batch.mask[0])
+            scene = srgb_from_linear(channels_from_rgb(batch.background[0], camera))
+            yield ValidationSample(batch.names[0], shown, scene, batch.mask[0])

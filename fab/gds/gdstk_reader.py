@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.units import NM, UM
 
-__all__ = ["Again", "Reading"]
+__all__ = ["GdstkReader", "LayerReading"]
 
 # The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
 _MOST_AT_ONCE = 2_200_000
@@ -31,7 +31,7 @@ _BATCH = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class LayerReading:
     """One layer as the other library sees it.
 
     Attributes:
@@ -88,12 +88,12 @@ class _Counter:
         for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
             np.add.at(self.steps, rows * width + columns, np.int32(step))
 
-    def reading(self) -> Reading:
+    def reading(self) -> LayerReading:
         """Sum the steps up, in place."""
         winding = self.steps.reshape(self.edges.y.size, self.edges.x.size)
         np.add.accumulate(winding, axis=0, out=winding)
         np.add.accumulate(winding, axis=1, out=winding)
-        return Reading(self.cell, self.layer, winding[:-1, :-1], self.strays, self.polygons)
+        return LayerReading(self.cell, self.layer, winding[:-1, :-1], self.strays, self.polygons)
 
 
 class _Collector(_Counter):
@@ -112,12 +112,12 @@ class _Collector(_Counter):
         self.boxes.append(np.concatenate([low, high], axis=1)[upright].astype(np.int32))
         self.polygons.extend(points[~upright])
 
-    def reading(self) -> Reading:
+    def reading(self) -> LayerReading:
         """Put everything together."""
         rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
         nothing = np.zeros((0, 0), dtype=np.int32)
         shapes = Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons))
-        return Reading(self.cell, self.layer, nothing, 0, self.polygons, shapes)
+        return LayerReading(self.cell, self.layer, nothing, 0, self.polygons, shapes)
 
 
 def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
@@ -203,7 +203,7 @@ def _sorted_out(polygons: list[NDArray[np.int64]]) -> Shapes:
     return Shapes(rects.astype(np.int32), tuple(points.astype(np.int32) for points in others))
 
 
-class Again:
+class GdstkReader:
     """A mask file of some cells, read by gdstk.
 
     The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
@@ -225,7 +225,7 @@ class Again:
         """The cells around the DOE."""
         return self._around.cells()
 
-    def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[Reading]:
+    def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[LayerReading]:
         """Read a GDSII file, few enough shapes at a time to bound the memory.
 
         Args:
@@ -247,7 +247,7 @@ class Again:
             rest = []
             yield from self._taken(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
 
-    def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[Reading]:
+    def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[LayerReading]:
         """Read an OASIS file, known to be whole, and unfold its repetitions.
 
         Args:
@@ -259,7 +259,7 @@ class Again:
         """
         yield from self._taken(gdstk.read_oas(str(path), unit=UM), list(layers))
 
-    def _taken(self, library: Any, group: list[Layer]) -> Iterator[Reading]:
+    def _taken(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:
         if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:
             units = [f"{value / NM:.9g} nm" for value in (library.precision, self.edges.dbu_m)]
             self.problems.append(f"the database unit is {units[0]} instead of {units[1]}")

@@ -18,7 +18,7 @@ from fab.errors import InputError
 from fab.layout.geometry import Cell, Layer, Reference, Shapes
 from fab.layout.lettering import label_block, mask_label, written
 from fab.layout.marks import alignment_site, die_marks
-from fab.layout.part import Part, Plate, centred, joined, moved, prefixed, row
+from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, row
 from fab.layout.split import Split
 from fab.layout.structures import process_monitor
 from fab.layout.wafer import READING, Wafer
@@ -64,7 +64,7 @@ class Frame(NamedTuple):
 
 def draw_frame(
     wafer: Wafer,
-    plates: Sequence[Plate],
+    plates: Sequence[Photomask],
     levels: Levels,
     *,
     splits: Sequence[Split],
@@ -140,7 +140,7 @@ def draw_frame(
     return Frame((*die_cells, *small, wafer_cell, top), places, raster, dies, drawn, pitch)
 
 
-def _titled(marks: Part, split: Split, plate: Plate) -> Part:
+def _titled(marks: Part, split: Split, plate: Photomask) -> Part:
     """Add what is special about a die above its DOE, where the marks are below."""
     if not split.lettering:
         return marks
@@ -240,7 +240,7 @@ def _beside(
     return round(site_m / MM, 1) * MM, monitor_m
 
 
-def _labels(plates: Sequence[Plate], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
+def _labels(plates: Sequence[Photomask], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
     """Labels of all masks side by side, above the wafer on the blank; each mask carries its own."""
     blocks = [label_block([(p, mask_label(stem, p, READING, digest))], _LETTERS_M, dbu_m) for p in plates]
     labels = centred(row(blocks, 4 * _LETTERS_M))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.layout.geometry import Shapes
-from fab.layout.part import Part, Plate, column, joined, moved
+from fab.layout.part import Part, Photomask, column, joined, moved
 from fab.layout.polygons import rectangles
 from fab.units import UM, format_length
 
@@ -111,7 +111,7 @@ def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
     return Shapes(letter_boxes(text) * np.int32(stroke))
 
 
-def mask_label(job: str, plate: Plate, reading: str, digest: str) -> list[str]:
+def mask_label(job: str, plate: Photomask, reading: str, digest: str) -> list[str]:
     """Return what is written on a mask.
 
     Args:
@@ -132,7 +132,7 @@ def mask_label(job: str, plate: Plate, reading: str, digest: str) -> list[str]:
     return [line.upper() for line in (job, what, tone, reading, f"hash {digest[:8]}")]
 
 
-def label_block(labels: Sequence[tuple[Plate, Sequence[str]]], height_m: float, dbu_m: float) -> Part:
+def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: float, dbu_m: float) -> Part:
     """Write the labels of several masks one below the other, so that no two meet on the wafer.
 
     Args:
@@ -157,6 +157,6 @@ def label_block(labels: Sequence[tuple[Plate, Sequence[str]]], height_m: float, 
     return column(blocks, (_BLOCK - HEIGHT) * stroke_m)
 
 
-def written(plate: Plate, text: str, stroke_um: float, dbu_m: float) -> Part:
+def written(plate: Photomask, text: str, stroke_um: float, dbu_m: float) -> Part:
     """Write a line of text on datatype 3 of a plate, beginning at the origin, with strokes of whole database units."""
     return Part(dbu_m, {plate.on(3): lettering(text, HEIGHT * stroke_um * UM, dbu_m)}, {})

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.layout.lettering import HEIGHT, letter_boxes, written
-from fab.layout.part import Part, Plate, block, centred, column, joined, moved, row, turned, without
+from fab.layout.part import Part, Photomask, block, centred, column, joined, moved, row, turned, without
 from fab.units import NM, UM
 
 __all__ = ["BOXES", "VERNIER_STEP_M", "alignment_notes", "alignment_site", "die_marks"]
@@ -68,14 +68,16 @@ def _cross(length_um: float, arm_um: float) -> Boxes:
     return without([(-half, -arm, half, arm), (-arm, -half, arm, half)])
 
 
-def _seen(name: str, first: Plate, plate: Plate, wafer: Boxes, dark: Boxes, window_um: float, dbu_m: float) -> Part:
+def _seen(
+    name: str, first: Photomask, plate: Photomask, wafer: Boxes, dark: Boxes, window_um: float, dbu_m: float
+) -> Part:
     """Draw a mark that is seen through the plate: the wafer's part, and the dark part or the window without it."""
     drawn = dark if plate.tone == "dark" else without([_square(window_um)], dark)
     part = joined([block(first.on(1), wafer, dbu_m), block(plate.on(1), drawn, dbu_m)])
     return Part(dbu_m, part.shapes, {f"{name}, {plate.name}": (0.0, 0.0)})
 
 
-def _finder(first: Plate, plate: Plate, dbu_m: float) -> Part:
+def _finder(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
     """Draw a cross on the wafer and four squares between its arms on the plate, centred."""
     off = _ARM_UM / 2 + _CROSS_GAP_UM + _QUADRANT_UM / 2
     dark = np.array([_square(_QUADRANT_UM, x, y) for x in (-off, off) for y in (-off, off)])
@@ -83,7 +85,7 @@ def _finder(first: Plate, plate: Plate, dbu_m: float) -> Part:
     return _seen("finder", first, plate, _cross(_CROSS_UM, _ARM_UM), dark, window, dbu_m)
 
 
-def _box(mark: BoxMark, first: Plate, plate: Plate, dbu_m: float) -> Part:
+def _box(mark: BoxMark, first: Photomask, plate: Photomask, dbu_m: float) -> Part:
     """Draw a frame on the wafer and a box in it on the plate, centred."""
     opening = mark.box_um + 2 * mark.gap_um
     outer = opening + 2 * mark.bar_um
@@ -102,7 +104,7 @@ def _comb(pitch_um: float, direction: int) -> Boxes:
     return np.array(lines)
 
 
-def _vernier(axis: str, first: Plate, plate: Plate, dbu_m: float) -> Part:
+def _vernier(axis: str, first: Photomask, plate: Photomask, dbu_m: float) -> Part:
     """Draw the two combs of a vernier, centred; the numbers count micrometres."""
     wafer, mask = _comb(_PITCH_UM, -1), _comb(_PLATE_PITCH_UM, 1)
     reach = f"{_LAST * VERNIER_STEP_M / UM:g}"
@@ -117,7 +119,7 @@ def _vernier(axis: str, first: Plate, plate: Plate, dbu_m: float) -> Part:
     return Part(dbu_m, part.shapes, {f"vernier {axis}, {plate.name}": (0.0, 0.0)})
 
 
-def _letter_f(plate: Plate, stroke_um: float, dbu_m: float) -> Part:
+def _letter_f(plate: Photomask, stroke_um: float, dbu_m: float) -> Part:
     """Draw the F and, below it, the plate's code; the lower left corner of the F is the origin."""
     f = block(plate.on(1), letter_boxes("F") * stroke_um, dbu_m)
     code = moved(written(plate, plate.code, stroke_um / 2, dbu_m), 0, -HEIGHT * stroke_um * UM)
@@ -128,7 +130,7 @@ def _at(part: Part, x_um: float, y_um: float) -> Part:
     return moved(part, x_um * UM, y_um * UM)
 
 
-def _site_slot(first: Plate, plate: Plate, dbu_m: float) -> Part:
+def _site_slot(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
     """Draw the slot of one plate at a site of the wafer, 0.9 mm x 1 mm."""
     centres = ((200, 200), (500, 115), (460, 295), (572, 273), (572, 360))
     boxes = [_at(_box(mark, first, plate, dbu_m), *at) for mark, at in zip(BOXES, centres, strict=True)]
@@ -144,7 +146,7 @@ def _site_slot(first: Plate, plate: Plate, dbu_m: float) -> Part:
     )
 
 
-def _die_slot(first: Plate, plate: Plate, dbu_m: float) -> Part:
+def _die_slot(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
     """Draw the slot of one plate beside a die, 0.55 mm x 0.3 mm."""
     centres = ((70, 250), (190, 250), (274, 250))
     boxes = [_at(_box(mark, first, plate, dbu_m), *at) for mark, at in zip(BOXES[2:], centres, strict=True)]
@@ -166,7 +168,7 @@ def _grid(slots: Sequence[Part]) -> Part:
     return column(lines, _SLOT_GAP_M)
 
 
-def _brackets(first: Plate, box: tuple[int, int, int, int], dbu_m: float) -> Part:
+def _brackets(first: Photomask, box: tuple[int, int, int, int], dbu_m: float) -> Part:
     """Draw an angle of two bars at each corner of a frame around a box of database units."""
     x0, y0, x1, y1 = (edge * dbu_m / UM for edge in box)
     away, long, wide = 250.0, 400.0, 60.0
@@ -179,11 +181,12 @@ def _brackets(first: Plate, box: tuple[int, int, int, int], dbu_m: float) -> Par
     return block(first.on(1), without(bars), dbu_m)
 
 
-def alignment_site(plates: Sequence[Plate], dbu_m: float) -> Part:
+def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw a site of the wafer where all masks are aligned.
 
     Args:
-        plates: all plates in the order in which they are used (`fab.layout.part.plates_of`); the first makes the marks.
+        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`); the first makes the
+            marks.
         dbu_m: database unit, metres.
 
     Returns:
@@ -201,7 +204,7 @@ def alignment_site(plates: Sequence[Plate], dbu_m: float) -> Part:
     return joined([body, _brackets(first, body.box, dbu_m)])
 
 
-def die_marks(plates: Sequence[Plate], dbu_m: float) -> Part:
+def die_marks(plates: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw the smaller marks that stand beside a die, to measure the overlay there.
 
     Args:
@@ -218,7 +221,7 @@ def die_marks(plates: Sequence[Plate], dbu_m: float) -> Part:
     return centred(row([f, _grid(slots)], 60 * UM) if slots else f)
 
 
-def _what_happens(first: Plate, plate: Plate) -> str:
+def _what_happens(first: Photomask, plate: Photomask) -> str:
     """Say what working on a plate does to the marks in its slot, and to the others."""
     dark_field = plate.tone == "clear"
     others = "The slots of all other masks stay under resist."
@@ -241,7 +244,7 @@ def _what_happens(first: Plate, plate: Plate) -> str:
     )
 
 
-def alignment_notes(plates: Sequence[Plate]) -> tuple[str, ...]:
+def alignment_notes(plates: Sequence[Photomask]) -> tuple[str, ...]:
     """Say in words how each mask is aligned and what happens to the marks.
 
     Args:

@@ -24,13 +24,13 @@ from fab.units import NM, UM
 __all__ = [
     "ZERO_LAYER",
     "Part",
-    "Plate",
+    "Photomask",
     "block",
     "centred",
     "column",
     "joined",
     "moved",
-    "plates_of",
+    "photomasks_of",
     "prefixed",
     "row",
     "turned",
@@ -67,7 +67,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Plate:
+class Photomask:
     """One mask of the set.
 
     Attributes:
@@ -104,13 +104,13 @@ class Plate:
         return Layer(self.layer, datatype, f"{self.code}_{('MARKS', 'TEST', 'LABEL')[datatype - 1]}")
 
 
-def plates_of(
+def photomasks_of(
     levels: Levels,
     order: Sequence[int],
     tone: Tone,
     chrome: Literal["liftoff", "etch", "none"],
     zero_layer: bool,
-) -> tuple[Plate, ...]:
+) -> tuple[Photomask, ...]:
     """List the plates of a job in the order in which they are used.
 
     The resist is the same at every step, so that chrome that is etched away around its polygons needs the other tone
@@ -129,10 +129,10 @@ def plates_of(
     """
     opposite: Tone = "dark" if tone == "clear" else "clear"
     chrome_tone = opposite if chrome == "etch" else tone
-    zero = [Plate(ZERO_LAYER, chrome_tone, "zero layer")] if zero_layer else []
-    etches = [Plate(bit + 1, tone, "etch", bit, levels.etch_depth_m(bit)) for bit in order]
+    zero = [Photomask(ZERO_LAYER, chrome_tone, "zero layer")] if zero_layer else []
+    etches = [Photomask(bit + 1, tone, "etch", bit, levels.etch_depth_m(bit)) for bit in order]
     way = "liftoff" if chrome == "liftoff" else "wet etch"
-    last = [] if chrome == "none" else [Plate(chrome_layer(levels).number, chrome_tone, way)]
+    last = [] if chrome == "none" else [Photomask(chrome_layer(levels).number, chrome_tone, way)]
     return (*zero, *etches, *last)
 
 

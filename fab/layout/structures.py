@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.layout.geometry import Layer, Shapes
 from fab.layout.lettering import written
-from fab.layout.part import Part, Plate, block, centred, column, joined, moved, row, without
+from fab.layout.part import Part, Photomask, block, centred, column, joined, moved, row, without
 from fab.levels import Levels
 from fab.units import UM, format_length
 
@@ -64,7 +64,7 @@ def _group(width_um: float, gaps: bool) -> list[Boxes]:
     return cells
 
 
-def cd_bars(plate: Plate, dbu_m: float) -> Part:
+def cd_bars(plate: Photomask, dbu_m: float) -> Part:
     """Draw the bars by which line widths are measured.
 
     Args:
@@ -88,7 +88,7 @@ def cd_bars(plate: Plate, dbu_m: float) -> Part:
     return joined(parts)
 
 
-def depth_pads(plate: Plate, dbu_m: float) -> Part:
+def depth_pads(plate: Photomask, dbu_m: float) -> Part:
     """Draw the squares by which a depth is measured.
 
     Args:
@@ -186,7 +186,9 @@ def grating_periods_m(levels: Levels, pitch_m: float, dbu_m: float, minimum_line
     return 4 * stripe_m, levels.count * stripe_m
 
 
-def _framed(name: str, grating: Part, size: tuple[int, int], chrome: Plate | None, words: Plate, dbu_m: float) -> Part:
+def _framed(
+    name: str, grating: Part, size: tuple[int, int], chrome: Photomask | None, words: Photomask, dbu_m: float
+) -> Part:
     """Put a frame of chrome around a grating of some size in units, its name below, and a place in its middle."""
     width, height = size
     frame, overlap = round(_FRAME_M / dbu_m), round(_OVERLAP_M / dbu_m)
@@ -201,7 +203,7 @@ def _framed(name: str, grating: Part, size: tuple[int, int], chrome: Plate | Non
     return Part(dbu_m, joined(pieces).shapes, {f"grating {name}": (width * dbu_m / 2, height * dbu_m / 2)})
 
 
-def _gratings(levels: Levels, plates: Sequence[Plate], stripe: int, dbu_m: float) -> Part:
+def _gratings(levels: Levels, plates: Sequence[Photomask], stripe: int, dbu_m: float) -> Part:
     """Draw the gratings, of 1 mm or a little more, and the empty window if there is chrome to frame it."""
     deepest = max((plate for plate in plates if plate.bit is not None), key=lambda plate: plate.depth_m)
     chrome = next((plate for plate in plates if plate.name == "chrome"), None)
@@ -221,13 +223,13 @@ def _gratings(levels: Levels, plates: Sequence[Plate], stripe: int, dbu_m: float
 
 
 def process_monitor(
-    levels: Levels, plates: Sequence[Plate], pitch_m: float, dbu_m: float, minimum_line_m: float
+    levels: Levels, plates: Sequence[Photomask], pitch_m: float, dbu_m: float, minimum_line_m: float
 ) -> Part:
     """Draw all test structures of a job.
 
     Args:
         levels: the staircase.
-        plates: all plates (`fab.layout.part.plates_of`); the zero layer has no test structures.
+        plates: all plates (`fab.layout.part.photomasks_of`); the zero layer has no test structures.
         pitch_m: pixel pitch of the DOE, metres; the gratings are made of such pixels.
         dbu_m: database unit, metres.
         minimum_line_m: narrowest line and gap the process prints, metres; the gratings keep to it, the bars do not,

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from fab.layout.frame import Frame
 from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer
-from fab.layout.part import Plate
+from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
 from fab.layout.split import Split
 from fab.layout.wafer import READING
@@ -69,7 +69,7 @@ def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
     )
 
 
-def plate_entry(order: Order, plate: Plate) -> PlateEntry:
+def plate_entry(order: Order, plate: Photomask) -> PlateEntry:
     """What the manifest says of a mask as the shop makes it."""
     dark_field = plate.tone == "clear"
     return PlateEntry(

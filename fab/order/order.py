@@ -13,7 +13,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.compensation import edge_moves
 from fab.layout.geometry import Chrome, pixel_edges
-from fab.layout.part import Plate, plates_of
+from fab.layout.part import Photomask, photomasks_of
 from fab.layout.split import Split, splits_of
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
@@ -58,10 +58,10 @@ class Order:
     patch: Patch | None = None
 
     @property
-    def plates(self) -> tuple[Plate, ...]:
+    def plates(self) -> tuple[Photomask, ...]:
         """The masks in the order in which they are used."""
         process, wafer = self.process, self.wafer
-        return plates_of(self.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
+        return photomasks_of(self.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
 
     @cached_property
     def rules(self) -> RulesReport:
@@ -81,7 +81,7 @@ class Order:
         """How the dies draw the DOE, the plate as ordered first."""
         return splits_of(self.wafer, self.levels, self.edge_moves(), pixel_edges(self.grid).dbu_m)
 
-    def plate_stem(self, plate: Plate) -> str:
+    def plate_stem(self, plate: Photomask) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
         if plate.bit is not None:
             return self.mask_stem(plate.bit)

@@ -55,9 +55,9 @@ from fab.order.order import Order
 from fab.order.preview import preview_png
 from fab.process import Process
 from fab.solids.patch import Patch
-from fab.solids.write import Relief, write_models
+from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
-from fab.verification.verify import Report, verify_order
+from fab.verification.verify import VerificationReport, verify_order
 
 __all__ = ["Add", "mask_file", "write_order"]
 
@@ -67,7 +67,7 @@ _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
-class Content(NamedTuple):
+class FileContent(NamedTuple):
     """What the manifest says of a file besides its bytes; of a mask file also top cell, DOE layers and other cells."""
 
     file: str
@@ -154,23 +154,23 @@ def _write_masks(
     gds: str,
     oasis: str,
     say: Callable[[str], None],
-) -> list[Content]:
+) -> list[FileContent]:
     """Write the review files and one file per mask."""
     say("writing GDSII")
     write_gds(folder / gds, layout)
-    contents = [Content(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
+    contents = [FileContent(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
     for plate in order.plates:
         name, layer = order.plate_stem(plate), Layer(plate.layer)
         one = mask_file(layout, layer, name)
         write_gds(folder / f"{name}.gds", one)
         on = [layer] if layer in doe_layers else []
-        contents.append(Content(f"{name}.gds", "GDSII", name, on, _around(order, one)))
+        contents.append(FileContent(f"{name}.gds", "GDSII", name, on, _around(order, one)))
     say("writing OASIS")
     write_oasis(folder / oasis, folder / gds, layout.layers)
-    return [*contents, Content(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
+    return [*contents, FileContent(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
 
 
-def _file_entry(folder: Path, content: Content) -> FileEntry:
+def _file_entry(folder: Path, content: FileContent) -> FileEntry:
     path = folder / content.file
     return FileEntry(
         file=content.file,
@@ -213,7 +213,7 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
     (folder / preview).write_bytes(picture)
     say("drawing the solids")
-    shown = Relief(
+    shown = PlateModel(
         order.level_map,
         order.levels,
         order.grid,
@@ -230,7 +230,7 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
         added = add(folder, order, frame)
         models = solids.result()
     others = [*(model.file for model in models), *added, levels_file, preview]
-    contents += [Content(name, Path(name).suffix[1:].upper()) for name in others]
+    contents += [FileContent(name, Path(name).suffix[1:].upper()) for name in others]
     return Manifest(
         format=FORMAT,
         name=order.name,
@@ -287,7 +287,7 @@ def write_order(
     patch: Patch | None = None,
     add: Add = lambda *_: (),
     say: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> VerificationReport:
     """Write a mask order and prove it; the folder appears only if the proof holds.
 
     Args:

@@ -30,11 +30,11 @@ from fab.grid import Grid
 from fab.layout.geometry import pixel_edges
 from fab.levels import Levels, require_levels
 from fab.process import Process
-from fab.rules.check import bitplanes as bits
+from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
 from fab.units import UM, format_length
 
-__all__ = ["OffGrid", "Place", "PlaneRules", "Rules", "RulesReport", "Widths", "check", "shortest_run"]
+__all__ = ["OffGrid", "PlaneRules", "Rules", "RulesReport", "Violation", "Widths", "check", "shortest_run"]
 
 Kind = Literal["line", "space", "kissing corner"]
 
@@ -81,7 +81,7 @@ class Rules:
         return cls(process.minimum_line_m, process.minimum_space_m)
 
 
-class Place(NamedTuple):
+class Violation(NamedTuple):
     """One place where a rule is broken.
 
     Attributes:
@@ -140,7 +140,7 @@ class PlaneRules:
     density: float
     emptiest: float
     fullest: float
-    places: tuple[Place, ...]
+    places: tuple[Violation, ...]
 
     @property
     def breaks(self) -> int:
@@ -270,11 +270,11 @@ def _windows(words: bits.Words, grid: Grid, aperture_m: float, rules: Rules, are
 def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture_m: float, area: int) -> PlaneRules:
     pitch, (ny, nx) = grid.pitch_m, grid.shape
     corner = (nx / 2, ny / 2)
-    places: list[Place] = []
+    places: list[Violation] = []
 
-    def place(what: Kind, x: float, y: float, size: float, length: float) -> Place:
+    def place(what: Kind, x: float, y: float, size: float, length: float) -> Violation:
         lengths = ((y - corner[1]) * pitch, (x - corner[0]) * pitch, size * pitch, length * pitch)
-        return Place(what, *map(_metres, lengths))
+        return Violation(what, *map(_metres, lengths))
 
     bounded = [count_bounded(words, axis) for axis in (0, 1)]
     widths = []

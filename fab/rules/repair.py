@@ -27,9 +27,9 @@ from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside
 from fab.rules.check import Rules, check, shortest_run
-from fab.rules.repair_moves import Task, broken, loss, offends, sweep
+from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
 
-__all__ = ["Cost", "repaired"]
+__all__ = ["RepairCost", "repaired"]
 
 # How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -42,7 +42,7 @@ _WIDEST = 32
 
 
 @dataclass(frozen=True)
-class Cost:
+class RepairCost:
     """What a repair changed and what it costs, over the clear aperture.
 
     Attributes:
@@ -133,7 +133,7 @@ def _part(task, side, origin, frozen, active):  # pragma: no cover - compiled
     return moved
 
 
-def _sweep_all(task: Task, weight: float, changed_too: bool) -> int:
+def _sweep_all(task: RepairTask, weight: float, changed_too: bool) -> int:
     """Sweep over stripes, first even and then odd ones: however many run at once, the result is the same."""
     end = task.etched.shape[0] - task.pad
     # A move at the edge of a stripe reads two narrowest widths of the next one and writes less than one.
@@ -149,7 +149,7 @@ def _sweep_all(task: Task, weight: float, changed_too: bool) -> int:
     return moved
 
 
-def _freeze_all(task: Task, shift: int) -> bool:
+def _freeze_all(task: RepairTask, shift: int) -> bool:
     """Freeze squares, all shifted alike, until no line or space is too narrow; tell whether anything was broken."""
     side = max(task.line, task.space)
     origin = task.pad - shift % side
@@ -162,7 +162,7 @@ def _freeze_all(task: Task, shift: int) -> bool:
             return bool(frozen.any())
 
 
-def _mend(task: Task) -> None:
+def _mend(task: RepairTask) -> None:
     """Repair in place."""
     for weight in _WEIGHTS:
         _sweep_all(task, weight, changed_too=False)
@@ -193,7 +193,7 @@ def repaired(
     aperture_m: float,
     rules: Rules,
     waves_per_m: float,
-) -> tuple[NDArray[np.uint8], Cost]:
+) -> tuple[NDArray[np.uint8], RepairCost]:
     """Change as few levels as can be, as little as can be, until no mask breaks a rule.
 
     Args:
@@ -205,8 +205,8 @@ def repaired(
         waves_per_m: waves of light per metre of height, (n - 1) / wavelength; says which levels are near each other.
 
     Returns:
-        The repaired map, blank outside the clear aperture, and what it costs. `Cost.broken_after` says honestly what
-        could not be repaired: corners that touch, at worst; no narrow line and no narrow space.
+        The repaired map, blank outside the clear aperture, and what it costs. `RepairCost.broken_after` says honestly
+        what could not be repaired: corners that touch, at worst; no narrow line and no narrow space.
 
     Raises:
         InputError: not a level map of this staircase and grid, a rate that is not positive, or a minimum of more than
@@ -229,7 +229,7 @@ def repaired(
         # By what is etched, the top level first.
         error = 1 - np.cos(_phases(levels, waves_per_m)[::-1, ::-1])
         target = np.pad(np.uint8(top) - wanted, pad)
-        task = Task(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
+        task = RepairTask(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
         _mend(task)
         mended = np.uint8(top) - task.etched[pad:-pad, pad:-pad]
     # How often which level took the place of which.
@@ -237,7 +237,7 @@ def repaired(
     shares = pairs.reshape(levels.count, levels.count) / max(pairs.sum(), 1)
     rises_m = np.subtract.outer(levels.heights_m(), levels.heights_m())
     after = before if before.clean else check(mended, levels, grid, aperture_m, rules)
-    return mended, Cost(
+    return mended, RepairCost(
         changed_share=1.0 - float(np.trace(shares)) if pairs.any() else 0.0,
         rms_height_m=math.sqrt(float(np.sum(shares * rises_m**2))),
         efficiency=float(abs(np.sum(shares * np.exp(1j * _phases(levels, waves_per_m)))) ** 2) if pairs.any() else 1.0,

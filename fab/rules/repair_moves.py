@@ -11,10 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Task", "broken", "loss", "offends", "sweep"]
+__all__ = ["RepairTask", "broken", "loss", "offends", "sweep"]
 
 
-class Task(NamedTuple):
+class RepairTask(NamedTuple):
     """A level map in work, on maps that are padded by `pad` pixels of blank glass.
 
     `etched` and `wanted` hold by which masks each pixel is etched now and should be, `free` what may change,

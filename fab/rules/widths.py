@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fab.rules.check import bitplanes as bits
+from fab.rules import bitplanes as bits
 
-__all__ = ["Narrow", "count_bounded", "narrow_runs", "shortest"]
+__all__ = ["NarrowRuns", "count_bounded", "narrow_runs", "shortest"]
 
 _MOST_PLACES = 5
 # Runs that are measured to find long ones, so that a map of millions costs no more than one of thousands.
 _LOOKS = 20_000
 
 
-class Narrow(NamedTuple):
+class NarrowRuns(NamedTuple):
     """Narrow runs of one kind along one axis, in pixels; `places` holds row, column, width, length of a few."""
 
     smallest: int | None
@@ -35,7 +35,7 @@ def _places(alone: bits.Words, slivers: bits.Words, axis: int, width: int) -> li
     return []
 
 
-def narrow_runs(words: bits.Words, axis: int, outside: np.uint64, fewest: int, sliver: int) -> Narrow:
+def narrow_runs(words: bits.Words, axis: int, outside: np.uint64, fewest: int, sliver: int) -> NarrowRuns:
     """Find the runs along an axis that have fewer than `fewest` pixels."""
     left, alone, long = words.copy(), np.empty_like(words), np.empty_like(words)
     smallest, runs, narrow, slivers = None, 0, 0, 0
@@ -51,7 +51,7 @@ def narrow_runs(words: bits.Words, axis: int, outside: np.uint64, fewest: int, s
         slivers += bits.count_starts(long, 1 - axis, bits.NONE)
         if smallest is None:
             smallest, places = width, _places(alone, long, 1 - axis, width)
-    return Narrow(smallest, runs, narrow, slivers, places)
+    return NarrowRuns(smallest, runs, narrow, slivers, places)
 
 
 def shortest(words: bits.Words, outside: np.uint64, known: int) -> int:

@@ -13,9 +13,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from fab.layout.part import Plate
+from fab.layout.part import Photomask
 from fab.levels import Levels
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 from fab.units import NM, UM, format_length
 
 __all__ = [
@@ -65,7 +65,7 @@ class Step(NamedTuple):
         deepest_m: depth of the deepest floor once this step is done, metres.
     """
 
-    plate: Plate
+    plate: Photomask
     before: tuple[Action, ...]
     after: tuple[Action, ...]
     deepest_m: float
@@ -99,7 +99,7 @@ def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
     return next_m - (measured_m - target_m)
 
 
-def resist_thickness_m(plate: Plate, chrome_m: float, deposition: Deposition) -> float:
+def resist_thickness_m(plate: Photomask, chrome_m: float, deposition: Deposition) -> float:
     """Return the least thickness of the resist, metres.
 
     Args:
@@ -116,32 +116,32 @@ def resist_thickness_m(plate: Plate, chrome_m: float, deposition: Deposition) ->
     return _LIFTOFF_FOLD[deposition] * chrome_m if lifts_off(plate) else _THINNEST_M
 
 
-def lifts_off(plate: Plate) -> bool:
+def lifts_off(plate: Photomask) -> bool:
     """Return whether the chrome of a plate is lifted off: clear polygons leave holes in a positive resist."""
     return plate.makes == "liftoff" or (plate.makes == "zero layer" and plate.tone == "clear")
 
 
-def spread_of(process: Process, bit: int, common: str, own: str) -> Spread:
+def spread_of(process: Process, bit: int, common: str, own: str) -> Normal:
     """Return mean and standard deviation of an error of one mask, its common part included.
 
     Args:
         process: the process.
         bit: the mask.
         common: name of the part that all masks share; "" if there is none.
-        own: name of the part of each mask, as in `fab.process.ERRORS`.
+        own: name of the part of each mask, as in `fab.process.DEVIATIONS`.
     """
-    parts = [process.spreads.get(name, Spread()) for name in (common, f"{own}[{bit}]")]
-    return Spread(sum(part.mean for part in parts), math.hypot(*(part.sigma for part in parts)))
+    parts = [process.spreads.get(name, Normal()) for name in (common, f"{own}[{bit}]")]
+    return Normal(sum(part.mean for part in parts), math.hypot(*(part.sigma for part in parts)))
 
 
-def tone_words(plate: Plate) -> str:
+def tone_words(plate: Photomask) -> str:
     """Say what the polygons of a plate are on the glass."""
     if plate.tone == "clear":
         return "polygons are CLEAR: chrome all over, light passes in the polygons (dark-field plate)"
     return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
 
 
-def _printing(plate: Plate, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
+def _printing(plate: Photomask, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
     """List the actions from the resist to the developed pattern, the same for every plate."""
     return (
         Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
@@ -174,7 +174,7 @@ def _clean(first: bool) -> Action:
     return Action("Clean", how, ("wafer number",) if first else ())
 
 
-def _etch_actions(plate: Plate, process: Process) -> tuple[Action, ...]:
+def _etch_actions(plate: Photomask, process: Process) -> tuple[Action, ...]:
     depth_m, bit = plate.depth_m, plate.bit or 0
     sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
     usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
@@ -196,7 +196,7 @@ def _etch_actions(plate: Plate, process: Process) -> tuple[Action, ...]:
     )
 
 
-def _chrome_actions(plate: Plate, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
+def _chrome_actions(plate: Photomask, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
     thickness = format_length(chrome_m)
     if lifts_off(plate):
         return (
@@ -210,7 +210,7 @@ def _chrome_actions(plate: Plate, chrome_m: float, deposition: Deposition) -> tu
     )
 
 
-def _resist_reason(plate: Plate, chrome_m: float, deposition: Deposition) -> str:
+def _resist_reason(plate: Photomask, chrome_m: float, deposition: Deposition) -> str:
     if plate.makes == "etch":
         used = format_length(float(f"{plate.depth_m / _SELECTIVITY:.3g}"))
         return f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
@@ -221,7 +221,7 @@ def _resist_reason(plate: Plate, chrome_m: float, deposition: Deposition) -> str
 
 
 def steps_of(
-    plates: Sequence[Plate],
+    plates: Sequence[Photomask],
     process: Process,
     files: Mapping[str, str],
     notes: Sequence[str],
@@ -231,7 +231,7 @@ def steps_of(
     """List what is done with every plate.
 
     Args:
-        plates: all plates in the order in which they are used (`fab.layout.part.plates_of`).
+        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`).
         process: how far depths stray.
         files: the mask file of every plate, by the plate's name.
         notes: how each plate is aligned (`fab.layout.marks.alignment_notes`), in the order of the plates.

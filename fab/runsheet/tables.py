@@ -1,6 +1,6 @@
 """What stands on a run sheet, in SI units: the order, the wafer, the process, and what the lab should see.
 
-`fab` knows no light: what the finished plate should show comes as plain numbers (`Outlook`).
+`fab` knows no light: what the finished plate should show comes as plain numbers (`Predictions`).
 """
 
 from collections.abc import Mapping
@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from fab.errors import InputError
-from fab.layout.part import Plate
+from fab.layout.part import Photomask
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.process import Process
 from fab.units import NM
 
-__all__ = ["Die", "Grating", "Matter", "Outlook", "PlateFile", "RunSheet", "Seen"]
+__all__ = ["Die", "Grating", "Importance", "PhotomaskFile", "PredictedMetrics", "Predictions", "RunSheet"]
 
 
-class PlateFile(NamedTuple):
+class PhotomaskFile(NamedTuple):
     """The file of one plate.
 
     Attributes:
@@ -43,7 +43,7 @@ class Die(NamedTuple):
     note: str = ""
 
 
-class Seen(NamedTuple):
+class PredictedMetrics(NamedTuple):
     """What one colour of a point at one depth (None for infinity) does; shares of the light are 0 to 1."""
 
     colour: str
@@ -63,7 +63,7 @@ class Grating(NamedTuple):
     blazed: float
 
 
-class Matter(NamedTuple):
+class Importance(NamedTuple):
     """Which share of the plates' variance in Strehl ratio and in 0th order a measured number explains."""
 
     measured: str
@@ -72,7 +72,7 @@ class Matter(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outlook:
+class Predictions:
     """What the lab should see.
 
     Attributes:
@@ -86,14 +86,14 @@ class Outlook:
         matters: measured numbers, the most important first; empty if the process has no errors.
     """
 
-    drawn: tuple[Seen, ...]
-    expected: tuple[Seen, ...]
+    drawn: tuple[PredictedMetrics, ...]
+    expected: tuple[PredictedMetrics, ...]
     design_m: float
     full_wave_m: float | None
     probe_m: float
     probe_waves: float
     gratings: tuple[Grating, ...]
-    matters: tuple[Matter, ...] = ()
+    matters: tuple[Importance, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class RunSheet:
         stem: what all files of the order begin with.
         level_map_sha256: digest of the level map; tells one design from another.
         levels: the staircase.
-        plates: all plates in the order in which they are used (`fab.layout.part.plates_of`).
+        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`).
         files: the file of every plate, by the plate's name.
         process: what the lab does and how far it strays.
         aperture_m: diameter of the relief.
@@ -123,8 +123,8 @@ class RunSheet:
     stem: str
     level_map_sha256: str
     levels: Levels
-    plates: tuple[Plate, ...]
-    files: Mapping[str, PlateFile]
+    plates: tuple[Photomask, ...]
+    files: Mapping[str, PhotomaskFile]
     process: Process
     aperture_m: float
     opening_m: float
@@ -134,7 +134,7 @@ class RunSheet:
     material: str = "fused silica"
     chrome_m: float = 100 * NM
     deposition: Literal["evaporated", "sputtered"] = "evaporated"
-    outlook: Outlook | None = None
+    outlook: Predictions | None = None
 
     def __post_init__(self) -> None:
         """Check that every plate has its file, and every etch its plate.

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 from fab.files import canonical_json, write_atomic
 from fab.layout.marks import VERNIER_STEP_M, alignment_notes
-from fab.layout.part import Plate
+from fab.layout.part import Photomask
 from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
 from fab.layout.wafer import READING
-from fab.process import Spread
+from fab.process import Normal
 from fab.runsheet.recipe import (
     RATES_M_PER_S,
     Action,
@@ -27,7 +27,7 @@ from fab.runsheet.recipe import (
     steps_of,
     tone_words,
 )
-from fab.runsheet.tables import Outlook, RunSheet
+from fab.runsheet.tables import Predictions, RunSheet
 from fab.units import MM, NM, UM, format_length
 
 __all__ = ["BARS", "FORMAT", "PADS", "html_page", "record", "write_run_sheet"]
@@ -54,7 +54,7 @@ def _mm(place_m: tuple[float, float]) -> dict[str, float]:
     return {"x_mm": round(place_m[0] / MM, 6), "y_mm": round(place_m[1] / MM, 6)}
 
 
-def _named(sheet: RunSheet, what: str, plate: Plate) -> Iterator[tuple[str, dict[str, float]]]:
+def _named(sheet: RunSheet, what: str, plate: Photomask) -> Iterator[tuple[str, dict[str, float]]]:
     """Yield the places of a plate whose own name begins with `what`: where ("" if not said), and coordinates."""
     ending = f", {plate.name}"
     for name, place in sheet.places.items():
@@ -63,15 +63,15 @@ def _named(sheet: RunSheet, what: str, plate: Plate) -> Iterator[tuple[str, dict
             yield where, _mm(place)
 
 
-def _first_place(sheet: RunSheet, what: str, plate: Plate) -> dict[str, Any]:
+def _first_place(sheet: RunSheet, what: str, plate: Photomask) -> dict[str, Any]:
     where, place = next(_named(sheet, f"{what}, ", plate), ("", {"x_mm": None, "y_mm": None}))
     return {"where": where, **place}
 
 
-def _width_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+def _width_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
     """List the CD bars of a plate: drawn width, the width at which the DOE comes out as designed, and tolerance."""
     move_m = sheet.files[plate.name].edge_move_m
-    sigma = Spread().sigma
+    sigma = Normal().sigma
     if plate.bit is not None:
         sigma = spread_of(sheet.process, plate.bit, "common_cd_bias_m", "cd_bias_m").sigma
     rows = []
@@ -92,8 +92,8 @@ def _width_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
     return rows
 
 
-def _depth_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
-    lag = sheet.process.spreads.get("etch_lag", Spread()).mean
+def _depth_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
+    lag = sheet.process.spreads.get("etch_lag", Normal()).mean
     return [
         {
             "pad": name,
@@ -106,7 +106,7 @@ def _depth_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
     ]
 
 
-def _overlay_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+def _overlay_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
     return [
         {"axis": axis, "where": where, **place}
         for axis in ("x", "y")
@@ -114,14 +114,14 @@ def _overlay_rows(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
     ]
 
 
-def _marks(sheet: RunSheet, plate: Plate) -> list[dict[str, Any]]:
+def _marks(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
     kinds = ("finder", *("box " + gap for gap in ("25 um", "10 um", "5 um", "3 um", "2 um")))
     return [
         {"mark": kind, "where": where, **place} for kind in kinds for where, place in _named(sheet, f"{kind}, ", plate)
     ]
 
 
-def _etch_record(sheet: RunSheet, step: Step, later: tuple[Plate, ...]) -> dict[str, Any]:
+def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> dict[str, Any]:
     """Describe the depth of one etch: times, pads, and what to do if it is off."""
     plate, following = step.plate, later[0] if later else None
     corrections = []
@@ -156,7 +156,7 @@ def _step_record(sheet: RunSheet, number: int, step: Step) -> dict[str, Any]:
     later = tuple(other for other in sheet.plates[number:] if other.bit is not None)
     titles = {"etch": f"etch {plate.depth}", "zero layer": "chrome marks", "liftoff": "the aperture, by lift-off"}
     structures = plate.makes != "zero layer"
-    overlay = spread_of(sheet.process, plate.bit, "", "overlay_x_m") if plate.bit is not None else Spread()
+    overlay = spread_of(sheet.process, plate.bit, "", "overlay_x_m") if plate.bit is not None else Normal()
     return {
         "number": number,
         "plate": plate.name,
@@ -200,7 +200,7 @@ def _row(values: NamedTuple) -> dict[str, Any]:
     return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in row.items()}
 
 
-def _outlook_record(outlook: Outlook) -> dict[str, Any]:
+def _outlook_record(outlook: Predictions) -> dict[str, Any]:
     full = outlook.full_wave_m
     return {
         "as_drawn": [_row(seen) for seen in outlook.drawn],
@@ -244,7 +244,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
     notes = alignment_notes(sheet.plates)
     steps = steps_of(sheet.plates, sheet.process, files, notes, sheet.chrome_m, sheet.deposition)
     process, wafer = sheet.process, sheet.wafer
-    wall = process.spreads.get("sidewall_rad", Spread())
+    wall = process.spreads.get("sidewall_rad", Normal())
     return {
         "format": FORMAT,
         "job": sheet.stem,

@@ -15,7 +15,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, require_levels
 
-__all__ = ["Cells", "Window", "reduced_cells", "require_map", "whole", "window_cells"]
+__all__ = ["Columns", "Window", "reduced_cells", "require_map", "whole", "window_cells"]
 
 _MOST_CELLS = 4_000_000
 # Heights that differ by less than this part of the relief are one height that was rounded differently.
@@ -103,7 +103,7 @@ def require_map(level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> N
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class Columns:
     """A relief of columns on a rectangular raster.
 
     Attributes:
@@ -159,7 +159,7 @@ def _heights_m(levels: Levels) -> NDArray[np.float64]:
     return _joined(heights, _CLOSEST * float(heights.max()))
 
 
-def window_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window) -> Cells:
+def window_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window) -> Columns:
     """Take a window of a map at full resolution.
 
     Args:
@@ -182,10 +182,10 @@ def window_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, win
         got = f"{window.rows} x {window.columns}"
         raise InputError("window", rule, got, "Choose a smaller window or a reduced map.")
     heights = _heights_m(levels)
-    return Cells(heights[window.cut(checked)], *window.edges_m(grid), float(heights.max()))
+    return Columns(heights[window.cut(checked)], *window.edges_m(grid), float(heights.max()))
 
 
-def reduced_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, most: int = 1000) -> Cells:
+def reduced_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, most: int = 1000) -> Columns:
     """Reduce a map to columns of the mean height of square blocks of pixels; the volume stays.
 
     The block is the smallest that leaves at most `most` columns along the longer side. Blocks at the high end
@@ -213,4 +213,4 @@ def reduced_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, mo
     x_m, y_m = whole(grid).edges_m(grid)
     x, y = (np.append(edges[:-1:block], edges[-1]) for edges in (x_m, y_m))
     means = _joined(_block_means(checked, heights, block), _CLOSEST * float(heights.max()))
-    return Cells(means, x, y, float(heights.max()), block)
+    return Columns(means, x, y, float(heights.max()), block)

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
-from fab.solids.columns import Cells
+from fab.solids.columns import Columns
 from fab.units import UM, format_length
 
 __all__ = ["Mesh", "closed_volume_m3", "relief_mesh"]
@@ -202,7 +202,7 @@ def _bottom(first: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate(parts)
 
 
-def relief_mesh(cells: Cells, base_m: float = 10e-6, exaggeration: float = 1.0) -> Mesh:
+def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0) -> Mesh:
     """Build the closed mesh of a relief on a slab.
 
     Args:

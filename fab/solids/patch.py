@@ -16,7 +16,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles
 from fab.levels import Levels
-from fab.solids.columns import Cells, Window, require_map, window_cells
+from fab.solids.columns import Columns, Window, require_map, window_cells
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
@@ -78,7 +78,7 @@ class Patch:
         if self.step:
             _tops(require_map(level_map, levels, grid), window, _MOST_BOXES)
 
-    def cells(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> Cells:
+    def cells(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> Columns:
         """Return the columns of the patch."""
         return window_cells(level_map, levels, grid, self.window(grid))
 

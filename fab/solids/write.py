@@ -24,7 +24,7 @@ from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import Cells, Window, reduced_cells
+from fab.solids.columns import Columns, Window, reduced_cells
 from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_sag
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import write_3mf, write_glb, write_stl
@@ -34,7 +34,7 @@ from fab.solids.step import Body
 from fab.solids.substrate import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
 from fab.units import MM, format_length
 
-__all__ = ["MESH_CELLS", "Relief", "write_models"]
+__all__ = ["MESH_CELLS", "PlateModel", "write_models"]
 
 MESH_CELLS = 400
 _SAG_CELLS = 500
@@ -44,7 +44,7 @@ _STEP_OFF, _MESH_OFF = 1e-11, 1e-6
 _SINGLE = 2.0**-23
 
 
-class Relief(NamedTuple):
+class PlateModel(NamedTuple):
     """What all models show.
 
     Attributes:
@@ -70,7 +70,7 @@ class Relief(NamedTuple):
     patch: Patch | None = None
 
 
-def write_models(folder: Path, stem: str, relief: Relief) -> list[ModelEntry]:
+def write_models(folder: Path, stem: str, relief: PlateModel) -> list[ModelEntry]:
     """Write all models of a relief.
 
     Args:
@@ -93,7 +93,7 @@ def write_models(folder: Path, stem: str, relief: Relief) -> list[ModelEntry]:
     ]
 
 
-def _write_plate(folder: Path, file: str, relief: Relief) -> ModelEntry:
+def _write_plate(folder: Path, file: str, relief: PlateModel) -> ModelEntry:
     """Write one die, with its rings if the map is radial."""
     level_map, levels, grid, aperture_m = relief.level_map, relief.levels, relief.grid, relief.aperture_m
     glass = Substrate("die", relief.die_m, relief.wafer.thickness_m)
@@ -111,7 +111,7 @@ def _write_plate(folder: Path, file: str, relief: Relief) -> ModelEntry:
     return _solid(file, about, substrate_bodies(glass, chrome, rings))
 
 
-def _write_wafer(folder: Path, file: str, relief: Relief) -> ModelEntry:
+def _write_wafer(folder: Path, file: str, relief: PlateModel) -> ModelEntry:
     """Write the wafer, with a flat unless the dies need its place."""
     wafer = relief.wafer
     chrome = ChromeRing(*relief.chrome.radii_m(relief.grid, relief.aperture_m))
@@ -124,7 +124,9 @@ def _write_wafer(folder: Path, file: str, relief: Relief) -> ModelEntry:
     return _solid(file, about, wafer_bodies(glass, chrome, relief.dies))
 
 
-def _write_meshes(folder: Path, name: str, cells: Cells, about: str, window: Window | None = None) -> list[ModelEntry]:
+def _write_meshes(
+    folder: Path, name: str, cells: Columns, about: str, window: Window | None = None
+) -> list[ModelEntry]:
     """Write a relief as a mesh in every format."""
     mesh = relief_mesh(cells, _BASE_M)
     closed_volume_m3(mesh)
@@ -145,7 +147,7 @@ def _write_meshes(folder: Path, name: str, cells: Cells, about: str, window: Win
     return entries
 
 
-def _write_patch(folder: Path, name: str, relief: Relief, patch: Patch) -> list[ModelEntry]:
+def _write_patch(folder: Path, name: str, relief: PlateModel, patch: Patch) -> list[ModelEntry]:
     """Write a window at full resolution."""
     level_map, levels, grid = relief.level_map, relief.levels, relief.grid
     patch.require(level_map, levels, grid)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.gds.gdstk_reader import Reading
+from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
 from fab.layout.polygons import doubled_area, paint
@@ -207,7 +207,7 @@ def _entry_problems(found: CellEntry, stated: CellEntry) -> list[str]:
     return problems
 
 
-def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> list[str]:
+def reading_problems(reading: LayerReading, entry: FileEntry, expected: Expected) -> list[str]:
     """Compare one layer, as the other library found it, with what it should hold.
 
     Args:
@@ -223,7 +223,7 @@ def reading_problems(reading: Reading, entry: FileEntry, expected: Expected) -> 
     return problems if plate else [f"cell {reading.cell}: {problem}" for problem in problems]
 
 
-def _reading_problems(reading: Reading, mask: Drawn | None, expected: Expected) -> list[str]:
+def _reading_problems(reading: LayerReading, mask: Drawn | None, expected: Expected) -> list[str]:
     layer, winding = reading.layer, reading.winding
     problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
     if mask is not None and reading.moved is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fab.errors import CheckFailed, InputError
 from fab.levels import height_of
 from fab.manifest.records import Manifest, ModelEntry
-from fab.solids.columns import Cells, Window, reduced_cells, whole, window_cells
+from fab.solids.columns import Columns, Window, reduced_cells, whole, window_cells
 from fab.solids.mesh import Mesh
 from fab.solids.meshfile import read_mesh
 from fab.solids.step import step_bodies
@@ -77,19 +77,19 @@ def _volume_problems(entry: ModelEntry, found_mm3: dict[str, float]) -> list[str
     return problems
 
 
-def _cells(manifest: Manifest, level_map: NDArray[np.uint8], window: Window | None) -> Cells:
+def _cells(manifest: Manifest, level_map: NDArray[np.uint8], window: Window | None) -> Columns:
     levels, grid = manifest.staircase(), manifest.grid()
     if window is None:
         return reduced_cells(level_map, levels, grid, MESH_CELLS)
     return window_cells(level_map, levels, grid, window)
 
 
-def _mesh_problems(path: Path, entry: ModelEntry, cells: Cells) -> list[str]:
+def _mesh_problems(path: Path, entry: ModelEntry, cells: Columns) -> list[str]:
     mesh = read_mesh(path, "mm" if path.suffix == ".stl" else None)
     return _volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3}) + _top_problems(mesh, cells)
 
 
-def _top_problems(mesh: Mesh, cells: Cells) -> list[str]:
+def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
     """Look at what faces up: it must cover every column once, at the height of that column."""
     a, b, c = (mesh.vertices_m[mesh.triangles[:, corner]] for corner in range(3))
     along, across = b - a, c - a

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
 from fab.files import explain_os_error, read_npy, sha256_file
-from fab.gds.gdstk_reader import Again
+from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
 from fab.layout.compensation import read_back
@@ -38,7 +38,7 @@ from fab.verification.compare import Expected, cell_problems, layout_problems, r
 from fab.verification.models import model_problems
 from fab.verification.shop_checks import drawing_problems, number_problems
 
-__all__ = ["Check", "Report", "read_level_map", "verify_order"]
+__all__ = ["Check", "VerificationReport", "read_level_map", "verify_order"]
 
 _GDS, _OASIS = "GDSII", "OASIS"
 
@@ -64,7 +64,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Report:
+class VerificationReport:
     """All checks of a mask order, in the order they were made."""
 
     checks: tuple[Check, ...]
@@ -233,7 +233,7 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
         cell: [layer for layer, mask in drawn.items() if mask.edge_move_nm]
         for cell, drawn in expected.etch_layers(entry).items()
     }
-    again = Again(moved, expected.edges)
+    again = GdstkReader(moved, expected.edges)
     others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
@@ -251,14 +251,14 @@ def _check_mask_file(folder: Path, entry: FileEntry, intact: bool, expected: Exp
     return [own, _library_check(path, entry, expected)] if fit else [own]
 
 
-def verify_order(folder: str | Path) -> Report:
+def verify_order(folder: str | Path) -> VerificationReport:
     """Read a mask order back, with two readers, and compare every pixel with its level map.
 
     Args:
         folder: a folder written by `write_order`.
 
     Returns:
-        The checks; `Report.require` raises if any failed.
+        The checks; `VerificationReport.require` raises if any failed.
 
     Raises:
         InputError: the folder is not a mask order, or its manifest is corrupt.
@@ -284,4 +284,4 @@ def verify_order(folder: str | Path) -> Report:
                 checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
     except OSError as error:
         raise explain_os_error(error, folder) from error
-    return Report(tuple(checks))
+    return VerificationReport(tuple(checks))

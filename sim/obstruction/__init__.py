@@ -25,27 +25,27 @@ from sim.obstruction.dirt import Dirt
 from sim.obstruction.fence import Fence
 from sim.obstruction.folder import MaskFolder
 from sim.obstruction.mixed import DirtRaindrop
-from sim.obstruction.parameters import Kind
+from sim.obstruction.parameters import ObstructionKind
 from sim.obstruction.raindrop import Raindrop
 from sim.obstruction.release import ReleaseDirt, ReleaseFence, ReleaseRaindrop
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = [
     "OBSTRUCTIONS",
+    "CameraView",
     "Dirt",
     "DirtRaindrop",
     "Fence",
-    "Kind",
     "MaskFolder",
+    "ObstructionKind",
     "Raindrop",
     "ReleaseDirt",
     "ReleaseFence",
     "ReleaseRaindrop",
-    "View",
 ]
 
 # By the name that a spec or the command line calls them; all but the folder can be made without arguments.
-OBSTRUCTIONS: Mapping[str, type[Kind]] = MappingProxyType(
+OBSTRUCTIONS: Mapping[str, type[ObstructionKind]] = MappingProxyType(
     {
         kind.name: kind
         for kind in (Fence, Raindrop, Dirt, DirtRaindrop, ReleaseFence, ReleaseRaindrop, ReleaseDirt, MaskFolder)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from sim.imaging.scene import Obstruction
 from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = ["SOILS", "Dirt"]
 
@@ -76,8 +76,8 @@ class Dirt:
         for name in ("persistence", "colour_jitter", "grain"):
             require_number(f"{self.name}: {name}", getattr(self, name), 0.0, 1.0)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one dirty glass (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw one dirty glass (see `sim.obstruction.parameters.ObstructionKind`)."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         cell, blur, edge = (

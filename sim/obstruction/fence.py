@@ -24,7 +24,7 @@ from fab.errors import InputError
 from sim.imaging.scene import Obstruction
 from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = ["Fence", "Pattern"]
 
@@ -89,8 +89,8 @@ class Fence:
             rule = f"must be wider than the widest wire, {self.wire_m[1]:g} m"
             raise InputError(f"{self.name}: mesh_m", rule, self.mesh_m, "Give a wider mesh or a thinner wire.")
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one fence (see `sim.obstruction.parameters.Kind`).
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw one fence (see `sim.obstruction.parameters.ObstructionKind`).
 
         Raises:
             InputError: the view is too wide for the tilt.
@@ -124,7 +124,7 @@ class Fence:
         stain = 1 + 0.4 * layered_noise(rng, view.shape, max(view.pixels(3 * wire_m, depth_m), 2.0), octaves=3)
         return Obstruction(mask, np.clip(colour[:, None, None] * (bare * stain), 0, 1), depth_m)
 
-    def bent(self, rng: np.random.Generator, view: View, plane: "_Plane", mesh_m: float) -> "_Plane":
+    def bent(self, rng: np.random.Generator, view: CameraView, plane: "_Plane", mesh_m: float) -> "_Plane":
         """Move the wires off their places, slowly varying over the frame."""
         moved = [plane.u, plane.v]
         for given, meshes in ((self.sag_m, 4), (self.bend_m, 1)):
@@ -189,7 +189,7 @@ class _Lamp(NamedTuple):
     ambient: float
 
 
-def tilted_plane(view: View, depth_m: float, tilt_rad: float, towards_rad: float) -> _Plane:
+def tilted_plane(view: CameraView, depth_m: float, tilt_rad: float, towards_rad: float) -> _Plane:
     """Meet every pixel's direction with a plane through the axis at `depth_m`.
 
     Args:
@@ -278,7 +278,7 @@ def zigzags(
 
 
 def seen(
-    wires: _Wires, plane: _Plane, wire_m: float, view: View, lamp: _Lamp
+    wires: _Wires, plane: _Plane, wire_m: float, view: CameraView, lamp: _Lamp
 ) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
     """Coverage and light of a family of wires.
 

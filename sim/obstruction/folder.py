@@ -24,9 +24,9 @@ from fab.units import UM
 from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
-__all__ = ["MASK_FILES", "MaskFolder", "Picture", "read_mask"]
+__all__ = ["MASK_FILES", "MaskFolder", "MaskPicture", "read_mask"]
 
 MASK_FILES = (".png", ".tif", ".tiff")
 
@@ -34,7 +34,7 @@ _MOST_PIXELS = 1 << 26
 _CURE = "Write the file again from its source, or take it out of the folder."
 
 
-class Picture(NamedTuple):
+class MaskPicture(NamedTuple):
     """One mask as its file holds it.
 
     Attributes:
@@ -109,7 +109,7 @@ class MaskFolder:
             raise InputError(str(self.folder), rule, f"{len(found)} files, none of use", "Put masks there.")
         return good
 
-    def _pitch_m(self, path: Path, picture: Picture) -> float:
+    def _pitch_m(self, path: Path, picture: MaskPicture) -> float:
         if picture.pitch_m is not None:
             return picture.pitch_m
         if self.width_m is None:
@@ -118,8 +118,8 @@ class MaskFolder:
             raise InputError(str(path), rule, "no width", cure)
         return self.width_m / picture.mask.shape[1]
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one obstruction (see `sim.obstruction.parameters.Kind`).
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw one obstruction (see `sim.obstruction.parameters.ObstructionKind`).
 
         A picture that is wider than the frame is shifted within itself, a smaller one within the frame; beyond a
         picture's edge the view is free.
@@ -180,7 +180,7 @@ def _averages(rows: Float[np.ndarray, "n m"], count: int, step: float, start: fl
     return (below(middle + half) - below(middle - half)) / (2 * half)
 
 
-def read_mask(path: Path) -> Picture:
+def read_mask(path: Path) -> MaskPicture:
     """Read a mask and what is known of its size.
 
     Args:
@@ -204,7 +204,7 @@ def read_mask(path: Path) -> Picture:
     mask, colour = _parted(values[::-1])
     if not mask.any():
         raise InputError(str(path), "a mask must cover something", "black", "White, or opaque, is what covers.")
-    return Picture(mask, colour, _sidecar_pitch_m(path.with_suffix(".json"), mask.shape[1]))
+    return MaskPicture(mask, colour, _sidecar_pitch_m(path.with_suffix(".json"), mask.shape[1]))
 
 
 def _pixels(path: Path) -> Float[np.ndarray, "y x k"]:

@@ -10,7 +10,7 @@ from sim.imaging.scene import Obstruction
 from sim.obstruction.dirt import Dirt
 from sim.obstruction.parameters import require_number
 from sim.obstruction.raindrop import Raindrop
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = ["DirtRaindrop"]
 
@@ -39,7 +39,7 @@ class DirtRaindrop:
         """
         require_number(f"{self.name}: dirt_share", self.dirt_share, 0.0, 1.0)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Toss the coin and draw (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Toss the coin and draw (see `sim.obstruction.parameters.ObstructionKind`)."""
         kind = self.dirt if rng.uniform() < self.dirt_share else self.raindrop
         return kind.draw(rng, view, background)

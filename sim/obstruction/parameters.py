@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from fab.errors import InputError
 from sim.imaging.scene import Obstruction
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
-__all__ = ["Kind", "Range", "draw_from", "require_depth", "require_number", "require_range"]
+__all__ = ["ObstructionKind", "Range", "draw_from", "require_depth", "require_number", "require_range"]
 
 # A value is drawn uniformly from here to there; twice the same number is that number.
 Range = tuple[float, float]
@@ -19,10 +19,10 @@ _FARTHEST_M = 100.0
 
 
 @runtime_checkable
-class Kind(Protocol):
+class ObstructionKind(Protocol):
     """A kind of obstruction: its parameters, and a way to draw one."""
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Draw one obstruction.
 
         Args:

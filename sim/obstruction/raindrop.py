@@ -30,7 +30,7 @@ from scipy.ndimage import map_coordinates
 
 from sim.imaging.scene import Obstruction
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = ["Drop", "Raindrop"]
 
@@ -92,8 +92,8 @@ class Raindrop:
             require_range(f"{self.name}: {name}", getattr(self, name), low, high)
         require_number(f"{self.name}: surroundings_rad", self.surroundings_rad, 0.01, pi)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw a glass with drops (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw a glass with drops (see `sim.obstruction.parameters.ObstructionKind`)."""
         view.require(background)
         depth_m, tilt, airflow = (draw_from(rng, given) for given in (self.depth_m, self.tilt_rad, self.airflow_rad))
         contrast = draw_from(rng, self.contrast)
@@ -112,7 +112,7 @@ class Raindrop:
             mask[window] = np.maximum(mask[window], cover)
         return Obstruction(mask, radiance, depth_m)
 
-    def drops(self, rng: np.random.Generator, view: View, depth_m: float, airflow: float) -> "list[Drop]":
+    def drops(self, rng: np.random.Generator, view: CameraView, depth_m: float, airflow: float) -> "list[Drop]":
         """Draw drops that reach into the frame and do not touch."""
         pixel_m = view.pixel_at_m(depth_m)
         reach = self.radius_m[1] * max(1.0, self.elongation[1]) / pixel_m
@@ -177,7 +177,7 @@ class Drop(NamedTuple):
     length: float
     airflow: float
 
-    def window(self, view: View) -> tuple[slice, slice]:
+    def window(self, view: CameraView) -> tuple[slice, slice]:
         """Rows and columns of the frame that it may reach."""
         reach = max(self.radius, self.length) + 1
         rows, columns = (
@@ -186,7 +186,7 @@ class Drop(NamedTuple):
         )
         return rows, columns
 
-    def centred(self, view: View) -> bool:
+    def centred(self, view: CameraView) -> bool:
         """Whether its middle lies in the frame."""
         return all(-0.5 <= at <= n - 0.5 for at, n in zip((self.y, self.x), view.shape, strict=True))
 
@@ -222,7 +222,7 @@ class Drop(NamedTuple):
         c, s = np.float32(cos(self.airflow)), np.float32(sin(self.airflow))
         return s * with_flow + c * beside, c * with_flow - s * beside
 
-    def slope(self, view: View) -> tuple[float, float]:
+    def slope(self, view: CameraView) -> tuple[float, float]:
         """Tangents (y, x) of its direction."""
         y, x = (
             (at - (n - 1) / 2) * view.pixel_m / view.focal_m for at, n in zip((self.y, self.x), view.shape, strict=True)
@@ -287,7 +287,7 @@ def _refract(ray: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], ratio:
     return ratio * ray + (np.sqrt(1 - ratio**2 * (1 - cosine**2)) - ratio * cosine) * normal
 
 
-def _with(drops: list[Drop], new: Drop, view: View) -> list[Drop]:
+def _with(drops: list[Drop], new: Drop, view: CameraView) -> list[Drop]:
     rows, columns = new.window(view)
     seen = rows.start < rows.stop and columns.start < columns.stop
     return [*drops, new] if seen and not any(new.touches(old) for old in drops) else drops

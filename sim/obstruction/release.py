@@ -18,7 +18,7 @@ from sim.light import linear_from_srgb, srgb_from_linear
 from sim.obstruction.fence import Fence
 from sim.obstruction.noise import gradients, perlin
 from sim.obstruction.parameters import Range, draw_from, require_depth, require_range
-from sim.obstruction.view import View
+from sim.obstruction.view import CameraView
 
 __all__ = ["ReleaseDirt", "ReleaseFence", "ReleaseRaindrop"]
 
@@ -51,8 +51,8 @@ class ReleaseDirt:
         """
         require_depth(self.name, self.depth_m)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one dirty glass (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw one dirty glass (see `sim.obstruction.parameters.ObstructionKind`)."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         spans = [n / view.pixels(_CELL_M, depth_m) for n in view.shape]
@@ -106,8 +106,8 @@ class ReleaseRaindrop:
         require_depth(self.name, self.depth_m)
         require_range(f"{self.name}: radius_m", self.radius_m, 1e-5, 0.02)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw a glass with drops (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw a glass with drops (see `sim.obstruction.parameters.ObstructionKind`)."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         display = srgb_from_linear(background.astype(np.float32))
@@ -168,8 +168,8 @@ class ReleaseFence:
         require_depth(self.name, self.depth_m)
         require_range(f"{self.name}: wire_m", self.wire_m, 1e-5, 0.1)
 
-    def draw(self, rng: np.random.Generator, view: View, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one fence (see `sim.obstruction.parameters.Kind`)."""
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Draw one fence (see `sim.obstruction.parameters.ObstructionKind`)."""
         wire_m, mesh = draw_from(rng, self.wire_m), rng.uniform(8, 14)
         fence = Fence(
             depth_m=self.depth_m,

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["View"]
+__all__ = ["CameraView"]
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """A frame of pixels behind a lens, in central perspective through the middle of the aperture.
 
     Attributes:

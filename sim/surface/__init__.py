@@ -27,6 +27,6 @@ numbers), `pieces` (what is open where, and its light), `edges` (walls and corne
 (the way in).
 """
 
-from sim.surface.plate import Surface, as_fabricated
+from sim.surface.plate import FabricatedDoe, as_fabricated
 
-__all__ = ["Surface", "as_fabricated"]
+__all__ = ["FabricatedDoe", "as_fabricated"]

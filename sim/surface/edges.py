@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim.surface.cell import Cuts, axis_moments, axis_values, plane_moments, point_moments
 from sim.surface.pieces import STATES, Pair, summed, turned, weighted
-from sim.surface.relief import Plan, Relief, effective_bias
+from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
 
 def walls(
@@ -17,9 +17,9 @@ def walls(
     depth: Float[Array, "p c"],
     along_y: Cuts,
     along_x: Cuts,
-    relief: Relief,
+    relief: EtchParameters,
     rates: Float[Array, " w"],
-    plan: Plan,
+    plan: TilePlan,
 ) -> Float[Array, "m 2 w c"]:
     """What tilted walls do besides shifting the wall (`effective_bias`), along every line.
 
@@ -64,9 +64,9 @@ def corners(
     kinds: Bool[Array, "mask j i c"],
     along_y: Cuts,
     along_x: Cuts,
-    relief: Relief,
+    relief: EtchParameters,
     rates: Float[Array, " w"],
-    plan: Plan,
+    plan: TilePlan,
 ) -> Float[Array, "m 2 w c"]:
     """What rounding changes where exactly one of the four pieces around a crossing of a mask's lines differs.
 

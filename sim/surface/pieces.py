@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim.surface.cell import Cuts
-from sim.surface.relief import Plan
+from sim.surface.relief import TilePlan
 
 TILE = 32  # cells
 PRECISION = jax.lax.Precision.HIGHEST
@@ -31,7 +31,7 @@ def mask_states(
     mask: Int[Array, ""],
     bias: Float[Array, ""],
     kinds: range,
-    plan: Plan,
+    plan: TilePlan,
 ) -> Float[Array, "j i t t"]:
     """What is left open of one mask in each of its kinds of piece, for all cells of a tile.
 

@@ -20,7 +20,7 @@ from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 
 
-class Surface(eqx.Module):
+class FabricatedDoe(eqx.Module):
     """A plate with its chrome.
 
     Attributes:
@@ -52,7 +52,7 @@ def as_fabricated(
     process: Process,
     variation: Variation,
     wavelengths_m: tuple[float, ...] | None = None,
-) -> Surface:
+) -> FabricatedDoe:
     """Predict the plate that the masks of a level map and a process with given errors make.
 
     Args:
@@ -77,7 +77,7 @@ def as_fabricated(
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return Surface(flat, flat, coverage, camera.grid, lines, height)
+        return FabricatedDoe(flat, flat, coverage, camera.grid, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan = plan_of(camera, process, variation, min(lines), traced)
@@ -94,7 +94,7 @@ def as_fabricated(
     if loss is not None:
         transmission, means = transmission * loss[:, None, None], means * loss[:, None, None]
     grid = _refined(camera.grid, plan.parts)
-    return Surface(transmission, means, _coverage(grid, camera, variation, traced), grid, lines)
+    return FabricatedDoe(transmission, means, _coverage(grid, camera, variation, traced), grid, lines)
 
 
 def _flat(height_m: Array, rate: Array) -> Array:

@@ -26,7 +26,7 @@ jax.tree_util.register_dataclass(
 _BAND = 0.46  # waves per cell up to which second moments and their filters do
 
 
-class Relief(NamedTuple):
+class EtchParameters(NamedTuple):
     """What all tiles share; leaves that are None are not needed.
 
     Attributes:
@@ -58,7 +58,7 @@ class Relief(NamedTuple):
     height_m: Array
 
 
-class Plan(NamedTuple):
+class TilePlan(NamedTuple):
     """What a compiled surface depends on besides its arrays. Hashable."""
 
     grid: Grid
@@ -72,7 +72,7 @@ class Plan(NamedTuple):
     walls: bool
 
 
-def effective_bias(relief: Relief) -> Float[Array, " mask"]:
+def effective_bias(relief: EtchParameters) -> Float[Array, " mask"]:
     """Growth of openings per edge, a tilted wall counted as an upright one in the middle of its slope."""
     return relief.bias_m - relief.depth_m * relief.slope / 2
 
@@ -81,7 +81,7 @@ def effective_bias(relief: Relief) -> Float[Array, " mask"]:
 _MOST, _TRACED_REACH = 8, 3
 
 
-def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> Plan:
+def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> TilePlan:
     """What has to be computed for these errors; everything that may be, where they are not known yet (`traced`).
 
     Raises:
@@ -102,7 +102,7 @@ def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: 
             raise InputError("variation.overlay", rule, format_length(float(shifts.max())), "Align better.")
     needed = _widest_band(camera, shortest_m)
     parts = int(np.ceil(needed / _BAND - 1e-9)) if cut else 1
-    return Plan(
+    return TilePlan(
         grid, process.masks, process.die_m, parts, reach, min(needed / parts, _BAND), cut, corners, walls
     )  # fmt: skip
 
@@ -131,7 +131,7 @@ def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.n
     )
 
 
-def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x"] | None = None) -> Relief:
+def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x"] | None = None) -> EtchParameters:
     """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
     masks = process.masks
     per_mask = partial(_per_mask, masks=masks)
@@ -149,7 +149,7 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
     )
     radius = process.wafer_radius_m
     tilt = jnp.stack([jnp.asarray(variation.linear_nonuniformity_y), jnp.asarray(variation.linear_nonuniformity_x)])
-    return Relief(
+    return EtchParameters(
         depth_m=jnp.asarray((nominal * (1 + repeats)).astype(np.float32)) * scale,
         shift_m=shift,
         turn=turn,

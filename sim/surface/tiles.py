@@ -18,16 +18,16 @@ from sim.surface.cell import (
 )
 from sim.surface.edges import corners, walls
 from sim.surface.pieces import PRECISION, STATES, TILE, light_of, mask_states, summed
-from sim.surface.relief import Plan, Relief, effective_bias
+from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
 
 @partial(jax.jit, static_argnames=("plan",))
 def transmission_of(
     etched: UInt8[Array, "y x"],
     widths: UInt8[Array, "mask y x"] | None,
-    relief: Relief,
+    relief: EtchParameters,
     rates: Float[Array, " w"],
-    plan: Plan,
+    plan: TilePlan,
 ) -> tuple[Complex[Array, "w v u"], Complex[Array, "w v u"]]:
     """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean."""
     ny, nx = plan.grid.shape
@@ -62,11 +62,11 @@ def transmission_of(
 
 def _tile_moments(
     states: Float[Array, "mask side side"],
-    relief: Relief,
+    relief: EtchParameters,
     bump: Float[Array, "t t"] | None,
     start: tuple[Array, Array],
     rates: Float[Array, " w"],
-    plan: Plan,
+    plan: TilePlan,
 ) -> Float[Array, "moment 2 w t t"]:
     """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which)."""
     pitch, tile = plan.grid.pitch_m, TILE
@@ -112,7 +112,7 @@ def _tile_moments(
 
 
 def _strip_values(
-    moments: Float[Array, "tile moment 2 w t t"], plan: Plan
+    moments: Float[Array, "tile moment 2 w t t"], plan: TilePlan
 ) -> tuple[Complex[Array, "w v u"], Complex[Array, "w y u"]]:
     """One row of tiles as values of its cells, with what spills to `FILTER_REACH` cells above and below; and means."""
     count, _, _, lines = moments.shape[:4]

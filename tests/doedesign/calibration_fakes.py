@@ -12,13 +12,13 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from doedesign.calibration.forward_model import Bench
+from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.unknowns import unknowns_of
 from doedesign.prediction import Drawn
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside
-from fab.process import Process, Spread, error_names
+from fab.process import Normal, Process, error_names
 from sim.camera import Camera, Colour
 from sim.psf_bank import PsfBank
 from sim.store import write_bank
@@ -50,10 +50,10 @@ def plate_drawn(cells: int = 200, count: int = 16, relief: float = 1.0, window: 
 
 
 def usual_process(drawn: Drawn, **sigmas: float) -> Process:
-    """A process with ordinary spreads; `sigmas` by key of `fab.process.ERRORS` replace them."""
+    """A process with ordinary spreads; `sigmas` by key of `fab.process.DEVIATIONS` replace them."""
     spreads = {"common_depth_scale": 0.03, "common_cd_bias_m": 0.15e-6, "overlay_y_m": 0.5e-6, "overlay_x_m": 0.5e-6}
     masks = drawn.levels.bits
-    each = {n: Spread(0.0, s) for key, s in {**spreads, **sigmas}.items() for n in error_names(masks, key) if s}
+    each = {n: Normal(0.0, s) for key, s in {**spreads, **sigmas}.items() for n in error_names(masks, key) if s}
     return Process(drawn.levels, spreads=each, name="usual")
 
 
@@ -64,10 +64,10 @@ def light_of(
 
     The chief ray misses the middle of the frame by `SHIFT`.
     """
-    unknowns = unknowns_of(replace(process, spreads={n: Spread(v, 0.0) for n, v in hidden.items()}), ["etch_lag"])
+    unknowns = unknowns_of(replace(process, spreads={n: Normal(v, 0.0) for n, v in hidden.items()}), ["etch_lag"])
     probe = Colour("probe", (PROBE_M,), (1.0,))
     camera = replace(drawn.camera, colours=(probe,), window=drawn.camera.window + margin)
-    seen = Bench(drawn.level, camera, process, unknowns, tuple(depths_m)).plate(np.zeros(1))
+    seen = ForwardModel(drawn.level, camera, process, unknowns, tuple(depths_m)).plate(np.zeros(1))
     whole = [round(s) for s in SHIFT]
     part = np.array([s - w for s, w in zip(SHIFT, whole, strict=True)] + [0.0])
     # The frame is wider still; what little light falls there is left out.

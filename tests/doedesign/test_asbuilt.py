@@ -18,7 +18,7 @@ from doedesign.spec import load_variation
 from fab.errors import InputError
 from fab.layout.structures import PAD_SIDES_UM
 from fab.levels import Levels
-from fab.process import Process, Spread, Variation
+from fab.process import Normal, Process, Variation
 from fab.runsheet.as_built import AsBuilt, ChromeMeasured, MaskMeasured
 from fab.runsheet.write import record
 from fab.units import NM, UM
@@ -216,7 +216,7 @@ def test_lag_is_never_negative_and_one_pad_alone_takes_the_mean():
     found = plate_of(measured(MaskMeasured(depths_m=rising), NOTHING), IDEAL)
     assert found.variation.etch_lag == 0
     assert found.variation.depth_scale == pytest.approx((0.01, 0.0))
-    process = Process(LEVELS, spreads={"etch_lag": Spread(0.5, 0.1)})
+    process = Process(LEVELS, spreads={"etch_lag": Normal(0.5, 0.1)})
     one = plate_of(measured(MaskMeasured(depths_m=pads(306 * NM, 0.5)[:1]), NOTHING), process)
     assert one.variation.etch_lag == 0.5
     assert one.variation.depth_scale == pytest.approx((0.02, 0.0), abs=1e-6)

@@ -9,13 +9,13 @@ import pytest
 
 from doedesign.calibration import Calibration, calibrate, load_shots, unknowns_of
 from doedesign.calibration.fit import search
-from doedesign.calibration.forward_model import Bench
-from doedesign.calibration.objective import Question, linearised, look, look_and_gradient, slopes_at
+from doedesign.calibration.forward_model import ForwardModel
+from doedesign.calibration.objective import FitObjective, linearised, look, look_and_gradient, slopes_at
 from doedesign.calibration.target import measured_weights
 from doedesign.calibration.uncertainty import posterior
 from doedesign.prediction import Drawn
 from fab.errors import InputError
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
 
 NEAR_M, FAR_M = 6e-3, np.inf
@@ -60,7 +60,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def question(tmp_path_factory: pytest.TempPathFactory) -> Question:
+def question(tmp_path_factory: pytest.TempPathFactory) -> FitObjective:
     """A small measurement of four errors, before the search."""
     drawn, process = small()
     return measured(tmp_path_factory.mktemp("small"), drawn, process, FEW).question
@@ -109,11 +109,11 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
     bench, at = loop.question.bench, loop.fit.lens.look
     nothing = unknowns_of(replace(loop.process, spreads=loop.process.spreads), ["etch_lag"])
     assert dict(nothing.fixed) == {name: spread.mean for name, spread in loop.process.spreads.items()}
-    again = Bench(bench.level, bench.camera, loop.process, nothing, bench.depths_m).plate(np.zeros(1))
+    again = ForwardModel(bench.level, bench.camera, loop.process, nothing, bench.depths_m).plate(np.zeros(1))
     for i, image in enumerate(at.images):
         predicted = again.image(i, loop.question.motion(at.scores, i))
         np.testing.assert_allclose(predicted, image, rtol=0, atol=1e-5 * image.max())  # single precision
-    assert loop.process.spreads["overlay_x_m[0]"] == Spread(0.0, 0.0)  # the reference
+    assert loop.process.spreads["overlay_x_m[0]"] == Normal(0.0, 0.0)  # the reference
     assert loop.process.spreads["common_depth_scale"].sigma < 0.001
 
 
@@ -216,10 +216,10 @@ def test_an_error_beyond_its_range_ends_at_the_end(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_the_global_search_helps_where_steps_end_astray(question: Question):
+def test_the_global_search_helps_where_steps_end_astray(question: FitObjective):
     """From a start two standard deviations off in everything, and the same for the same seed."""
     far = replace(question.bench.unknowns, start=question.bench.unknowns.high * 0.9)
-    astray = Question(replace(question.bench, unknowns=far), question.targets)
+    astray = FitObjective(replace(question.bench, unknowns=far), question.targets)
     alone = search(astray)
     helped = [search(astray, evaluations=80, seed=3) for _ in range(2)]
     assert helped[0].lens.look.objective <= alone.lens.look.objective
@@ -229,13 +229,13 @@ def test_the_global_search_helps_where_steps_end_astray(question: Question):
         assert value == pytest.approx(FEW[name], abs=0.05 * far.sigma[far.names.index(name)]), name
 
 
-def scores_near_the_truth(question: Question) -> np.ndarray:
+def scores_near_the_truth(question: FitObjective) -> np.ndarray:
     unknowns = question.bench.unknowns
     values = np.array([FEW[name] for name in unknowns.names])
     return np.concatenate([unknowns.scores(values) + 0.05, np.full(len(question.motions), 0.02)])
 
 
-def test_slopes_of_the_objective(question: Question):
+def test_slopes_of_the_objective(question: FitObjective):
     """Gauss-Newton's half gradient is that of the objective."""
     weights = tuple(measured_weights(target, 0.01) for target in question.targets)
     scores = scores_near_the_truth(question)
@@ -250,7 +250,7 @@ def test_slopes_of_the_objective(question: Question):
 
 
 @pytest.mark.slow
-def test_the_exact_gradient_agrees_and_polishes_nothing_away(question: Question):
+def test_the_exact_gradient_agrees_and_polishes_nothing_away(question: FitObjective):
     """Backwards through light and plate: the same slope as central differences, and the same place to end."""
     weights = tuple(measured_weights(target, 0.01) for target in question.targets)
     scores = scores_near_the_truth(question)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.build import process_of
+from doedesign.build import process_from_spec
 from doedesign.prediction import drawn_of
 from doedesign.runs.folder import open_run
 from doedesign.spec import load_process, load_variation
@@ -106,7 +106,7 @@ def test_the_estimate_is_a_process_like_any_other(run: Path, fitted: tuple[int, 
     text = (folder / "process-estimate.toml").read_text()
     for name, digest in record["measurement_sha256"].items():
         assert f"# {name}: sha256 {digest}" in text
-    process = process_of(load_process(folder / "process-estimate.toml"))
+    process = process_from_spec(load_process(folder / "process-estimate.toml"))
     for error in record["errors"]:
         spread = process.spreads[error["name"]]
         assert (spread.mean, spread.sigma) == (error["value"], error["sigma"])

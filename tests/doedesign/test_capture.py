@@ -5,8 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.build import camera_of
-from doedesign.capture.from_spec import obstruction_of, occlusion_of, outside_of, seen_in, sensor_of, shown_as
+from doedesign.build import camera_from_spec
+from doedesign.capture.from_spec import (
+    channels_from_rgb,
+    obstruction_from_spec,
+    occlusion_from_spec,
+    outside_from_kind,
+    rgb_from_channels,
+    sensor_from_spec,
+)
 from doedesign.capture.image_files import read_image, write_image
 from doedesign.spec import load_spec, scene, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
@@ -57,14 +64,14 @@ def test_everything_said_reads_back(tmp_path: Path):
 
 
 def test_the_sensor():
-    assert sensor_of(spec_of(path=PLAIN)) == Sensor()
+    assert sensor_from_spec(spec_of(path=PLAIN)) == Sensor()
     said = spec_of(
         "sensor.full_well=5000", "sensor.bits=10", "sensor.quantum_efficiency=[0.4, 0.6, 0.5]", path=AUTOMOTIVE
     )
-    made = sensor_of(said)
+    made = sensor_from_spec(said)
     assert (made.full_well_e, made.bits, made.quantum_efficiency) == (5000, 10, (0.4, 0.6, 0.5))
     with pytest.raises(InputError, match="sensor: black_level must lie below 255"):
-        sensor_of(spec_of("sensor.bits=8", "sensor.black_level=300"))
+        sensor_from_spec(spec_of("sensor.bits=8", "sensor.black_level=300"))
 
 
 @pytest.mark.parametrize(
@@ -97,34 +104,34 @@ def test_a_mosaic_needs_three_colours_in_order():
 
 
 def test_the_occlusion_model_has_no_default():
-    assert occlusion_of(spec_of(), "a.toml") == "radiometric"
-    assert occlusion_of(spec_of(), "a.toml", "paper") == "paper"
+    assert occlusion_from_spec(spec_of(), "a.toml") == "radiometric"
+    assert occlusion_from_spec(spec_of(), "a.toml", "paper") == "paper"
     with pytest.raises(InputError, match=r'a\.toml: scene\.occlusion: .*Add occlusion = "reciprocal" to \[scene\]'):
-        occlusion_of(spec_of(path=PLAIN), "a.toml")
+        occlusion_from_spec(spec_of(path=PLAIN), "a.toml")
     with pytest.raises(InputError, match=r"--occlusion: .*Did you mean `radiometric`"):
-        occlusion_of(spec_of(), "a.toml", "radiometrc")
+        occlusion_from_spec(spec_of(), "a.toml", "radiometrc")
 
 
 def test_the_obstruction_stands_where_the_plate_was_made_for():
-    assert obstruction_of(spec_of(), "a.toml") == Dirt(depth_m=(0.05, 0.12))
+    assert obstruction_from_spec(spec_of(), "a.toml") == Dirt(depth_m=(0.05, 0.12))
     dslr = spec_of(path=EXAMPLES / "dslr.toml")
-    assert obstruction_of(dslr, "a.toml") == Fence(depth_m=(0.4, 0.8))
-    mixed = obstruction_of(dslr, "a.toml", "dirt_raindrop")
+    assert obstruction_from_spec(dslr, "a.toml") == Fence(depth_m=(0.4, 0.8))
+    mixed = obstruction_from_spec(dslr, "a.toml", "dirt_raindrop")
     assert isinstance(mixed, DirtRaindrop)
     assert mixed.dirt.depth_m == mixed.raindrop.depth_m == (0.4, 0.8)
-    assert obstruction_of(spec_of("scene.near=[]", path=PLAIN), "a.toml", "dirt") == Dirt()
-    assert outside_of(mixed) == outside_of(obstruction_of(dslr, "a.toml", "raindrop")) == "nothing"
-    assert outside_of(Dirt()) == "scene"
+    assert obstruction_from_spec(spec_of("scene.near=[]", path=PLAIN), "a.toml", "dirt") == Dirt()
+    assert outside_from_kind(mixed) == outside_from_kind(obstruction_from_spec(dslr, "a.toml", "raindrop")) == "nothing"
+    assert outside_from_kind(Dirt()) == "scene"
 
 
 def test_options_are_physical_parameters_with_units():
     options = 'obstruction.options={clump=["1 mm", "2 mm"], blur="50 um", octaves=3, depth="7 cm", coverage=[0.2, 0.3]}'
-    made = obstruction_of(spec_of(options), "a.toml")
+    made = obstruction_from_spec(spec_of(options), "a.toml")
     assert made == Dirt(depth_m=(0.07, 0.07), clump_m=(1e-3, 2e-3), blur_m=(5e-5, 5e-5), octaves=3, coverage=(0.2, 0.3))
     # They are those of the spec's kind; another one named on the command line has its usual ones.
-    assert obstruction_of(spec_of(options), "a.toml", "fence") == Fence(depth_m=(0.05, 0.12))
+    assert obstruction_from_spec(spec_of(options), "a.toml", "fence") == Fence(depth_m=(0.05, 0.12))
     fence = spec_of("obstruction.kind=fence", 'obstruction.options={tilt=["0 deg", "10 deg"], patterns=["bars"]}')
-    made = obstruction_of(fence, "a.toml")
+    made = obstruction_from_spec(fence, "a.toml")
     assert isinstance(made, Fence)
     assert made.tilt_rad == pytest.approx((0, np.radians(10)))
     assert made.patterns == ("bars",)
@@ -141,7 +148,7 @@ def test_options_are_physical_parameters_with_units():
 )
 def test_options_that_make_no_sense(options: str, words: list[str]):
     with pytest.raises(InputError) as caught:
-        obstruction_of(spec_of(f"obstruction.options={options}"), "a.toml")
+        obstruction_from_spec(spec_of(f"obstruction.options={options}"), "a.toml")
     for word in ["a.toml", *words]:
         assert word in str(caught.value)
 
@@ -154,32 +161,32 @@ def test_a_folder_of_masks(tmp_path: Path):
     values[5:10] = 255
     Image.fromarray(values).save(tmp_path / "masks" / "bar.png")
     spec = spec_of("obstruction.kind=folder", 'obstruction.options={folder="masks", width="5 cm"}')
-    made = obstruction_of(spec, str(tmp_path / "a.toml"))
+    made = obstruction_from_spec(spec, str(tmp_path / "a.toml"))
     assert isinstance(made, MaskFolder)
     assert (made.width_m, made.depth_m) == (0.05, (0.05, 0.12))
     (tmp_path / "masks" / "bar.json").write_text('{"width_m": 0.04}')
-    assert isinstance(obstruction_of(spec_of(), "a.toml", str(tmp_path / "masks")), MaskFolder)
+    assert isinstance(obstruction_from_spec(spec_of(), "a.toml", str(tmp_path / "masks")), MaskFolder)
     with pytest.raises(InputError, match="kind of obstruction, or a folder"):
-        obstruction_of(spec_of(), "a.toml", str(tmp_path / "none"))
+        obstruction_from_spec(spec_of(), "a.toml", str(tmp_path / "none"))
     with pytest.raises(InputError, match="folder"):
-        obstruction_of(spec_of("obstruction.kind=folder"), "a.toml")
+        obstruction_from_spec(spec_of("obstruction.kind=folder"), "a.toml")
     with pytest.raises(InputError, match="an obstruction must be named"):
-        obstruction_of(spec_of(path=PLAIN), "a.toml")
+        obstruction_from_spec(spec_of(path=PLAIN), "a.toml")
 
 
 def test_colours_of_a_picture_in_those_of_a_camera():
     light = np.stack([np.full((2, 3), value, np.float32) for value in (0.1, 0.5, 0.9)])
-    camera = camera_of(spec_of())
-    assert np.array_equal(seen_in(light, camera), light)
-    turned = camera_of(spec_of('optics.wavelengths=["486 nm", "656 nm", "589 nm"]'))
-    seen = seen_in(light, turned)
+    camera = camera_from_spec(spec_of())
+    assert np.array_equal(channels_from_rgb(light, camera), light)
+    turned = camera_from_spec(spec_of('optics.wavelengths=["486 nm", "656 nm", "589 nm"]'))
+    seen = channels_from_rgb(light, turned)
     assert seen[:, 0, 0] == pytest.approx([0.9, 0.1, 0.5])
-    assert np.array_equal(shown_as(seen, turned), light)
-    single = camera_of(spec_of('optics.wavelengths=["550 nm"]'))
-    assert seen_in(light, single)[0, 0, 0] == pytest.approx(0.2126 * 0.1 + 0.7152 * 0.5 + 0.0722 * 0.9)
-    assert shown_as(seen_in(light, single), single).shape == (3, 2, 3)
+    assert np.array_equal(rgb_from_channels(seen, turned), light)
+    single = camera_from_spec(spec_of('optics.wavelengths=["550 nm"]'))
+    assert channels_from_rgb(light, single)[0, 0, 0] == pytest.approx(0.2126 * 0.1 + 0.7152 * 0.5 + 0.0722 * 0.9)
+    assert rgb_from_channels(channels_from_rgb(light, single), single).shape == (3, 2, 3)
     with pytest.raises(InputError, match="three colours, or of one"):
-        seen_in(light, camera_of(spec_of('optics.wavelengths=["550 nm", "600 nm"]')))
+        channels_from_rgb(light, camera_from_spec(spec_of('optics.wavelengths=["550 nm", "600 nm"]')))
 
 
 @pytest.mark.parametrize("png", [False, True])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from doedesign.design.etch_depths import choose_depths, heights_of, held, light_cost
-from doedesign.design.optimize import State, finished_design, initial_state, steps
-from doedesign.design.parametrize import PACE, Staircase
+from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
+from doedesign.design.parametrize import DEPTH_SCALE, LevelParametrization
 from doedesign.design.problem import losses, problem_of, view_of
 from doedesign.spec import Spec, load_spec
 from fab.grid import Grid
@@ -37,7 +37,7 @@ def unread(path: Path) -> np.ndarray:
     raise AssertionError(path)
 
 
-def run(spec: Spec, start: State | None = None, stop: int | None = None) -> State:
+def run(spec: Spec, start: OptimizationState | None = None, stop: int | None = None) -> OptimizationState:
     problem, scene = problem_of(spec, {})
     state = start or initial_state(spec, problem, scene, {}, unread)
     for state, _ in steps(spec, problem, scene, state):  # noqa: B020 - the last state is the result
@@ -121,7 +121,7 @@ def test_where_nothing_is_better_2_to_the_k_steps_stay() -> None:
 
 @pytest.mark.parametrize("levels", [UNEVEN, Levels(4, 300e-9, (500e-9, 150e-9)), Levels(8, 150e-9, (1e-7, 3e-7, 7e-7))])
 def test_the_loop_takes_the_levels_that_are_drawn(levels: Levels) -> None:
-    staircase = Staircase.at("fused_silica", 550e-9, levels)
+    staircase = LevelParametrization.at("fused_silica", 550e-9, levels)
     radians = jnp.asarray(np.random.default_rng(2).uniform(-20, 20, 4000), jnp.float32)
     continuous = np.asarray(staircase.continuous_m(radians), np.float64)
     level = np.asarray(staircase.level(jnp.asarray(continuous, jnp.float32)))
@@ -149,7 +149,7 @@ def test_depths_given_as_2_to_the_k_steps_change_no_bit() -> None:
 
 @pytest.mark.parametrize("softness", [0.0, 0.5])
 def test_gradient_of_the_heights_by_the_depths(softness: float) -> None:
-    staircase = Staircase.at("fused_silica", 550e-9, UNEVEN)
+    staircase = LevelParametrization.at("fused_silica", 550e-9, UNEVEN)
     rng = np.random.default_rng(3)
     radians, weight = (jnp.asarray(rng.uniform(0, 6, 500), jnp.float32) for _ in range(2))
 
@@ -216,7 +216,7 @@ def test_the_design_stands_on_the_chosen_levels() -> None:
     state = run(spec)
     design = finished_design(spec, problem, state)
     assert state.stretch is not None
-    learnt = np.array([300e-9, 600e-9]) * np.exp(PACE * state.stretch)
+    learnt = np.array([300e-9, 600e-9]) * np.exp(DEPTH_SCALE * state.stretch)
     # A recipe holds tenths of a nanometre.
     np.testing.assert_allclose(design.levels.depths_m, learnt, atol=0.051 * NM)
     assert not design.levels.is_binary

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.objectives import View, far_spot, handcrafted, near_spread, terms_of, window_loss
+from doedesign.design.objectives import PsfSet, far_spot, handcrafted, near_spread, terms_of, window_loss
 from doedesign.design.patterns import target_pattern_image
 from doedesign.spec import load_spec
 from fab.errors import InputError
@@ -21,8 +21,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 CAMERA = Camera(Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64)
 
 
-def view(near: np.ndarray, far: np.ndarray, lens: float = 1.0) -> View:
-    return View(jnp.asarray(near)[None, None], jnp.asarray(far)[None, None], jnp.full((1, 1), lens), CAMERA)
+def view(near: np.ndarray, far: np.ndarray, lens: float = 1.0) -> PsfSet:
+    return PsfSet(jnp.asarray(near)[None, None], jnp.asarray(far)[None, None], jnp.full((1, 1), lens), CAMERA)
 
 
 def even() -> np.ndarray:
@@ -69,13 +69,13 @@ def test_handcrafted_is_zero_at_its_targets() -> None:
 
 def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:
     spec = load_spec(EXAMPLES / "beam_splitter.toml")
-    from doedesign.build import camera_of
+    from doedesign.build import camera_from_spec
 
-    camera = camera_of(spec)
+    camera = camera_from_spec(spec)
     (term,) = terms_of(spec, camera, {})
     target = target_pattern_image(camera, dict(spec.objectives[0].options), None, "objective")
     assert target.sum() == pytest.approx(1.0, abs=1e-5)
-    images = View(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
+    images = PsfSet(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
     assert float(term.value(images)) == pytest.approx(0.0, abs=1e-9)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.optimize import State, finished_design, initial_state, steps
+from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
 from doedesign.design.problem import losses, problem_of, view_of
 from doedesign.spec import Spec, load_spec
 from fab.levels import quantise
@@ -21,7 +21,9 @@ def unread(path: Path) -> np.ndarray:
     raise AssertionError(path)
 
 
-def run(spec: Spec, start: State | None = None, stop: int | None = None) -> tuple[State, list[float]]:
+def run(
+    spec: Spec, start: OptimizationState | None = None, stop: int | None = None
+) -> tuple[OptimizationState, list[float]]:
     problem, scene = problem_of(spec, {})
     begun = start or initial_state(spec, problem, scene, {}, unread)
     state, history = begun, []

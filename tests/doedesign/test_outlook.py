@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.lab.predictions import foretold, grating_orders, matters_of
+from doedesign.lab.predictions import grating_orders, matters_of, predict_sheet
 from doedesign.prediction import Drawn, predict, process_with_moves
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.masks import unetched_outside
-from fab.process import Process, Spread, Variation
+from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour
 from sim.material import refractive_index
@@ -76,9 +76,9 @@ def test_no_other_etch_makes_up_for_a_wrong_depth():
 
 
 def test_the_outlook_is_the_prediction_of_one_depth(drawn):
-    spreads = {"common_depth_scale": Spread(0.03, 0.01), "overlay_x_m[3]": Spread(0.1 * UM, 0.3 * UM)}
+    spreads = {"common_depth_scale": Normal(0.03, 0.01), "overlay_x_m[3]": Normal(0.1 * UM, 0.3 * UM)}
     process = Process(LEVELS, spreads=spreads)
-    outlook, picture = foretold(drawn, process, 550e-9)
+    outlook, picture = predict_sheet(drawn, process, 550e-9)
     assert [(seen.depth_m, seen.far_spot) for seen in outlook.drawn] == [(6e-3, None)]
     short = replace(drawn, near_m=(6e-3,), far_m=())
     # The plate as drawn is cut into the pieces of the other one, and added up again in single precision.
@@ -95,7 +95,7 @@ def test_the_outlook_is_the_prediction_of_one_depth(drawn):
 
 
 def test_a_design_without_near_depths_is_foretold_for_its_farthest(drawn):
-    far = foretold(replace(drawn, near_m=()), Process(LEVELS), 550e-9).outlook
+    far = predict_sheet(replace(drawn, near_m=()), Process(LEVELS), 550e-9).outlook
     assert [(seen.depth_m, seen.ring_to_disc) for seen in far.drawn] == [(None, None)]
     assert far.drawn == far.expected
     assert far.matters == ()
@@ -103,27 +103,27 @@ def test_a_design_without_near_depths_is_foretold_for_its_farthest(drawn):
 
 def test_a_height_without_a_full_wave_is_said_so(drawn):
     flat = replace(drawn, level=drawn.level.copy(), levels=Levels(16, 20 * NM), near_m=())
-    assert foretold(flat, Process(flat.levels), 550e-9).outlook.full_wave_m is None
+    assert predict_sheet(flat, Process(flat.levels), 550e-9).outlook.full_wave_m is None
 
 
 def test_compensated_masks_bring_the_expected_plate_back(drawn):
     process = Process(LEVELS, spreads=spreads_of(LEVELS, common_cd_bias_m=(80 * NM, 0.0)))
     moved = process_with_moves(process, (-80 * NM,) * 4)
-    outlook = foretold(drawn, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).outlook
+    outlook = predict_sheet(drawn, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).outlook
     assert moved.expected().common_cd_bias_m + moved.expected().cd_bias_m[0] == 0
     # Widened and narrowed by the same, the plate goes through the model of pieces, which rounds differently.
     for a, b in zip(outlook.drawn, outlook.expected, strict=True):
         assert b.strehl == pytest.approx(a.strehl, abs=1e-5)
-    assert foretold(drawn, process, 550e-9).outlook.expected[0].strehl < 0.99
+    assert predict_sheet(drawn, process, 550e-9).outlook.expected[0].strehl < 0.99
 
 
 def test_the_largest_error_matters_most(drawn):
     spreads = {
-        "overlay_x_m[3]": Spread(0.0, 0.4 * UM),
-        "overlay_y_m[3]": Spread(0.0, 0.4 * UM),
-        "overlay_x_m[0]": Spread(0.0, 0.05 * UM),
-        "depth_scale[3]": Spread(0.0, 0.04),
-        "chrome_x_m": Spread(0.0, 5 * UM),
+        "overlay_x_m[3]": Normal(0.0, 0.4 * UM),
+        "overlay_y_m[3]": Normal(0.0, 0.4 * UM),
+        "overlay_x_m[0]": Normal(0.0, 0.05 * UM),
+        "depth_scale[3]": Normal(0.0, 0.04),
+        "chrome_x_m": Normal(0.0, 5 * UM),
     }
     matters = matters_of(drawn, Process(LEVELS, spreads=spreads), 550e-9)
     assert matters[0].measured == "overlay of mask 4"

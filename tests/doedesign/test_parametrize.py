@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from doedesign.design.parametrize import Staircase, softness_at
+from doedesign.design.parametrize import LevelParametrization, softness_at
 from fab.levels import Levels, height_of, quantise
 
-SIXTEEN = Staircase.at("fused_silica", 550e-9, Levels(16, 75e-9))
+SIXTEEN = LevelParametrization.at("fused_silica", 550e-9, Levels(16, 75e-9))
 
 
 def test_one_radian_is_a_wave_over_two_pi() -> None:

@@ -6,7 +6,7 @@ from matplotlib.image import imread
 
 from doedesign.report.marks import draw_part, draw_view
 from fab.layout.marks import alignment_site
-from fab.layout.part import plates_of
+from fab.layout.part import photomasks_of
 from fab.layout.structures import process_monitor
 from fab.levels import Levels
 from fab.units import NM, UM
@@ -20,7 +20,7 @@ def share(path, colour: tuple[float, float, float], tolerance: float) -> float:
 
 
 def test_parts_are_drawn_the_same_every_time(tmp_path):
-    plates = plates_of(LEVELS, (1, 0), "clear", "liftoff", True)
+    plates = photomasks_of(LEVELS, (1, 0), "clear", "liftoff", True)
     for name in ("a.png", "b.png"):
         draw_part(tmp_path / name, process_monitor(LEVELS, plates, 2 * UM, NM, 2 * UM), plates, "all masks")
     draw_part(tmp_path / "c.png", alignment_site(plates, NM), plates, "one corner", (0, 0, 1e-3, 1e-3))
@@ -33,7 +33,7 @@ def test_parts_are_drawn_the_same_every_time(tmp_path):
     ("tone", "dark", "wafer"), [("clear", (0.3, 0.6), (0.03, 0.2)), ("dark", (0.04, 0.3), (0.06, 0.3))]
 )
 def test_a_dark_field_plate_shows_the_wafer_in_its_windows_only(tmp_path, tone, dark, wafer):
-    plates = plates_of(LEVELS, (1, 0), tone, "none", False)
+    plates = photomasks_of(LEVELS, (1, 0), tone, "none", False)
     draw_view(tmp_path / "view.png", alignment_site(plates, NM), plates[0], plates[1], "mask 1 over the wafer")
     # The plate's grey over glass, and the colour of mask 2; both are the drawing's own.
     assert dark[0] < share(tmp_path / "view.png", (0.27, 0.275, 0.285), 0.03) < dark[1]

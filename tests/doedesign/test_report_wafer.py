@@ -5,7 +5,7 @@ from PIL import Image
 
 from doedesign.report.wafer import draw_wafer
 from fab.layout.frame import draw_frame
-from fab.layout.part import plates_of
+from fab.layout.part import photomasks_of
 from fab.layout.split import splits_of
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
@@ -15,7 +15,7 @@ def drawn(path, wafer):
     levels = Levels(4, 300e-9)
     frame = draw_frame(
         wafer,
-        plates_of(levels, (0, 1), "clear", wafer.chrome, wafer.zero_layer),
+        photomasks_of(levels, (0, 1), "clear", wafer.chrome, wafer.zero_layer),
         levels,
         splits=splits_of(wafer, levels, (0,) * levels.bits, 1e-9),
         stem="A",

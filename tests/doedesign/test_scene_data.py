@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from doedesign.capture.images import Pictures, picture_files
-from doedesign.capture.scenes import Batch, SceneData
+from doedesign.capture.scenes import SceneBatch, SceneData
 from fab.errors import InputError
 from sim.imaging.scene import Obstruction
-from sim.obstruction import Dirt, View
+from sim.obstruction import CameraView, Dirt
 
-VIEW = View((24, 32), 3.7e-6, 8e-3)
+VIEW = CameraView((24, 32), 3.7e-6, 8e-3)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Bar:
     fails: bool = False
     wait_s: float = 0.0
 
-    def draw(self, rng: np.random.Generator, view: View, background: np.ndarray) -> Obstruction:
+    def draw(self, rng: np.random.Generator, view: CameraView, background: np.ndarray) -> Obstruction:
         if self.fails:
             raise InputError("bar: width", "must be drawn", "none", "Draw it.")
         time.sleep(self.wait_s)
@@ -47,12 +47,12 @@ def data(folder: Path) -> SceneData:
     return SceneData(Pictures(picture_files(folder)), Bar(), VIEW, (5.0, 10.0), seed=3, batch=2)
 
 
-def take(data: SceneData, count: int, start: int = 0) -> list[Batch]:
+def take(data: SceneData, count: int, start: int = 0) -> list[SceneBatch]:
     with data.batches(start, start + count) as batches:
         return list(batches)
 
 
-def same(a: Batch, b: Batch) -> bool:
+def same(a: SceneBatch, b: SceneBatch) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from doedesign.build import camera_of
-from doedesign.capture.scenes import Item
-from doedesign.capture.simulate import Bench, captured, flat_psfs, within
+from doedesign.build import camera_from_spec
+from doedesign.capture.scenes import SceneItem
+from doedesign.capture.simulate import CameraPair, captured, flat_psfs, within
 from doedesign.spec import load_spec
 from sim.imaging.occlusion import Model
 from sim.sensor import Sensor
@@ -20,12 +20,12 @@ from tests.doedesign.test_simulate_command import SPEC
 def test_light_comes_in_over_the_edges(rng: np.random.Generator, tmp_path: Path, model: Model):
     """The middle of a large scene is the same whether its surroundings are real or invented farther out."""
     (tmp_path / "small.toml").write_text(SPEC)
-    camera = replace(camera_of(load_spec(tmp_path / "small.toml")), window=9)
+    camera = replace(camera_from_spec(load_spec(tmp_path / "small.toml")), window=9)
     psfs, quiet = flat_psfs(camera), Sensor(bits=None, noise="none")
-    bench = Bench(camera, psfs, psfs, model, "scene", quiet, 17, "own")
+    bench = CameraPair(camera, psfs, psfs, model, "scene", quiet, 17, "own")
     assert bench.margin_px == 8 + 16 * {"paper": 0, "radiometric": 1, "reciprocal": 2}[model]
     background, radiance = rng.random((2, 3, 104, 96), np.float32)
-    item = Item(background, rng.random((104, 96), np.float32), radiance, 7e-3, 0.6, "noise")
+    item = SceneItem(background, rng.random((104, 96), np.float32), radiance, 7e-3, 0.6, "noise")
     mirrored, key, half = bench._replace(border="reflect"), jax.random.key(1), bench.margin_px // 2
     own, whole = captured(item, bench, key), captured(item, mirrored, key)
     inner = within(item, bench.margin_px)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from doedesign.build import levels_of, process_for, process_of, process_spec_of
+from doedesign.build import levels_from_spec, process_for, process_from_spec, process_spec_of
 from doedesign.spec import (
     ProcessSpec,
     load_process,
@@ -42,30 +42,32 @@ def test_a_spec_without_them_keeps_its_digest():
 
 def test_they_make_the_staircase_and_the_process():
     process = load_spec(QUICK, [DEPTHS]).process
-    assert levels_of(process) == LEVELS
-    assert process_of(process) == Process(LEVELS)
-    assert levels_of(load_spec(QUICK).process) == Levels(16, 75e-9)
+    assert levels_from_spec(process) == LEVELS
+    assert process_from_spec(process) == Process(LEVELS)
+    assert levels_from_spec(load_spec(QUICK).process) == Levels(16, 75e-9)
     even = 'process.etch_depths=["75 nm", "150 nm", "300 nm", "600 nm"]'
-    assert levels_of(load_spec(QUICK, [even]).process) == Levels(16, 75e-9)
+    assert levels_from_spec(load_spec(QUICK, [even]).process) == Levels(16, 75e-9)
 
 
 def test_etches_go_from_shallow_to_deep_unless_an_order_is_given():
     swapped = ["process.levels=4", "process.level_step=300 nm", 'process.etch_depths=["500 nm", "150 nm"]']
     spec = load_spec(QUICK, swapped)
-    assert process_of(spec.process).order == (1, 0)
+    assert process_from_spec(spec.process).order == (1, 0)
     said = load_spec(QUICK, [*swapped, "process.etches=[{mask = 0, depth = '500 nm'}, {mask = 1}]"])
-    assert process_of(said.process).order == (0, 1)
+    assert process_from_spec(said.process).order == (0, 1)
     # And back to a spec, order and all.
     for one in (spec, said):
-        process = process_of(one.process)
-        assert process_of(process_spec_of(process, one.process)) == Process(process.levels, process.order, name="ideal")
+        process = process_from_spec(one.process)
+        assert process_from_spec(process_spec_of(process, one.process)) == Process(
+            process.levels, process.order, name="ideal"
+        )
 
 
 def test_what_is_to_be_chosen_must_be_known_where_it_is_needed():
     process = load_spec(QUICK, ["process.etch_depths=optimize"]).process
     assert process.chooses_depths
     with pytest.raises(InputError, match=r"process\.etch_depths: the depths must be known here"):
-        process_of(process)
+        process_from_spec(process)
     # A process file that leaves the choice to the optimisation goes with whatever the design chose.
     assert process_for(LEVELS, process).levels == LEVELS
 

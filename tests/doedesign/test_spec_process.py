@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from doedesign.build import process_of, process_spec_of
+from doedesign.build import process_from_spec, process_spec_of
 from doedesign.spec import (
     ErrorsSpec,
     LimitSpec,
@@ -29,7 +29,7 @@ from doedesign.spec import (
 )
 from fab.errors import InputError
 from fab.levels import Levels
-from fab.process import ERRORS, Defects, Disc, MaskDisc, Process, Spread, Variation, error_names
+from fab.process import DEVIATIONS, Defects, Disc, MaskDisc, Normal, Process, Variation, error_names
 from fab.stock import STOCK
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -85,26 +85,26 @@ def refusal(read: Callable[..., object], *arguments: object) -> str:
 
 
 def test_every_error_of_the_process_model_has_its_key():
-    assert set(ErrorsSpec.model_fields) == set(ERRORS)
+    assert set(ErrorsSpec.model_fields) == set(DEVIATIONS)
     assert all(field.alias and not field.alias.endswith(("_m", "_rad")) for field in ErrorsSpec.model_fields.values())
 
 
 def test_a_process_in_full(written: Callable[..., Path]):
     spec = load_process(written("[process]" + FULL))
-    process = process_of(spec)
+    process = process_from_spec(spec)
     stock = STOCK["contact_aligner"]
     assert process.levels == Levels(16, 75e-9)
     assert process.order == (3, 0, 1, 2)
     assert (process.tone, process.minimum_line_m, process.minimum_space_m) == ("dark", 1.5e-6, 1.2e-6)
     assert (process.die_m, process.wafer_radius_m, process.name) == ((0.0, 0.03), 0.075, "contact_aligner")
     spreads = process.spreads
-    assert [spreads[f"overlay_x_m[{k}]"] for k in range(4)] == [Spread(0, 0.2e-6)] * 4
+    assert [spreads[f"overlay_x_m[{k}]"] for k in range(4)] == [Normal(0, 0.2e-6)] * 4
     assert [spreads[f"overlay_y_m[{k}]"].sigma for k in range(4)] == pytest.approx([1e-7, 2e-7, 3e-7, 4e-7], rel=1e-15)
-    assert [spreads[f"cd_bias_m[{k}]"] for k in (0, 2)] == [Spread(1e-7, 5e-8), Spread(-1e-7, 5e-8)]
+    assert [spreads[f"cd_bias_m[{k}]"] for k in (0, 2)] == [Normal(1e-7, 5e-8), Normal(-1e-7, 5e-8)]
     # What is said of an error replaces both its numbers: no sigma here, though the stock process has one.
     assert spreads["sidewall_rad"].mean == pytest.approx(math.radians(3), rel=1e-14)  # fifteen digits of text
     assert spreads["sidewall_rad"].sigma == 0
-    assert spreads["rotation_rad[3]"] == Spread(0, 20e-6)
+    assert spreads["rotation_rad[3]"] == Normal(0, 20e-6)
     assert "roughness_m" not in spreads
     # What is not said comes from the stock process.
     assert spreads["etch_lag"] == stock.errors["etch_lag"][:2]
@@ -119,10 +119,10 @@ def test_a_process_in_full(written: Callable[..., Path]):
 
 @pytest.mark.parametrize("name", STOCK)
 def test_a_stock_process_alone_has_all_its_numbers(name: str):
-    process = process_of(ProcessSpec(levels=8, level_step_m=150e-9, stock=name))
+    process = process_from_spec(ProcessSpec(levels=8, level_step_m=150e-9, stock=name))
     stock = STOCK[name]
     expected = {
-        flat: Spread(typical.mean, typical.sigma)
+        flat: Normal(typical.mean, typical.sigma)
         for error, typical in stock.errors.items()
         for flat in error_names(3, error)
     }
@@ -133,7 +133,7 @@ def test_a_stock_process_alone_has_all_its_numbers(name: str):
 
 def test_a_process_that_says_nothing_of_errors_is_ideal_and_leaves_no_trace():
     spec = load_spec(QUICK)
-    assert process_of(spec.process) == Process(Levels(spec.process.levels, spec.process.level_step_m))
+    assert process_from_spec(spec.process) == Process(Levels(spec.process.levels, spec.process.level_step_m))
     # The very keys of a spec before there were errors, so digests of older runs still hold.
     assert list(spec_to_json(spec)["process"]) == ["levels", "level_step_m", "chrome_overlap_m"]
     assert "limits" not in spec_to_json(spec)
@@ -289,7 +289,9 @@ def test_largest_values_are_allowed():
             "optics.focal_length=50 mm",
         ],
     )
-    assert process_of(spec.process).spreads["cd_bias_m[2]"].mean == pytest.approx(-1e-4, rel=1e-12)  # the bound's slack
+    assert process_from_spec(spec.process).spreads["cd_bias_m[2]"].mean == pytest.approx(
+        -1e-4, rel=1e-12
+    )  # the bound's slack
     assert spec.sensor.defocus_m == -0.01
 
 
@@ -330,9 +332,9 @@ def processes(draw: st.DrawFn) -> Process:
     chosen = draw(st.lists(st.sampled_from(error_names(masks)), unique=True, max_size=12))
     spreads = {}
     for name in chosen:
-        error = ERRORS[name.partition("[")[0]]
+        error = DEVIATIONS[name.partition("[")[0]]
         sign = 1 if error.one_sided else draw(st.sampled_from([-1, 1]))
-        spreads[name] = Spread(sign * draw(_digits) * largest[error.unit], draw(_digits) * largest[error.unit])
+        spreads[name] = Normal(sign * draw(_digits) * largest[error.unit], draw(_digits) * largest[error.unit])
     return Process(
         Levels(2**masks, float(f"{draw(st.floats(1e-9, 1e-6)):.17g}")),
         order=tuple(draw(st.permutations(range(masks)))),
@@ -354,7 +356,7 @@ def test_a_process_survives_its_file_to_the_last_bit(process: Process, tmp_path_
     path.write_text(process_to_toml(spec, ["fitted to measurements", "two\nlines"]), "utf-8")
     assert load_process(path) == spec
     assert (spec.chrome_overlap_m, spec.stock) == (3e-6, None)
-    again = process_of(load_process(path))
+    again = process_from_spec(load_process(path))
     # The name says where a process came from, and no number.
     assert replace(again, name=process.name, defects=process.defects) == process
     # Densities are per mm2 in a file: a division and a multiplication, each rounded.
@@ -364,9 +366,9 @@ def test_a_process_survives_its_file_to_the_last_bit(process: Process, tmp_path_
 @pytest.mark.parametrize("name", [None, *STOCK])
 def test_a_stock_process_said_in_full_is_the_same(name: str | None):
     spec = ProcessSpec(levels=16, level_step_m=75e-9, stock=name)
-    said = process_spec_of(process_of(spec), spec)
+    said = process_spec_of(process_from_spec(spec), spec)
     assert said.stock is None
-    assert replace(process_of(said), name=name or "ideal") == process_of(spec)
+    assert replace(process_from_spec(said), name=name or "ideal") == process_from_spec(spec)
     assert said.filled().errors == spec.filled().errors
     text = process_to_toml(said)
     # Round numbers stay round on their way through SI units.
@@ -376,7 +378,7 @@ def test_a_stock_process_said_in_full_is_the_same(name: str | None):
 
 
 def test_a_process_beyond_what_a_spec_may_hold_is_refused():
-    process = Process(Levels(2, 75e-9), spreads={"depth_scale[0]": Spread(0.6, 0.01)}, name="estimate")
+    process = Process(Levels(2, 75e-9), spreads={"depth_scale[0]": Normal(0.6, 0.01)}, name="estimate")
     message = refusal(process_spec_of, process, ProcessSpec(levels=2, level_step_m=75e-9))
     assert "process estimate: process.errors.depth_scale.mean: must lie between -0.5 and 0.5, but got 0.6." in message
 
@@ -413,7 +415,7 @@ _place = st.floats(-1e-2, 1e-2, allow_subnormal=False)
 def variations(draw: st.DrawFn) -> Variation:
     masks = draw(st.integers(1, 6))
     values: dict[str, object] = {}
-    for name, error in ERRORS.items():
+    for name, error in DEVIATIONS.items():
         one = _positive if error.one_sided else _value
         lists = st.just(()) | st.tuples(*[one] * masks)
         values[name] = draw(lists if error.per_mask else one)

@@ -14,9 +14,9 @@ from doedesign.spec import LimitSpec
 from doedesign.tolerancing import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
 from doedesign.tolerancing.analysis import good_plates, obeys, statistics, table_of, worst_plate, yield_of
 from doedesign.tolerancing.budget import budget_of
-from doedesign.tolerancing.pool import Beyond, Rows, Work
+from doedesign.tolerancing.pool import OutOfModel, Rows, Work
 from fab.errors import InputError
-from fab.process import Process, Spread, Variation
+from fab.process import Normal, Process, Variation
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_words_that_are_no_limit_are_refused(text: str):
 
 def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
     rows = [row("red", 0.05, strehl=0.9, zeroth_order=0.1, ring_to_disc=None)]
-    table = table_of({"normal/0": Beyond("too much"), "normal/1": rows, "normal/2": rows})
+    table = table_of({"normal/0": OutOfModel("too much"), "normal/1": rows, "normal/2": rows})
     assert table.within.tolist() == [False, True, True]
     assert good_plates(table, []).tolist() == [False, True, True]
     assert obeys(table, limit_from_text("strehl >= 0")).tolist() == [False, True, True]
@@ -165,7 +165,7 @@ def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
     assert worst_plate(table, [limit_from_text("strehl >= 0.95")]) == "normal/1"
     assert [found["min"] for found in statistics(table) if found["quantity"] == "strehl"] == [0.9, 0.9]
     with pytest.raises(ValueError, match="at least one plate with rows"):
-        table_of({"normal/0": Beyond("too much")})
+        table_of({"normal/0": OutOfModel("too much")})
 
 
 def test_the_worst_plate_is_farthest_beyond_a_limit():
@@ -214,7 +214,7 @@ def test_what_errors_do_together_shows_in_the_total_index(ask: Callable[..., Stu
     def together(drawn: object, process: Process, variation: Variation) -> Rows:
         return [row("red", None, strehl=1e5 * variation.depth_scale[0] * variation.overlay_x_m[0])]
 
-    process = Process(fakes.LEVELS, spreads={"depth_scale[0]": Spread(0, 0.02), "overlay_x_m[0]": Spread(0.0, 0.5e-6)})
+    process = Process(fakes.LEVELS, spreads={"depth_scale[0]": Normal(0, 0.02), "overlay_x_m[0]": Normal(0.0, 0.5e-6)})
     found = {one.source: one for one in ask(process=process, evaluate=together).sobol(1024) if one.colour is None}
     assert set(found) == {"depth", "overlay"}
     for one in found.values():
@@ -313,10 +313,10 @@ def test_a_process_of_other_levels_is_refused(ask: Callable[..., Study]):
 def test_errors_can_be_changed_as_text_or_as_numbers(ask: Callable[..., Study]):
     changed = ask(errors={"overlay_x": {"sigma": ["0.3 um", "0.4 um"]}, "rotation_rad": 1e-4, "depth_scale": 0.01})
     spreads = changed.process.spreads
-    assert [spreads[f"overlay_x_m[{k}]"] for k in range(2)] == [Spread(0, 0.3e-6), Spread(0, 0.4e-6)]
-    assert spreads["rotation_rad[1]"] == Spread(0, 1e-4)
-    assert spreads["depth_scale[0]"] == Spread(0, 0.01)
-    assert spreads["corner_radius_m"] == Spread(0, 0.2e-6)  # as it was
+    assert [spreads[f"overlay_x_m[{k}]"] for k in range(2)] == [Normal(0, 0.3e-6), Normal(0, 0.4e-6)]
+    assert spreads["rotation_rad[1]"] == Normal(0, 1e-4)
+    assert spreads["depth_scale[0]"] == Normal(0, 0.01)
+    assert spreads["corner_radius_m"] == Normal(0, 0.2e-6)  # as it was
 
 
 def test_plates_as_rows_and_without_limits(ask: Callable[..., Study]):

@@ -18,7 +18,7 @@ from doedesign.tolerancing.draws import (
     variation_at,
 )
 from fab.errors import InputError
-from fab.process import Defects, Process, Spread, Variation
+from fab.process import Defects, Normal, Process, Variation
 from fab.sampling import normal_draw, varying
 
 SIDE = 1e-3
@@ -35,7 +35,7 @@ def fakes():
 def process(fakes) -> Process:
     """Errors of four sources, roughness and rare events among them; overlay and depth have a mean."""
     spreads = dict(fakes.process().spreads)
-    spreads |= {"overlay_x_m[0]": Spread(0.1e-6, 0.5e-6), "roughness_m": Spread(2e-9), "correlation_m": Spread(1e-6)}
+    spreads |= {"overlay_x_m[0]": Normal(0.1e-6, 0.5e-6), "roughness_m": Normal(2e-9), "correlation_m": Normal(1e-6)}
     return dataclasses.replace(fakes.process(), spreads=spreads, defects=Defects(particles_per_m2=3e6, missed=0.1))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from fab.errors import InputError
 from fab.levels import Levels
-from fab.process import Defects, Process, Spread, Variation, error_names
+from fab.process import Defects, Normal, Process, Variation, error_names
 
 LEVELS = Levels(4, 75e-9)
 
@@ -50,7 +50,7 @@ def drawn(name: object = "fake") -> FakeDrawn:
 def process(**sigmas: float) -> Process:
     """Errors by the name in `ERRORS`, one sigma for all masks; those of three sources by default."""
     chosen = sigmas or {"overlay_x_m": 0.5e-6, "depth_scale": 0.02, "corner_radius_m": 0.2e-6}
-    spreads = {name: Spread(0.0, sigma) for key, sigma in chosen.items() for name in error_names(LEVELS.bits, key)}
+    spreads = {name: Normal(0.0, sigma) for key, sigma in chosen.items() for name in error_names(LEVELS.bits, key)}
     return Process(LEVELS, spreads=spreads)
 
 

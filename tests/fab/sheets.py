@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from fab.layout.marks import alignment_site, die_marks
-from fab.layout.part import moved, plates_of, prefixed
+from fab.layout.part import moved, photomasks_of, prefixed
 from fab.layout.structures import process_monitor
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
-from fab.process import Process, Spread, error_names
-from fab.runsheet.tables import Die, Grating, Matter, Outlook, PlateFile, RunSheet, Seen
+from fab.process import Normal, Process, error_names
+from fab.runsheet.tables import Die, Grating, Importance, PhotomaskFile, PredictedMetrics, Predictions, RunSheet
 from fab.units import NM, UM
 
 DIGEST = "0123456789abcdef" * 4
@@ -18,9 +18,9 @@ DBU_M = 1e-9
 LEVELS = Levels(16, 75 * NM)
 
 
-def spreads_of(levels: Levels, **means_and_sigmas: tuple[float, float]) -> dict[str, Spread]:
+def spreads_of(levels: Levels, **means_and_sigmas: tuple[float, float]) -> dict[str, Normal]:
     """The same mean and sigma for every mask, by the name in `ERRORS`."""
-    return {name: Spread(*one) for key, one in means_and_sigmas.items() for name in error_names(levels.bits, key)}
+    return {name: Normal(*one) for key, one in means_and_sigmas.items() for name in error_names(levels.bits, key)}
 
 
 def sheet(
@@ -29,13 +29,13 @@ def sheet(
     tone: Literal["clear", "dark"] = "clear",
     chrome: Literal["liftoff", "etch"] = "liftoff",
     zero_layer: bool = False,
-    spreads: Mapping[str, Spread] | None = None,
+    spreads: Mapping[str, Normal] | None = None,
     moves_m: Sequence[float] = (),
     **rest: Any,
 ) -> RunSheet:
     """A run sheet of a few dies; `rest` goes into it as it is."""
     order = tuple(order) or tuple(range(levels.bits))
-    plates = plates_of(levels, order, tone, chrome, zero_layer)
+    plates = photomasks_of(levels, order, tone, chrome, zero_layer)
     process = Process(levels, order, spreads or {}, tone=tone, minimum_line_m=1.2 * UM, name="a lab")
     site = alignment_site(plates, DBU_M)
     places = {
@@ -46,7 +46,7 @@ def sheet(
     }
     moves = dict(enumerate(moves_m))
     files = {
-        plate.name: PlateFile(
+        plate.name: PhotomaskFile(
             f"{STEM}_{plate.code}.gds",
             f"{plate.layer:x}" * 64,
             f"{STEM}_{plate.code}",
@@ -63,10 +63,10 @@ def sheet(
     )  # fmt: skip
 
 
-def outlook() -> Outlook:
+def outlook() -> Predictions:
     """Numbers that no plate has."""
-    near = Seen("red", 0.05, 0.81, 0.0123, 0.86, ring_to_disc=3.21)
-    far = Seen("red", None, 0.81, 0.0123, 0.91, far_spot=0.654)
+    near = PredictedMetrics("red", 0.05, 0.81, 0.0123, 0.86, ring_to_disc=3.21)
+    far = PredictedMetrics("red", None, 0.81, 0.0123, 0.91, far_spot=0.654)
     gratings = tuple(Grating(error, 0.01 + error**2, 0.004 + error**2) for error in (-0.02, 0.0, 0.02))
-    matters = (Matter("overlay of mask 4", 0.61, 0.02), Matter("line width (CD bars) of every mask", 0.2, 0.7))
-    return Outlook((near, far), (near, far), 550 * NM, 552.06 * NM, 520 * NM, 1.0645, gratings, matters)
+    matters = (Importance("overlay of mask 4", 0.61, 0.02), Importance("line width (CD bars) of every mask", 0.2, 0.7))
+    return Predictions((near, far), (near, far), 550 * NM, 552.06 * NM, 520 * NM, 1.0645, gratings, matters)

@@ -11,7 +11,7 @@ from fab.layout.compensation import edge_moves, grown, read_back
 from fab.layout.geometry import PixelEdges, Shapes, pixel_edges
 from fab.layout.polygons import rectangles
 from fab.levels import Levels
-from fab.masks import levels_of, planes
+from fab.masks import level_map_from_planes, planes
 
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 1))
 PIXEL = 1850
@@ -157,7 +157,7 @@ def test_a_whole_mask_set_comes_back_with_a_move_per_mask():
     moves = edge_moves((-120e-9, 0.0, 80e-9, -40e-9), edges.dbu_m)
     assert moves == (120, 0, -80, 40)
     back = [read_back(grown(p, edges, m), edges, m) for p, m in zip(planes(level_map, levels), moves, strict=True)]
-    assert np.array_equal(levels_of(np.stack(back), levels), level_map)
+    assert np.array_equal(level_map_from_planes(np.stack(back), levels), level_map)
 
 
 def test_a_bias_that_is_no_number_is_refused():

@@ -8,7 +8,7 @@ from fab.errors import InputError
 from fab.gds.writer import write_gds
 from fab.layout.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
 from fab.layout.geometry import Cell, Layer, Layout, Shapes
-from fab.layout.part import plates_of
+from fab.layout.part import photomasks_of
 from fab.layout.split import splits_of
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
@@ -19,7 +19,7 @@ DOE = Cell("A_DOE", {Layer(1): Shapes(np.array([[-1000, -1000, 1000, 1000]], np.
 
 def framed(wafer=None, chrome_m=7.4e-3, order=(0, 1, 2, 3)):
     wafer = wafer or Wafer()
-    plates = plates_of(LEVELS, order, "clear", wafer.chrome, wafer.zero_layer)
+    plates = photomasks_of(LEVELS, order, "clear", wafer.chrome, wafer.zero_layer)
     return draw_frame(
         wafer,
         plates,

@@ -6,13 +6,13 @@ import pytest
 from fab.errors import InputError
 from fab.layout.geometry import Layer, Shapes
 from fab.layout.lettering import HEIGHT, label_block, letter_boxes, lettering, mask_label, written
-from fab.layout.part import Part, plates_of
+from fab.layout.part import Part, photomasks_of
 from fab.levels import Levels
 from fab.units import MM, NM, UM
 from tests.fab.parts import assert_sound, region
 
 ALPHABET = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-_/:+"
-PLATES = plates_of(Levels(16, 75 * NM), (3, 2, 1, 0), "clear", "etch", zero_layer=True)
+PLATES = photomasks_of(Levels(16, 75 * NM), (3, 2, 1, 0), "clear", "etch", zero_layer=True)
 
 
 def raster(text: str) -> np.ndarray:

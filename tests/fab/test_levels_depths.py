@@ -12,7 +12,7 @@ from fab.grid import Grid
 from fab.layout.structures import codes_by_depth
 from fab.levels import Levels, height_of, quantise, quantise_wrapped, wrapped_cells
 from fab.manifest.records import read_manifest
-from fab.masks import levels_of, planes
+from fab.masks import level_map_from_planes, planes
 from fab.order.preview import preview_png
 from fab.order.write import write_order
 from fab.process import Process
@@ -68,7 +68,7 @@ def test_depths_of_2_to_the_k_steps_are_the_even_staircase_itself(count):
 def test_masks_and_levels_are_inverse_for_any_depths(levels: Levels, seed: int):
     level_map = np.random.default_rng(seed).integers(0, levels.count, (5, 7)).astype(np.uint8)
     opened = planes(level_map, levels)
-    assert np.array_equal(levels_of(opened, levels), level_map)
+    assert np.array_equal(level_map_from_planes(opened, levels), level_map)
     # What is left standing is the blank glass less the etches.
     etched = np.tensordot(np.array(levels.depths_m), opened.astype(float), axes=1)
     np.testing.assert_allclose(height_of(level_map, levels), levels.total_m - etched, atol=1e-12 * levels.total_m)

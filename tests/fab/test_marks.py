@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fab.layout.marks import BOXES, VERNIER_STEP_M, alignment_notes, alignment_site, die_marks
-from fab.layout.part import Part, Plate, plates_of
+from fab.layout.part import Part, Photomask, photomasks_of
 from fab.levels import Levels
 from fab.units import NM, UM
 from tests.fab.parts import assert_sound, layers_of, region
@@ -14,19 +14,19 @@ from tests.fab.parts import assert_sound, layers_of, region
 SIXTEEN = Levels(16, 75 * NM)
 SHALLOW, DEEP = (0, 1, 2, 3), (3, 2, 1, 0)
 JOBS = {
-    "deep first": plates_of(SIXTEEN, DEEP, "clear", "liftoff", False),
-    "zero layer": plates_of(SIXTEEN, SHALLOW, "clear", "liftoff", True),
-    "wet etch": plates_of(SIXTEEN, SHALLOW, "clear", "etch", True),
-    "clear field": plates_of(SIXTEEN, DEEP, "dark", "etch", False),
-    "2 levels": plates_of(Levels(2, 600 * NM), (0,), "clear", "liftoff", False),
-    "64 levels": plates_of(Levels(64, 19 * NM), range(6), "clear", "etch", True),
+    "deep first": photomasks_of(SIXTEEN, DEEP, "clear", "liftoff", False),
+    "zero layer": photomasks_of(SIXTEEN, SHALLOW, "clear", "liftoff", True),
+    "wet etch": photomasks_of(SIXTEEN, SHALLOW, "clear", "etch", True),
+    "clear field": photomasks_of(SIXTEEN, DEEP, "dark", "etch", False),
+    "2 levels": photomasks_of(Levels(2, 600 * NM), (0,), "clear", "liftoff", False),
+    "64 levels": photomasks_of(Levels(64, 19 * NM), range(6), "clear", "etch", True),
 }
 DRAWINGS = {"site": alignment_site, "die": die_marks}
 job = pytest.mark.parametrize("plates", JOBS.values(), ids=JOBS.keys())
 drawing = pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS.keys())
 
 
-def around(part: Part, plate: Plate, place: str, half_m: float):
+def around(part: Part, plate: Photomask, place: str, half_m: float):
     """The marks of one plate in a square about a place, merged, with the place at the origin."""
     from klayout import db
 
@@ -135,7 +135,7 @@ def test_no_mask_draws_in_the_slot_of_another_or_over_a_vernier(draw, plates):
             assert (wafer & around(part, plate, f"vernier {axis}, {plate.name}", 100 * UM)).is_empty()
 
 
-def lines(part: Part, plate: Plate, axis: str, place: str) -> np.ndarray:
+def lines(part: Part, plate: Photomask, axis: str, place: str) -> np.ndarray:
     """Middles of the lines of one comb along an axis from the place, in units."""
     along, across = (0, 1) if axis == "x" else (1, 0)
     x, y = (round(v / part.dbu_m) for v in part.places[place])
@@ -211,7 +211,7 @@ def test_all_masks_are_aligned_to_the_first_one_used():
 
 
 def test_a_job_of_one_mask_has_only_its_own_marks():
-    plates = plates_of(Levels(2, 600 * NM), (0,), "clear", "none", False)
+    plates = photomasks_of(Levels(2, 600 * NM), (0,), "clear", "none", False)
     for draw in DRAWINGS.values():
         part = draw(plates, NM)
         assert_sound(part, 2 * UM)
@@ -229,7 +229,7 @@ def test_notes_say_what_is_done_in_each_window():
     assert "etched 300 nm in its windows" in deep[1]
     assert "so the steps stay" in deep[1]
     assert "before the deposition" in deep[-1]
-    shallow = alignment_notes(plates_of(SIXTEEN, SHALLOW, "clear", "liftoff", False))
+    shallow = alignment_notes(photomasks_of(SIXTEEN, SHALLOW, "clear", "liftoff", False))
     assert "etched 75 nm deep. Warning: such shallow marks" in shallow[0]
     wet = alignment_notes(JOBS["wet etch"])
     assert wet[0] == "Zero layer: makes the marks that all other masks are aligned to, of chrome."

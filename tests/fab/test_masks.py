@@ -7,7 +7,7 @@ from hypothesis.extra import numpy as hnp
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.masks import levels_of, planes, unetched_outside
+from fab.masks import level_map_from_planes, planes, unetched_outside
 from fab.units import NM
 
 COUNTS = st.sampled_from([2, 4, 8, 16, 32, 64])
@@ -21,14 +21,14 @@ def test_joining_undoes_splitting(count, data):
     )
     bit_planes = planes(level_map, levels)
     assert bit_planes.shape == (levels.bits, *level_map.shape)
-    assert np.array_equal(levels_of(bit_planes, levels), level_map)
+    assert np.array_equal(level_map_from_planes(bit_planes, levels), level_map)
 
 
 @given(COUNTS, st.data())
 def test_splitting_undoes_joining(count, data):
     levels = Levels(count, 75 * NM)
     bit_planes = data.draw(hnp.arrays(np.uint8, (levels.bits, 3, 4), elements=st.integers(0, 1)))
-    assert np.array_equal(planes(levels_of(bit_planes, levels), levels), bit_planes)
+    assert np.array_equal(planes(level_map_from_planes(bit_planes, levels), levels), bit_planes)
 
 
 @given(hnp.arrays(np.uint8, (4, 5), elements=st.integers(0, 15)))
@@ -51,9 +51,9 @@ def test_outside_the_aperture_the_glass_is_left_blank():
 def test_mismatches_are_refused():
     levels = Levels(16, 75 * NM)
     with pytest.raises(InputError, match="16 levels need 4 planes"):
-        levels_of(np.zeros((3, 2, 2), dtype=np.uint8), levels)
+        level_map_from_planes(np.zeros((3, 2, 2), dtype=np.uint8), levels)
     with pytest.raises(InputError, match="0 or 1"):
-        levels_of(np.full((4, 2, 2), 2, dtype=np.uint8), levels)
+        level_map_from_planes(np.full((4, 2, 2), 2, dtype=np.uint8), levels)
     with pytest.raises(InputError, match="0 to 15"):
         planes(np.full((2, 2), 16), levels)
     with pytest.raises(InputError, match="grid's shape"):

@@ -15,7 +15,7 @@ from fab.order.write import write_order
 from fab.solids.columns import Window
 from fab.solids.patch import Patch
 from fab.solids.step import step_bodies
-from fab.solids.write import Relief, write_models
+from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
 from fab.verification.verify import verify_order
 
@@ -77,7 +77,7 @@ def test_the_wafer_of_an_order(written_order):
 )
 def test_wafers_have_the_usual_flat_or_none(tmp_path, diameter_m, dies, words):
     wafer = Wafer(diameter_m, blank_m=diameter_m + 25 * MM)
-    relief = Relief(np.zeros((8, 8), np.uint8), LEVELS, Grid((8, 8), UM), 8 * UM, Chrome(UM), wafer, 5 * MM, dies)
+    relief = PlateModel(np.zeros((8, 8), np.uint8), LEVELS, Grid((8, 8), UM), 8 * UM, Chrome(UM), wafer, 5 * MM, dies)
     found = {entry.file: entry for entry in write_models(tmp_path, "A", relief)}
     assert words in found["A_WAFER.step"].content
 

@@ -15,7 +15,7 @@ from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 from fab.verification.verify import read_level_map, verify_order
 
 
@@ -24,7 +24,7 @@ def compensated(tmp_path_factory):
     """A map of blocks against a bias of 0.1 um on every mask, 0.3 um less on the third; and the same as drawn."""
     levels, grid = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
     level_map = np.kron(np.random.default_rng(8).integers(0, 16, (12, 10)), np.ones((3, 3), int)).astype(np.uint8)
-    bias = {"common_cd_bias_m": Spread(0.1e-6, 0.0), "cd_bias_m[2]": Spread(-0.3e-6, 0.0)}
+    bias = {"common_cd_bias_m": Normal(0.1e-6, 0.0), "cd_bias_m[2]": Normal(-0.3e-6, 0.0)}
     process = Process(levels, spreads=bias)
     folders = [tmp_path_factory.mktemp("moved") / name for name in ("moved", "plain")]
     for folder, wafer in zip(folders, (Wafer(compensate=True), Wafer()), strict=True):
@@ -68,7 +68,7 @@ def test_an_edge_that_was_moved_otherwise_is_told_by_both_readers(compensated, t
 def test_a_bias_wider_than_the_pixels_allow_is_refused(tmp_path):
     levels, grid = Levels(4, 75e-9), Grid((12, 12), 1e-6)
     level_map = np.random.default_rng(0).integers(0, 4, (12, 12)).astype(np.uint8)
-    process = Process(levels, spreads={"common_cd_bias_m": Spread(0.6e-6, 0.0)})
+    process = Process(levels, spreads={"common_cd_bias_m": Normal(0.6e-6, 0.0)})
     with pytest.raises(ValueError, match="edges must move by less than half the narrowest line and space"):
         write_order(
             tmp_path / "o", level_map, levels, grid, 12e-6, "s", {}, process=process, wafer=Wafer(compensate=True)

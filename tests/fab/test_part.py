@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fab.layout.geometry import Layer, Shapes
-from fab.layout.part import Part, block, centred, column, joined, moved, plates_of, prefixed, row, turned, without
+from fab.layout.part import Part, block, centred, column, joined, moved, photomasks_of, prefixed, row, turned, without
 from fab.levels import Levels
 from fab.units import MM, NM, UM
 from tests.fab.parts import kissing_corners
@@ -85,13 +85,13 @@ def test_touching_corners_are_found():
 
 
 def test_plates_come_in_the_order_of_use():
-    plates = plates_of(SIXTEEN, (3, 2, 0, 1), "clear", "liftoff", zero_layer=True)
+    plates = photomasks_of(SIXTEEN, (3, 2, 0, 1), "clear", "liftoff", zero_layer=True)
     assert [plate.name for plate in plates] == ["zero layer", "mask 4", "mask 3", "mask 1", "mask 2", "chrome"]
     assert [plate.code for plate in plates] == ["Z0", "M4", "M3", "M1", "M2", "CR"]
     assert [plate.layer for plate in plates] == [10, 4, 3, 1, 2, 5]
     assert [plate.depth for plate in plates[1:3]] == ["600 nm", "300 nm"]
     assert plates[1].on(2) == Layer(4, 2)
-    assert [p.name for p in plates_of(SIXTEEN, (0, 1, 2, 3), "clear", "none", False)] == [
+    assert [p.name for p in photomasks_of(SIXTEEN, (0, 1, 2, 3), "clear", "none", False)] == [
         f"mask {k}" for k in (1, 2, 3, 4)
     ]
 
@@ -108,5 +108,5 @@ def test_plates_come_in_the_order_of_use():
 def test_chrome_that_is_etched_needs_the_other_tone(tone, chrome, expected):
     # Positive resist goes where light was: glass is etched there, and lifted-off chrome stays there, but a chrome film
     # is etched there, and its polygons say where chrome stays.
-    plates = plates_of(Levels(4, 75 * NM), (0, 1), tone, chrome, False)
+    plates = photomasks_of(Levels(4, 75 * NM), (0, 1), tone, chrome, False)
     assert [plate.tone for plate in plates] == [tone, tone, expected]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fab.errors import InputError
 from fab.levels import Levels
-from fab.process import ERRORS, Defects, Disc, MaskDisc, Process, Spread, Variation, error_names, variation_of
+from fab.process import DEVIATIONS, Defects, Disc, MaskDisc, Normal, Process, Variation, error_names, variation_of
 
 SIXTEEN = Levels(16, 75e-9)
 
@@ -18,18 +18,18 @@ SIXTEEN = Levels(16, 75e-9)
 
 def test_every_error_is_a_field_of_a_variation_with_its_unit_in_the_name():
     fields = {f.name: f.default for f in dataclasses.fields(Variation)}
-    for name, error in ERRORS.items():
+    for name, error in DEVIATIONS.items():
         assert fields[name] == (() if error.per_mask else 0.0)
         assert name.endswith("_m") == (error.unit == "m")
         assert name.endswith("_rad") == (error.unit == "rad")
     # What is left draws no numbers of its own.
-    assert set(fields) - set(ERRORS) == {"repeats", "particles", "pinholes", "seed"}
+    assert set(fields) - set(DEVIATIONS) == {"repeats", "particles", "pinholes", "seed"}
 
 
 def test_flat_names_follow_the_errors_and_the_masks():
     names = error_names(2)
     assert names[:3] == ("common_depth_scale", "depth_scale[0]", "depth_scale[1]")
-    assert len(names) == sum(2 if error.per_mask else 1 for error in ERRORS.values())
+    assert len(names) == sum(2 if error.per_mask else 1 for error in DEVIATIONS.values())
     # The order is that of the table, not that of the question.
     assert error_names(2, "cd_bias_m", "etch_lag", "overlay_x_m") == (
         "overlay_x_m[0]",
@@ -49,9 +49,9 @@ def test_a_plate_without_errors_is_nominal():
     assert Variation(seed=7, correlation_m=1e-6, overlay_x_m=(0.0, 0.0), repeats=(0, 0)).nominal
 
 
-@pytest.mark.parametrize("name", [name for name in ERRORS if name != "correlation_m"])
+@pytest.mark.parametrize("name", [name for name in DEVIATIONS if name != "correlation_m"])
 def test_any_error_makes_a_plate_other_than_nominal(name: str):
-    value = (0.0, 0.0, 1e-12, 0.0) if ERRORS[name].per_mask else 1e-12
+    value = (0.0, 0.0, 1e-12, 0.0) if DEVIATIONS[name].per_mask else 1e-12
     assert not Variation(**{name: value}).nominal  # type: ignore[arg-type]
 
 
@@ -83,15 +83,15 @@ def test_a_plain_process_is_ideal_and_etches_shallow_to_deep():
 
 
 def test_the_expected_plate_has_every_error_at_its_mean():
-    process = Process(SIXTEEN, spreads={"overlay_x_m[2]": Spread(1e-6, 5e-7), "etch_lag": Spread(0.05, 0.0)})
+    process = Process(SIXTEEN, spreads={"overlay_x_m[2]": Normal(1e-6, 5e-7), "etch_lag": Normal(0.05, 0.0)})
     assert process.expected() == Variation(overlay_x_m=(0.0, 0.0, 1e-6, 0.0), etch_lag=0.05)
 
 
 def test_a_process_can_be_hashed_and_sent_to_another_process_and_keeps_its_own_numbers():
-    spreads = {"etch_lag": Spread(0.05, 0.02)}
+    spreads = {"etch_lag": Normal(0.05, 0.02)}
     process = Process(SIXTEEN, spreads=spreads)
-    spreads["etch_lag"] = Spread(0.5, 0.5)
-    assert process.spreads == {"etch_lag": Spread(0.05, 0.02)}
+    spreads["etch_lag"] = Normal(0.5, 0.5)
+    assert process.spreads == {"etch_lag": Normal(0.05, 0.02)}
     again = pickle.loads(pickle.dumps(process))
     assert again == process
     assert hash(again) == hash(process)
@@ -103,15 +103,15 @@ def test_a_process_can_be_hashed_and_sent_to_another_process_and_keeps_its_own_n
         ({"order": (0, 1, 2)}, r"process.order: must name each of the masks 0 to 3 once, but got \(0, 1, 2\)"),
         ({"order": (0, 1, 2, 2)}, "process.order"),
         ({"order": (1, 2, 3, 4)}, "process.order"),
-        ({"spreads": {"overlay": Spread()}}, "process.errors.overlay: must be a known error"),
-        ({"spreads": {"overlay_x_m": Spread()}}, r"must be a known error.*overlay_x_m\[0\]"),
-        ({"spreads": {"overlay_x_m[4]": Spread()}}, r"process.errors.overlay_x_m\[4\]: must be a known error"),
-        ({"spreads": {"etch_lag[0]": Spread()}}, "must be a known error"),
-        ({"spreads": {"etch_lag": Spread(0.0, -1e-3)}}, "sigma must be finite and not negative"),
-        ({"spreads": {"etch_lag": Spread(0.0, math.nan)}}, "sigma must be finite"),
-        ({"spreads": {"etch_lag": Spread(math.inf, 0.0)}}, "must be finite"),
-        ({"spreads": {"etch_lag": Spread(-0.01, 0.0)}}, "never negative must not be negative"),
-        ({"spreads": {"corner_radius_m": Spread(-1e-9, 1e-6)}}, "never negative must not be negative"),
+        ({"spreads": {"overlay": Normal()}}, "process.errors.overlay: must be a known error"),
+        ({"spreads": {"overlay_x_m": Normal()}}, r"must be a known error.*overlay_x_m\[0\]"),
+        ({"spreads": {"overlay_x_m[4]": Normal()}}, r"process.errors.overlay_x_m\[4\]: must be a known error"),
+        ({"spreads": {"etch_lag[0]": Normal()}}, "must be a known error"),
+        ({"spreads": {"etch_lag": Normal(0.0, -1e-3)}}, "sigma must be finite and not negative"),
+        ({"spreads": {"etch_lag": Normal(0.0, math.nan)}}, "sigma must be finite"),
+        ({"spreads": {"etch_lag": Normal(math.inf, 0.0)}}, "must be finite"),
+        ({"spreads": {"etch_lag": Normal(-0.01, 0.0)}}, "never negative must not be negative"),
+        ({"spreads": {"corner_radius_m": Normal(-1e-9, 1e-6)}}, "never negative must not be negative"),
         ({"tone": "grey"}, 'process.tone: must be "clear" or "dark", but got grey'),
         ({"minimum_line_m": -1e-6}, "process.minimum_line_m: must be finite and not negative"),
         ({"minimum_space_m": math.nan}, "process.minimum_space_m"),
@@ -126,7 +126,7 @@ def test_impossible_processes_are_refused(changes: dict, message: str):
 
 
 def test_means_below_zero_are_for_errors_that_go_both_ways():
-    assert Process(SIXTEEN, spreads={"common_cd_bias_m": Spread(-1e-7, 0.0)}).expected().common_cd_bias_m == -1e-7
+    assert Process(SIXTEEN, spreads={"common_cd_bias_m": Normal(-1e-7, 0.0)}).expected().common_cd_bias_m == -1e-7
 
 
 @pytest.mark.parametrize(

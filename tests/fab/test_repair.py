@@ -13,7 +13,8 @@ from fab.grid import Grid
 from fab.layout.polygons import smallest_runs
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
-from fab.rules.check import Rules, check, repair
+from fab.rules import repair
+from fab.rules.check import Rules, check
 from fab.rules.repair import repaired
 
 UM = 1e-6

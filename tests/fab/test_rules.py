@@ -13,8 +13,8 @@ from fab.layout.polygons import rectangles, smallest_runs
 from fab.levels import Levels
 from fab.masks import planes, unetched_outside
 from fab.process import Process
+from fab.rules import bitplanes as bits
 from fab.rules.check import Rules, check
-from fab.rules.check import bitplanes as bits
 
 UM = 1e-6
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=14), elements=st.integers(0, 1))

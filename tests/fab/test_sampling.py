@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fab.levels import Levels
-from fab.process import ERRORS, Defects, Process, Spread, Variation, error_names
+from fab.process import DEVIATIONS, Defects, Normal, Process, Variation, error_names
 from fab.sampling import (
     corner_scores,
     draw_at,
@@ -26,22 +26,22 @@ SIXTEEN = Levels(16, 75e-9)
 PLATE_M = 4.44e-3
 SIGMAS = 5.0
 
-ALL = Process(SIXTEEN, spreads={name: Spread(0.0, 1e-3) for name in error_names(4)})
+ALL = Process(SIXTEEN, spreads={name: Normal(0.0, 1e-3) for name in error_names(4)})
 SOME = Process(
     SIXTEEN,
     spreads={
-        "corner_radius_m": Spread(0.0, 2e-7),
-        "overlay_x_m[2]": Spread(1e-7, 5e-7),
-        "common_depth_scale": Spread(-0.01, 0.02),
-        "etch_lag": Spread(0.05, 0.02),
-        "sidewall_rad": Spread(0.1, 0.0),
+        "corner_radius_m": Normal(0.0, 2e-7),
+        "overlay_x_m[2]": Normal(1e-7, 5e-7),
+        "common_depth_scale": Normal(-0.01, 0.02),
+        "etch_lag": Normal(0.05, 0.02),
+        "sidewall_rad": Normal(0.1, 0.0),
     },
     defects=Defects(particles_per_m2=2e5, pinholes_per_m2=1e5, missed=0.2, doubled=0.1),
 )
 
 
 def with_errors(count: int) -> Process:
-    return Process(SIXTEEN, spreads={name: Spread(0.0, 1.0) for name in error_names(4)[:count]})
+    return Process(SIXTEEN, spreads={name: Normal(0.0, 1.0) for name in error_names(4)[:count]})
 
 
 # --- which errors -----------------------------------------------------------------------------------------------------
@@ -54,7 +54,7 @@ def test_errors_vary_in_the_order_of_the_table():
 
 
 def test_every_error_belongs_to_a_source():
-    assert {source_of(name) for name in error_names(4)} == {error.source for error in ERRORS.values()}
+    assert {source_of(name) for name in error_names(4)} == {error.source for error in DEVIATIONS.values()}
     assert source_of("overlay_x_m[2]") == "overlay"
 
 
@@ -80,7 +80,7 @@ def test_scores_must_be_one_per_error():
 def test_folded_errors_are_never_negative(scores: list[float]):
     variation = draw_at(ALL, np.array(scores))
     for name, score in zip(error_names(4), scores, strict=True):
-        folded = ERRORS[name.partition("[")[0]].one_sided
+        folded = DEVIATIONS[name.partition("[")[0]].one_sided
         assert variation.value(name) == (abs(score) if folded else score) * 1e-3
 
 

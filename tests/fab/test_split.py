@@ -17,7 +17,7 @@ from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 from fab.verification.verify import verify_order
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
@@ -27,7 +27,7 @@ LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
 def split(tmp_path_factory):
     """Blocks of 3 x 3 pixels, two line-width splits and the control, with a known bias made up for."""
     level_map = np.kron(np.random.default_rng(8).integers(0, 16, (12, 10)), np.ones((3, 3), int)).astype(np.uint8)
-    process = Process(LEVELS, spreads={"common_cd_bias_m": Spread(0.1e-6, 0.0)})
+    process = Process(LEVELS, spreads={"common_cd_bias_m": Normal(0.1e-6, 0.0)})
     wafer = Wafer(compensate=True, line_splits_m=(-0.25e-6, 0.25e-6), order_control=True)
     folder = tmp_path_factory.mktemp("split") / "order"
     report = write_order(folder, level_map, LEVELS, GRID, GRID.extent_m[1], "s", {}, process=process, wafer=wafer)

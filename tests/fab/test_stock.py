@@ -3,7 +3,7 @@ import math
 import pytest
 
 from fab.levels import Levels
-from fab.process import ERRORS, Defects, Process, Spread, error_names
+from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, Stock
 
 
@@ -15,7 +15,7 @@ def test_every_number_has_a_source(stock: Stock):
         assert len(number.source.text) > 15, number  # says something
         assert number.source.text in str(number)
     # None is left out: a sigma for each error, the limits of printing, every field of Defects.
-    assert {n.name for n in numbers if n.kind == "sigma"} == set(ERRORS)
+    assert {n.name for n in numbers if n.kind == "sigma"} == set(DEVIATIONS)
     assert {n.name for n in numbers if n.kind == "mean"} == {k for k, t in stock.errors.items() if t.mean}
     assert {n.name for n in numbers if n.kind == "value"} == {
         "minimum_line_m",
@@ -28,7 +28,7 @@ def test_every_number_has_a_source(stock: Stock):
 @pytest.mark.parametrize("stock", STOCK.values(), ids=STOCK)
 def test_every_stock_is_a_process(stock: Stock):
     spreads = {
-        flat: Spread(typical.mean, typical.sigma)
+        flat: Normal(typical.mean, typical.sigma)
         for name, typical in stock.errors.items()
         for flat in error_names(4, name)
     }

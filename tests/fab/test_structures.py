@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.layout.part import Part, Plate, plates_of
+from fab.layout.part import Part, Photomask, photomasks_of
 from fab.layout.structures import (
     BAR_WIDTHS_UM,
     PAD_SIDES_UM,
@@ -29,12 +29,12 @@ PITCH, LINE = 1.85 * UM, 2 * UM
 
 def job(
     count: int, chrome: Literal["liftoff", "etch", "none"] = "liftoff", zero: bool = False
-) -> tuple[Levels, tuple[Plate, ...]]:
+) -> tuple[Levels, tuple[Photomask, ...]]:
     levels = Levels(count, 1200 * NM / count)
-    return levels, plates_of(levels, range(levels.bits), "clear", chrome, zero)
+    return levels, photomasks_of(levels, range(levels.bits), "clear", chrome, zero)
 
 
-def runs(part: Part, plate: Plate, at_m: tuple[float, float], axis: int = 0) -> list[tuple[int, int]]:
+def runs(part: Part, plate: Photomask, at_m: tuple[float, float], axis: int = 0) -> list[tuple[int, int]]:
     """Where a line through a point along an axis crosses what a plate tests, from the point, in units."""
     point = [round(v / part.dbu_m) for v in at_m]
     boxes = part.shapes[plate.on(2)].rectangles
@@ -50,7 +50,7 @@ def runs(part: Part, plate: Plate, at_m: tuple[float, float], axis: int = 0) -> 
     return joined
 
 
-def etched(part: Part, plates: tuple[Plate, ...], at_m: tuple[float, float]) -> int:
+def etched(part: Part, plates: tuple[Photomask, ...], at_m: tuple[float, float]) -> int:
     """Code of the masks that etch at a point."""
     x, y = (v / part.dbu_m for v in at_m)
     code = 0
@@ -204,7 +204,7 @@ def test_depths_that_are_no_binary_steps_are_sorted_by_depth():
     # 0, 90, 130, 220, 300, 390, 430, 520 nm
     assert codes_by_depth(levels, range(3)) == [0, 4, 2, 6, 1, 5, 3, 7]
     part = staircase(levels, (0, 1, 2), STEP_M, NM)
-    plates = plates_of(levels, (0, 1, 2), "clear", "none", False)
+    plates = photomasks_of(levels, (0, 1, 2), "clear", "none", False)
     x, y = part.places["staircase 8 levels, start"]
     assert [etched(part, plates, (x + (n + 0.5) * STEP_M, y)) for n in range(9)] == [0, 4, 2, 6, 1, 5, 3, 7, 0]
 
@@ -251,7 +251,7 @@ def test_chrome_frames_the_gratings_and_an_empty_window():
     assert widths["blank", 0] == widths["blank", 1] == 990_000
     assert 990_000 <= widths["blazed", 0] < 990_000 + 16 * 3700
     assert etched(part, plates, part.places["grating blank"]) == 0
-    bare = process_monitor(levels, plates_of(levels, range(4), "clear", "none", False), PITCH, NM, LINE)
+    bare = process_monitor(levels, photomasks_of(levels, range(4), "clear", "none", False), PITCH, NM, LINE)
     assert "grating blank" not in bare.places
     assert "grating blazed" in bare.places
 

@@ -15,7 +15,7 @@ from fab.process import Process, Variation, variation_of
 from sim.camera import Camera, Colour
 from sim.leakage import mean_transmission, strehl, zeroth_order
 from sim.psf_bank import PsfBank, surface_bank
-from sim.surface import Surface, as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 1.85e-6
 CELLS = 64
@@ -34,7 +34,7 @@ RATE = CAMERA.waves_per_metre(YELLOW_M)
 WHOLE = camera(open_share=1.5)  # no chrome
 
 
-def made(level: np.ndarray, levels: Levels, variation: Variation, optics: Camera = WHOLE) -> Surface:
+def made(level: np.ndarray, levels: Levels, variation: Variation, optics: Camera = WHOLE) -> FabricatedDoe:
     return as_fabricated(level, optics, Process(levels), variation)
 
 
@@ -56,7 +56,7 @@ def blazed_efficiency(order: int, depth: float) -> float:
     return float(np.sinc(order / 16) ** 2 * steps)
 
 
-def orders(surface: Surface, period: int) -> np.ndarray:
+def orders(surface: FabricatedDoe, period: int) -> np.ndarray:
     """Amplitudes of the orders of a grating along x, without the cell's own sinc: a plain Fourier sum of one period."""
     line = np.asarray(surface.transmission, complex)[0, CELLS // 2, CELLS // 2 : CELLS // 2 + period]
     return np.fft.fft(line) / period
@@ -119,7 +119,7 @@ def test_a_missed_and_a_doubled_etch_of_a_binary_grating():
 # --- line width and overlay -------------------------------------------------------------------------------------------
 
 
-def middle(surface: Surface, period: int) -> complex:
+def middle(surface: FabricatedDoe, period: int) -> complex:
     """Mean over one period and a few rows, away from the plate's own edges."""
     start = (CELLS - period) // 2
     values = np.asarray(surface.transmission, complex)[0, 24:40, start : start + period]

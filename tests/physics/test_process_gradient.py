@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from bench.reference import YELLOW_M
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.process import ERRORS, Process, Variation, error_names, variation_of
+from fab.process import DEVIATIONS, Process, Variation, error_names, variation_of
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
 from sim.propagation.pupil import SurfaceRows, surface_pupil
 from sim.psf_bank import plan_propagation
@@ -150,7 +150,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, compiled: Compil
 
 
 def test_every_error_is_tried():
-    assert set(PLATE) == set(STEPS) == set(ERRORS)
+    assert set(PLATE) == set(STEPS) == set(DEVIATIONS)
     assert set(VALUES) == set(NAMES)
 
 

@@ -10,7 +10,7 @@ from doedesign.runs.level_maps import levels_of_run
 from fab.layout.wafer import Wafer
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
-from fab.process import Process, Spread
+from fab.process import Normal, Process
 from sim.store import read_bank
 
 PROCESS = """
@@ -128,7 +128,7 @@ def test_masks_drawn_against_the_bias_of_the_process_give_the_design(copy_of_run
         drawing.aperture_m,
         "tiny",
         {},
-        process=Process(drawing.levels, spreads={"common_cd_bias_m": Spread(0.2e-6)}),
+        process=Process(drawing.levels, spreads={"common_cd_bias_m": Normal(0.2e-6)}),
         wafer=Wafer(compensate=True),
     )
     assert read_manifest(order).edge_moves() == (-200,) * 4

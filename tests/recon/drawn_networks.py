@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.recon.network import Layout, Network
+from doedesign.recon.network import Network, NetworkShape
 
 
-def drawn(layout: Layout, spread: float = 0.1) -> Network:
+def drawn(layout: NetworkShape, spread: float = 0.1) -> Network:
     """A network whose weights, regularisers among them, are drawn with a given standard deviation."""
     rng = np.random.default_rng(0)
     network = Network.make(layout, 0)

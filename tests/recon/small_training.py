@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.capture.from_spec import obstruction_of
-from doedesign.capture.scenes import Batch
+from doedesign.capture.from_spec import obstruction_from_spec
+from doedesign.capture.scenes import SceneBatch
 from doedesign.spec import Spec, load_spec
 from doedesign.training.joint import Trainer
 from sim.imaging.occlusion import Model
@@ -74,12 +74,12 @@ def heights() -> np.ndarray:
 def trainer(*changes: str, model: Model = "paper", height_m: np.ndarray | None = None, **more: Any) -> Trainer:
     """A trainer for the spec with changes."""
     spec = small_spec(*changes)
-    kind = obstruction_of(spec, "small.toml")
+    kind = obstruction_from_spec(spec, "small.toml")
     height = heights() if height_m is None else height_m
     return Trainer.of(spec, {}, "small.toml", model, kind, height, **more)
 
 
-def batch(count: int = 1, step: int = 0) -> Batch:
+def batch(count: int = 1, step: int = 0) -> SceneBatch:
     """Scenes of soft blobs behind a disc."""
     y, x = np.mgrid[:PIXELS, :PIXELS] / PIXELS - 0.5
     items = [np.random.default_rng((step, k)) for k in range(count)]
@@ -92,4 +92,4 @@ def batch(count: int = 1, step: int = 0) -> Batch:
     far = np.full(count, 0.6, np.float32)
     names = tuple(f"{step}-{k}" for k in range(count))
     background, mask, radiance = (part.astype(np.float32) for part in (background, mask, radiance))
-    return Batch(background, mask, radiance, near, far, names, step)
+    return SceneBatch(background, mask, radiance, near, far, names, step)

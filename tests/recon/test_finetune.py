@@ -14,9 +14,9 @@ from scipy.signal import convolve2d
 
 import doedesign.commands.finetune as command
 from doedesign.cli import exit_code, main
-from doedesign.commands.finetune import Request, finetune
+from doedesign.commands.finetune import FinetuneSettings, finetune
 from doedesign.recon.model import PsfChoice, open_model, psfs_of
-from doedesign.recon.network import Layout, Network
+from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import read_network, write_network
 from doedesign.training.crops import PairData, Pairs
@@ -32,7 +32,7 @@ from sim.store import read_bank, write_bank, write_picture
 PIXEL = 3.7e-6
 ABOUT = {"run": "small", "colours": ["550nm"], "wavelengths_m": [550e-9], "pixel_m": PIXEL, "near_m": [0.05, 0.12]}
 # One colour, a network without transforms of its own and a loss of two terms compile in the least time.
-LAYOUT = Layout(colours=1, width=2, depth=1, wiener=False, near_estimate=False, refine=False)
+LAYOUT = NetworkShape(colours=1, width=2, depth=1, wiener=False, near_estimate=False, refine=False)
 SPEC = """
 name = "small"
 [optics]
@@ -131,7 +131,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tuned(model: Path, pairs: Path, out: Path, *, drawn: bool = False, **options: Any) -> tuple[int, str]:
     """Fine-tune: the exit code, and what was said. Drawing takes longer than all else, so it is left out."""
     said: list[str] = []
-    request = Request(**{"steps": STEPS, "validation": 2, **options})
+    request = FinetuneSettings(**{"steps": STEPS, "validation": 2, **options})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.talk.say", said.append)
         for name in () if drawn else ("draw_training", "draw_validation"):

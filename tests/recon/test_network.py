@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.recon.network import Block, Layout, Network, count_parameters, normalised, shrunk
+from doedesign.recon.network import Block, Network, NetworkShape, count_parameters, normalised, shrunk
 from sim.light import srgb_from_linear
 
-SMALL = Layout(width=3, depth=2)
-TINY = Layout(width=3, depth=1)
+SMALL = NetworkShape(width=3, depth=2)
+TINY = NetworkShape(width=3, depth=1)
 CALL = eqx.filter_jit(Network.__call__)
 
 
@@ -29,7 +29,7 @@ def capture(side: int = 16) -> jax.Array:
     return jax.random.uniform(jax.random.key(5), (1, 3, side, side))
 
 
-def by_hand(layout: Layout) -> int:
+def by_hand(layout: NetworkShape) -> int:
     """Parameters counted from the layers as they are described."""
     w, c = layout.widths, layout.colours
     total = 2 * c  # regularisers of the estimates with both PSFs
@@ -46,11 +46,11 @@ def by_hand(layout: Layout) -> int:
 
 
 def test_the_paper_size_has_two_point_three_million_parameters() -> None:
-    network = Network.make(Layout(), 0)
-    assert count_parameters(network) == by_hand(Layout()) == 2_311_128
+    network = Network.make(NetworkShape(), 0)
+    assert count_parameters(network) == by_hand(NetworkShape()) == 2_311_128
     # The public release's layers, 2 307 399 numbers with 1 677 biases that a normalisation takes away again and without
     # the 231 regularisers that are learnt here (324 and 3).
-    release = Network.make(Layout(variant="release"), 0)
+    release = Network.make(NetworkShape(variant="release"), 0)
     assert abs(count_parameters(release) - 2_307_399) < 2000
 
 
@@ -135,11 +135,11 @@ def test_signals_keep_their_size() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="multiple of the 3 colours"):
-        Layout(width=10)
+        NetworkShape(width=10)
     with pytest.raises(ValueError, match="from 1 to 4"):
-        Layout(depth=5)
+        NetworkShape(depth=5)
     with pytest.raises(ValueError, match="but both are off"):
-        Network.make(Layout(features=False, wiener=False), 0)
+        Network.make(NetworkShape(features=False, wiener=False), 0)
     network = Network.make(SMALL, 1)
     with pytest.raises(ValueError, match="must have 3 colours"):
         network(capture()[:, :1], psfs()[:, :1], psfs()[:, :1])

@@ -10,9 +10,9 @@ from PIL import Image
 
 import doedesign
 from doedesign.cli import main
-from doedesign.commands.reconstruct import FORMAT, Request, reconstruct
+from doedesign.commands.reconstruct import FORMAT, ReconstructionSettings, reconstruct
 from doedesign.recon.model import PsfChoice, open_model, psfs_of
-from doedesign.recon.network import Layout
+from doedesign.recon.network import NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import camera_facts, read_network, write_network
 from fab.errors import InputError
@@ -29,7 +29,7 @@ COLOURS = ("486nm", "589nm", "656nm")
 WAVES = (486e-9, 589e-9, 656e-9)
 PIXEL = 3.7e-6
 ABOUT = {"colours": list(COLOURS), "wavelengths_m": list(WAVES), "pixel_m": PIXEL, "near_m": [0.05, 0.08, 0.12]}
-LAYOUT = Layout(width=3, depth=1, wiener=False, near_estimate=False, refine=False)
+LAYOUT = NetworkShape(width=3, depth=1, wiener=False, near_estimate=False, refine=False)
 # Through single precision, the curve and back, and half a count of 16 bits.
 SIXTEEN = 0.5 / 65535 + 1e-6
 
@@ -41,7 +41,7 @@ def bank(colours=COLOURS, depths=(0.05, 0.12, 5.0, np.inf), pixel=PIXEL, window=
 
 
 def model_in(
-    folder: Path, layout: Layout = LAYOUT, about=ABOUT, spread: float = 0.0, psfs: PsfBank | None = None
+    folder: Path, layout: NetworkShape = LAYOUT, about=ABOUT, spread: float = 0.0, psfs: PsfBank | None = None
 ) -> Path:
     """A model; with a spread of 0 its network hands the capture through."""
     write_network(folder / "network.npz", drawn(layout, spread), about)
@@ -74,7 +74,7 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
     for path, bits in zip(files, (None, 16, 8, 16, None), strict=True):
         write_reconstruction(path, display, bits)
     out = tmp_path / "out"
-    written = reconstruct(run, files, out, Request(tile=32, overlap=8))
+    written = reconstruct(run, files, out, ReconstructionSettings(tile=32, overlap=8))
     assert written == [out / path.name for path in files]
     for before, after in zip(files, written, strict=True):
         one, other = read_capture(before), read_capture(after)
@@ -84,7 +84,7 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
 
 def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
     out = tmp_path / "out"
-    reconstruct(run, [capture], out, Request(PsfChoice(near_m=0.07), kind=".png", beside=True))
+    reconstruct(run, [capture], out, ReconstructionSettings(PsfChoice(near_m=0.07), kind=".png", beside=True))
     manifest = read_json(out / "manifest.json")
     assert manifest["format"] == FORMAT
     assert set(manifest["results"]) == {"capture.png", "capture_beside.png"}
@@ -97,7 +97,7 @@ def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Pat
 
 
 def test_side_by_side_shows_both(tmp_path: Path, run: Path, capture: Path, light: np.ndarray):
-    reconstruct(run, [capture], tmp_path / "out", Request(beside=True))
+    reconstruct(run, [capture], tmp_path / "out", ReconstructionSettings(beside=True))
     seen = np.asarray(Image.open(tmp_path / "out" / "capture_beside.png"))[::-1].transpose(2, 0, 1) / 255
     assert seen.shape == (3, 30, 2 * 41 + 2)
     for half in (seen[..., :41], seen[..., 43:]):
@@ -130,7 +130,7 @@ def test_captures_of_one_name_are_told_apart_by_their_folders(tmp_path: Path, ru
 
 def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
     """A network with Wiener blocks gives another picture with other PSFs, and the same with its own handed in."""
-    model = model_in(tmp_path / "model", Layout(width=3, depth=1, features=False, refine=False), spread=0.1)
+    model = model_in(tmp_path / "model", NetworkShape(width=3, depth=1, features=False, refine=False), spread=0.1)
     sharp = bank()
     sharp = PsfBank(np.zeros_like(sharp.energy), COLOURS, sharp.depths_m, PIXEL)
     sharp.energy[..., 3, 3] = 0.8
@@ -138,7 +138,7 @@ def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
     shutil.copy(model / "psf.exr", tmp_path / "same.exr")
     pictures = []
     for k, psf in enumerate(((), (tmp_path / "same.exr",), (tmp_path / "sharp.exr",))):
-        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", Request(PsfChoice(psf)))
+        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", ReconstructionSettings(PsfChoice(psf)))
         pictures.append(read_picture(path)[0]["G"])
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert np.abs(pictures[2] - pictures[0]).max() > 1e-3
@@ -188,7 +188,7 @@ def test_measured_psfs_take_the_energy_of_the_models(tmp_path: Path, run: Path):
 
 def test_one_colour_takes_luminance_and_gives_grey(tmp_path: Path, capture: Path, light: np.ndarray):
     about = ABOUT | {"colours": ["550nm"], "wavelengths_m": [550e-9]}
-    layout = Layout(colours=1, width=2, depth=1, wiener=False, near_estimate=False, refine=False)
+    layout = NetworkShape(colours=1, width=2, depth=1, wiener=False, near_estimate=False, refine=False)
     model = model_in(tmp_path / "grey", layout, about)
     (path,) = reconstruct(model, [capture], tmp_path / "out")
     channels, _ = read_picture(path)
@@ -224,7 +224,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
     write_picture(tmp_path / "nan.exr", {c: nan for c in "RGB"})
 
     def psf(*names: str, **more) -> dict:
-        return {"request": Request(PsfChoice([tmp_path / name for name in names], **more))}
+        return {"request": ReconstructionSettings(PsfChoice([tmp_path / name for name in names], **more))}
 
     return {
         "pitch": (r"must have the 3\.7 um pixels .* but got 1\.85 um\. Compute or bin", psf("pitch.exr")),
@@ -241,12 +241,24 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
         "dark": ("a PSF must hold light", psf("dark.exr", "dark.exr", pixel_m=PIXEL)),
         "three": ("must be one bank, or one file of the scene", psf("far.exr", "far.exr", "far.exr")),
         "no psf": ("must exist", psf("none.exr")),
-        "near beyond": ("--near-depth: must lie within", {"request": Request(PsfChoice(near_m=0.01))}),
-        "negative": ("--near-depth: must be a positive distance", {"request": Request(PsfChoice(near_m=-0.1))}),
-        "nan depth": ("--far-depth: must be a positive distance", {"request": Request(PsfChoice(far_m=np.nan))}),
-        "order": ("the obstruction must be nearer", {"request": Request(PsfChoice(near_m=6.0, far_m=5.0))}),
-        "tile": ("--tile, --overlap: overlap must be at most half", {"request": Request(tile=64, overlap=48)}),
-        "kind": ("--kind: must be one of", {"request": Request(kind=".jpg")}),
+        "near beyond": ("--near-depth: must lie within", {"request": ReconstructionSettings(PsfChoice(near_m=0.01))}),
+        "negative": (
+            "--near-depth: must be a positive distance",
+            {"request": ReconstructionSettings(PsfChoice(near_m=-0.1))},
+        ),
+        "nan depth": (
+            "--far-depth: must be a positive distance",
+            {"request": ReconstructionSettings(PsfChoice(far_m=np.nan))},
+        ),
+        "order": (
+            "the obstruction must be nearer",
+            {"request": ReconstructionSettings(PsfChoice(near_m=6.0, far_m=5.0))},
+        ),
+        "tile": (
+            "--tile, --overlap: overlap must be at most half",
+            {"request": ReconstructionSettings(tile=64, overlap=48)},
+        ),
+        "kind": ("--kind: must be one of", {"request": ReconstructionSettings(kind=".jpg")}),
         "grey": ("a capture must have the 3 colours of the network, but got 1", {"captures": [tmp_path / "grey.exr"]}),
         "nan": ("NaN or infinity at row 3 from below, column 4", {"captures": [tmp_path / "nan.exr"]}),
         "nothing": ("at least one capture", {"captures": []}),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from doedesign.recon.conv import convolution
-from doedesign.recon.network import Layout
+from doedesign.recon.network import NetworkShape
 from doedesign.recon.tiles import plan_tiles, reconstruct_tiled
 from sim.light import srgb_from_linear
 from tests.recon.drawn_networks import drawn
@@ -148,7 +148,7 @@ def test_plans_that_cannot_be_are_refused():
 @pytest.mark.slow
 def test_a_real_network_takes_tiles():
     """One tile is the network's own result; several agree with it but for what a tile has as a whole."""
-    layout = Layout(width=3, depth=1)
+    layout = NetworkShape(width=3, depth=1)
     network = drawn(layout, 0.02)
     far, near = np.random.default_rng(3).dirichlet(np.ones(25), (2, 3)).reshape(2, 3, 5, 5).astype(np.float32)
     image = picture(64, 160)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.capture.scenes import Batch
+from doedesign.capture.scenes import SceneBatch
 from doedesign.spec.training import TrainSpec
-from doedesign.training.joint import State, Trainer, devices_mesh, rates_at, resting_depths_m
+from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
 from doedesign.training.optics import LivePlate
 from fab.errors import InputError
 from sim.obstruction import Dirt
@@ -37,7 +37,9 @@ def alike(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def walk(made: Trainer, steps: int, state: State | None = None, at: int | None = None) -> tuple[State, list[float]]:
+def walk(
+    made: Trainer, steps: int, state: JointState | None = None, at: int | None = None
+) -> tuple[JointState, list[float]]:
     """Steps on one batch, and their losses; `at` lets each of them count as that step."""
     state, losses = state or made.initial(heights()), []
     for _ in range(steps):
@@ -97,7 +99,7 @@ def test_a_conventional_camera_has_a_flat_plate() -> None:
 
 
 def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
-    def first(given: Batch, made: Trainer = joint) -> float:
+    def first(given: SceneBatch, made: Trainer = joint) -> float:
         return made.step(made.initial(heights()), given)[1].loss
 
     loss = first(batch())

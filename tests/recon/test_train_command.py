@@ -23,10 +23,10 @@ from PIL import Image
 import doedesign.commands.train as command
 import doedesign.runs.archive
 import doedesign.training.results
-from doedesign.build import camera_of
+from doedesign.build import camera_from_spec
 from doedesign.capture.images import decoded, sample_files
 from doedesign.cli import exit_code, main
-from doedesign.commands.train import Request, train
+from doedesign.commands.train import TrainingSettings, train
 from doedesign.recon.weights import read_network
 from doedesign.report.training import ValidationRow, draw_training, draw_validation
 from doedesign.runs.level_maps import level_map_from
@@ -127,7 +127,7 @@ def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> tuple[int, str]:
     """Train: the exit code, and what was said."""
     said: list[str] = []
-    request = Request(images=images, overrides=changes, **more)
+    request = TrainingSettings(images=images, overrides=changes, **more)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.talk.say", said.append)
         code = exit_code(lambda: train(run, out, request, said.append))
@@ -517,7 +517,7 @@ def test_what_stays_at_rest(
     moved, _ = read_network(out / "network.npz")
     fresh = jax.tree.leaves(command.Trainer.initial(_still(run), np.zeros((2, 2), np.float32)).network)
     assert any(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(moved), fresh, strict=True)) == network
-    camera = camera_of(load_spec(run / "spec.toml"))
+    camera = camera_from_spec(load_spec(run / "spec.toml"))
     flat = psf_bank(replace(camera, window=33), np.zeros((64, 64), np.float32), (np.inf,)).energy
     assert np.array_equal(read_bank(out / "psf.exr").energy[:, -1:], flat) == (height is None)
 

@@ -10,14 +10,14 @@ import jax
 import numpy as np
 import pytest
 
-from doedesign.recon.network import Layout, Network, count_parameters
+from doedesign.recon.network import Network, NetworkShape, count_parameters
 from doedesign.recon.weights import FORMAT, read_network, write_network
 from doedesign.runs.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import canonical_json
 from tests.recon.drawn_networks import drawn
 
-SMALL = Layout(width=3, depth=1)
+SMALL = NetworkShape(width=3, depth=1)
 ABOUT = {
     "colours": ["red", "green", "blue"],
     "occlusion": "radiometric",
@@ -61,12 +61,12 @@ def test_a_network_comes_back_to_the_last_bit(path: Path, network: Network):
 @pytest.mark.parametrize(
     "layout",
     [
-        Layout(colours=1, width=2, depth=1, refine=False, near_estimate=False, wiener=False),
-        Layout(width=3, depth=2, features=False),
-        Layout(width=3, depth=1, variant="release"),
+        NetworkShape(colours=1, width=2, depth=1, refine=False, near_estimate=False, wiener=False),
+        NetworkShape(width=3, depth=2, features=False),
+        NetworkShape(width=3, depth=1, variant="release"),
     ],
 )
-def test_every_ablation_has_a_file(tmp_path: Path, layout: Layout):
+def test_every_ablation_has_a_file(tmp_path: Path, layout: NetworkShape):
     network = drawn(layout)
     write_network(tmp_path / "network.npz", network, {})
     assert jax.tree.structure(read_network(tmp_path / "network.npz")[0]) == jax.tree.structure(network)
@@ -78,7 +78,7 @@ def test_the_same_network_gives_the_same_bytes(path: Path, tmp_path: Path, netwo
 
 
 def test_the_full_network_fits_into_ten_megabytes(tmp_path: Path):
-    network = drawn(Layout())
+    network = drawn(NetworkShape())
     for half, bytes_each in ((False, 4), (True, 2)):
         write_network(tmp_path / "network.npz", network, ABOUT, half=half)
         size = (tmp_path / "network.npz").stat().st_size

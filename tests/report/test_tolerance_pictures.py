@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from doedesign.report.pictures import draw_budget, draw_changes, draw_histograms, draw_shares, draw_yield
 from doedesign.report.tolerance import error_label
-from doedesign.tolerancing import Budget, Change, Index, Share, Table, limit_from_text
+from doedesign.tolerancing import Budget, Change, Index, PlateTable, Share, limit_from_text
 from doedesign.tolerancing.analysis import yield_of
 from fab.grid import Grid
 from sim.camera import Camera, Colour
@@ -26,7 +26,7 @@ LIMITS = [
 MARK = np.array([0xD1, 0x49, 0x5B]) / 255
 
 
-def random_table(rng: np.random.Generator, plates: int = 60) -> Table:
+def random_table(rng: np.random.Generator, plates: int = 60) -> PlateTable:
     shape = (plates, len(PLACES))
     values = {
         "zeroth_order": rng.gamma(3, 0.01, shape),
@@ -37,7 +37,7 @@ def random_table(rng: np.random.Generator, plates: int = 60) -> Table:
         "far_spot": np.where(NEAR_ROWS, np.nan, rng.normal(0.4, 0.02, shape)),
     }
     values["ring_to_disc"][0, 0] = np.inf  # a plate without any light in the disc
-    return Table(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
+    return PlateTable(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
 
 
 def changes(rng: np.random.Generator) -> list[Change]:
@@ -124,7 +124,7 @@ def coloured(path: Path, hue: np.ndarray) -> int:
     ids=["histograms", "yield"],
 )
 def test_a_limit_is_marked_wherever_it_lies(
-    draw: Callable[[Path, Table, list], None], rng: np.random.Generator, tmp_path: Path
+    draw: Callable[[Path, PlateTable, list], None], rng: np.random.Generator, tmp_path: Path
 ):
     table = random_table(rng)
     draw(tmp_path / "without.png", table, [])

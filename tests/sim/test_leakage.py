@@ -14,7 +14,7 @@ from sim.camera import Camera, Colour
 from sim.leakage import SplitPsf, mean_transmission, split_psf, strehl, zeroth_order
 from sim.metrics import zeroth_order as zeroth_order_of_heights
 from sim.psf_bank import psf_bank, surface_bank
-from sim.surface import Surface, as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 2e-6
 CELLS = 48
@@ -33,21 +33,21 @@ def level() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def nominal(level: np.ndarray) -> Surface:
+def nominal(level: np.ndarray) -> FabricatedDoe:
     return as_fabricated(level, CAMERA, Process(LEVELS), Variation())
 
 
 @pytest.fixture(scope="module")
-def plate(level: np.ndarray) -> Surface:
+def plate(level: np.ndarray) -> FabricatedDoe:
     return as_fabricated(level, CAMERA, Process(LEVELS), Variation(depth_scale=(0.02, -0.04, 0.03, 0.05)))
 
 
 @pytest.fixture(scope="module")
-def split(plate: Surface) -> SplitPsf:
+def split(plate: FabricatedDoe) -> SplitPsf:
     return split_psf(CAMERA, plate, GREEN, DEPTH_M)
 
 
-def test_the_mean_is_weighted_by_the_open_share_of_every_cell(plate: Surface):
+def test_the_mean_is_weighted_by_the_open_share_of_every_cell(plate: FabricatedDoe):
     weights = np.asarray(plate.coverage, float)
     values = np.asarray(plate.means, complex)
     mean = (values * weights).sum(axis=(1, 2)) / weights.sum()
@@ -55,14 +55,14 @@ def test_the_mean_is_weighted_by_the_open_share_of_every_cell(plate: Surface):
     np.testing.assert_allclose(zeroth_order(plate), np.abs(mean) ** 2, rtol=1e-12)
 
 
-def test_the_zeroth_order_of_a_plate_as_drawn_is_that_of_its_height_map(level: np.ndarray, nominal: Surface):
+def test_the_zeroth_order_of_a_plate_as_drawn_is_that_of_its_height_map(level: np.ndarray, nominal: FabricatedDoe):
     height = height_of(level, LEVELS)
     heights = [zeroth_order_of_heights(CAMERA, height, line) for line in GREEN.wavelengths_m]
     # Both divide by the opening's area, once summed over the cells' shares (1e-4 for so small a circle).
     np.testing.assert_allclose(zeroth_order(nominal), heights, rtol=1e-3)
 
 
-def test_a_flat_plate_leaks_everything(nominal: Surface):
+def test_a_flat_plate_leaks_everything(nominal: FabricatedDoe):
     even = jnp.full_like(nominal.transmission, jnp.exp(0.7j))
     flat = dataclasses.replace(nominal, transmission=even, means=even, height_m=None)
     np.testing.assert_allclose(zeroth_order(flat), 1.0, atol=1e-6)  # float32
@@ -71,7 +71,7 @@ def test_a_flat_plate_leaks_everything(nominal: Surface):
     assert relative_error(parts.leaked, parts.total.astype(np.float64)) < 1e-6
 
 
-def test_strehl_is_the_overlap_with_the_plate_as_drawn(nominal: Surface, plate: Surface):
+def test_strehl_is_the_overlap_with_the_plate_as_drawn(nominal: FabricatedDoe, plate: FabricatedDoe):
     np.testing.assert_allclose(strehl(nominal, nominal), 1.0, atol=1e-5)  # `cis` is good to 4e-6
     weights = np.asarray(plate.coverage, float)
     wrong = np.asarray(plate.means, complex) * np.conj(np.asarray(nominal.means, complex))
@@ -80,7 +80,7 @@ def test_strehl_is_the_overlap_with_the_plate_as_drawn(nominal: Surface, plate: 
     assert (overlap < 0.999).all()
 
 
-def test_strehl_of_a_plate_in_half_cells(nominal: Surface, plate: Surface):
+def test_strehl_of_a_plate_in_half_cells(nominal: FabricatedDoe, plate: FabricatedDoe):
     """Every cell of the plate as drawn stands for the two by two halves of it."""
 
     def halved(values: jnp.ndarray) -> jnp.ndarray:
@@ -96,13 +96,13 @@ def test_strehl_of_a_plate_in_half_cells(nominal: Surface, plate: Surface):
     np.testing.assert_allclose(strehl(halves, nominal), strehl(plate, nominal), rtol=1e-6)
 
 
-def test_the_parts_belong_to_the_psf_of_the_bank(plate: Surface, split: SplitPsf):
+def test_the_parts_belong_to_the_psf_of_the_bank(plate: FabricatedDoe, split: SplitPsf):
     bank = surface_bank(CAMERA, plate, [DEPTH_M]).energy[0, 0]
     np.testing.assert_array_equal(split.total, bank)
     assert relative_error(split.leaked + split.diffracted + split.interference, bank.astype(np.float64)) < 1e-6
 
 
-def test_what_leaks_is_the_zeroth_order_of_the_bare_lens(plate: Surface, split: SplitPsf):
+def test_what_leaks_is_the_zeroth_order_of_the_bare_lens(plate: FabricatedDoe, split: SplitPsf):
     orders = zeroth_order(plate)
     bare = np.zeros_like(split.leaked, float)
     for i, line in enumerate(GREEN.wavelengths_m):

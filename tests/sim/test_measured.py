@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from sim.frames import Frame
+from sim.frames import CameraFrame
 from sim.measured import (
     MeasuredPsf,
     Noise,
@@ -19,11 +19,11 @@ NOISE = Noise(gain_e=2.0, read_e=4.0)
 BLACK = 100.0
 
 
-def exposed(rate: np.ndarray, exposure: float, rng: np.random.Generator, top: float = 4095.0) -> Frame:
+def exposed(rate: np.ndarray, exposure: float, rng: np.random.Generator, top: float = 4095.0) -> CameraFrame:
     """A 12-bit frame of a known rate, counts per unit of exposure."""
     electrons = rng.poisson(rate * exposure * NOISE.gain_e) + rng.normal(0, NOISE.read_e, rate.shape)
     counts = np.clip(np.rint(electrons / NOISE.gain_e + BLACK), 0, top).astype(np.float32)
-    return Frame(counts, np.ones(rate.shape, bool), top, 0.0, 1.0)
+    return CameraFrame(counts, np.ones(rate.shape, bool), top, 0.0, 1.0)
 
 
 def test_a_bracket_has_the_true_rate_and_the_noise_it_claims(rng: np.random.Generator):
@@ -72,8 +72,8 @@ def test_full_pixels_come_from_shorter_exposures_and_are_lost_without(rng: np.ra
 def test_bad_brackets_are_refused_by_name(rng: np.random.Generator):
     rate = np.full((20, 20), 10.0)
     frame = exposed(rate, 1.0, rng)
-    other = Frame(frame.counts[:10], frame.valid[:10])
-    bright = Frame(frame.counts + 50, frame.valid)
+    other = CameraFrame(frame.counts[:10], frame.valid[:10])
+    bright = CameraFrame(frame.counts + 50, frame.valid)
     names = ["a.tiff", "b.tiff"]
     with pytest.raises(InputError, match=r"b\.tiff: all exposures of an image must have the same size"):
         merge_exposures([frame, other], [1.0, 2.0], [0.0, 0.0], NOISE, names=names)

@@ -11,13 +11,13 @@ from bench.reference import relative_error
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.masks import levels_of, planes
+from fab.masks import level_map_from_planes, planes
 from fab.process import Disc, MaskDisc, Process, Variation, error_names, variation_of
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.propagation.pupil import cis
 from sim.psf_bank import psf_bank, surface_bank
-from sim.surface import Surface, as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 1.85e-6
 CELLS = 48
@@ -41,7 +41,7 @@ SAME_LIGHT = 1e-5
 NOTHING = Variation()
 
 
-def plate(level: np.ndarray, variation: Variation = NOTHING, process: Process = PROCESS) -> Surface:
+def plate(level: np.ndarray, variation: Variation = NOTHING, process: Process = PROCESS) -> FabricatedDoe:
     return as_fabricated(level, CAMERA, process, variation)
 
 
@@ -62,7 +62,7 @@ def shifted_planes(level: np.ndarray, mask: int, by: tuple[int, int]) -> np.ndar
     """The level map when one mask's plane is moved by whole pixels (y, x)."""
     masks = planes(level, LEVELS)
     masks[mask] = np.roll(masks[mask], by, axis=(0, 1))
-    return levels_of(masks, LEVELS)
+    return level_map_from_planes(masks, LEVELS)
 
 
 # --- nothing wrong with the plate -------------------------------------------------------------------------------------

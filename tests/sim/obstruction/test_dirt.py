@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from sim.obstruction import Dirt, View
+from sim.obstruction import CameraView, Dirt
 from sim.obstruction.dirt import SOILS, layer
 from sim.obstruction.noise import layered_noise
 
-VIEW = View((192, 256), 7.4e-6, 8e-3)
+VIEW = CameraView((192, 256), 7.4e-6, 8e-3)
 GREY = np.full((3, 192, 256), 0.5, np.float32)
 
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from sim.obstruction import Fence, View
+from sim.obstruction import CameraView, Fence
 from sim.obstruction.fence import _Lamp, _Wires, rods, seen, tilted_plane
 
-VIEW = View((256, 512), 12.9e-6, 50e-3)
+VIEW = CameraView((256, 512), 12.9e-6, 50e-3)
 GREY = np.full((3, 256, 512), 0.5, np.float32)
 PLAIN: dict[str, Any] = {
     "tilt_rad": (0.0, 0.0),
@@ -19,7 +19,7 @@ PLAIN: dict[str, Any] = {
 LAMP = _Lamp(0.0, 0.0, 1.0, 1.0, 0.25)
 
 
-def drawn_mask(fence: Fence, seed: int = 0, view: View = VIEW) -> np.ndarray:
+def drawn_mask(fence: Fence, seed: int = 0, view: CameraView = VIEW) -> np.ndarray:
     grey = np.full((3, *view.shape), 0.5, np.float32)
     return np.asarray(fence.draw(np.random.default_rng(seed), view, grey).mask)
 
@@ -58,7 +58,7 @@ def test_turned_bars_cover_as_much():
 
 @pytest.mark.parametrize("pattern", ["grid", "chain_link"])
 def test_two_families_cover_what_two_families_cover(pattern: Any):
-    wide = View((256, 256), 12.9e-6, 6e-3)
+    wide = CameraView((256, 256), 12.9e-6, 6e-3)
     fence = Fence(patterns=(pattern,), depth_m=(0.5, 0.5), mesh_m=(0.04, 0.04), diamond_rad=(0.8, 0.8), **PLAIN)
     alone = 4 / 40
     # Bends that reach past each other add a little to a chain-link fence, or take it from the crossing.
@@ -112,14 +112,14 @@ def test_a_wire_is_lit_as_a_cylinder():
 
 @pytest.mark.parametrize("pattern", ["chain_link", "bars", "grid"])
 def test_no_frame_falls_into_a_gap(pattern: Any):
-    small = View((64, 64), 12.9e-6, 50e-3)
+    small = CameraView((64, 64), 12.9e-6, 50e-3)
     fence = Fence(patterns=(pattern,), mesh_m=(0.4, 0.5))
     # Even with meshes a hundred times wider than the frame, the wire through its random pixel is seen.
     assert min(drawn_mask(fence, seed, small).max() for seed in range(20)) > 0.9
 
 
 def test_sag_moves_wires_by_what_was_asked():
-    view = View((128, 128), 12.9e-6, 5e-3)
+    view = CameraView((128, 128), 12.9e-6, 5e-3)
     fence = Fence(patterns=("bars",), sag_m=(5e-3, 5e-3), bend_m=(0.0, 0.0))
     plane = tilted_plane(view, 0.5, 0.0, 0.0)
     moved = [fence.bent(np.random.default_rng(s), view, plane, 0.04).u - plane.u for s in range(30)]
@@ -128,7 +128,7 @@ def test_sag_moves_wires_by_what_was_asked():
 
 
 def test_a_view_too_wide_for_the_tilt_is_refused(rng: np.random.Generator):
-    wide = View((64, 64), 100e-6, 3e-3)
+    wide = CameraView((64, 64), 100e-6, 3e-3)
     with pytest.raises(InputError, match=r"fence: tilt_rad: must keep the whole frame's fence before the lens"):
         Fence(tilt_rad=(0.8, 0.8)).draw(rng, wide, np.full((3, 64, 64), 0.5, np.float32))
 

@@ -9,10 +9,10 @@ from PIL import Image
 
 from fab.errors import InputError
 from sim.light import linear_from_srgb
-from sim.obstruction import MaskFolder, View
+from sim.obstruction import CameraView, MaskFolder
 from sim.obstruction.folder import read_mask, resized
 
-VIEW = View((120, 160), 10e-6, 10e-3)  # 1 mm at 10 cm is 10 pixels
+VIEW = CameraView((120, 160), 10e-6, 10e-3)  # 1 mm at 10 cm is 10 pixels
 GREY = np.full((3, 120, 160), 0.5, np.float32)
 AT: dict[str, Any] = {"depth_m": (0.1, 0.1), "light": (1.0, 1.0)}
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sim.obstruction import OBSTRUCTIONS, Dirt, DirtRaindrop, Kind, MaskFolder, Raindrop, View
+from sim.obstruction import OBSTRUCTIONS, CameraView, Dirt, DirtRaindrop, MaskFolder, ObstructionKind, Raindrop
 
 # Frames as wide as those of the paper's two tasks, with four times fewer pixels each way.
-AUTOMOTIVE = View((128, 128), 14.8e-6, 8e-3)
-DSLR = View((128, 128), 51.6e-6, 50e-3)
+AUTOMOTIVE = CameraView((128, 128), 14.8e-6, 8e-3)
+DSLR = CameraView((128, 128), 51.6e-6, 50e-3)
 
 # Depth, and mean share of the frame that 16 draws cover: what the defaults give, and as much again either way.
 EXPECTED = {
@@ -25,7 +25,7 @@ EXPECTED = {
 }
 
 
-def made(name: str, folder: Path) -> Kind:
+def made(name: str, folder: Path) -> ObstructionKind:
     if name != "folder":
         return OBSTRUCTIONS[name]()
     Image.fromarray(np.pad(np.full((40, 60), 255, np.uint8), 10)).save(folder / "patch.png")
@@ -77,13 +77,13 @@ def test_a_background_of_another_size_is_refused(name: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_frames_need_not_be_square(name: str, tmp_path: Path):
-    view = View((60, 90), 30e-6, 8e-3)
+    view = CameraView((60, 90), 30e-6, 8e-3)
     drawn = made(name, tmp_path).draw(np.random.default_rng(0), view, np.full((3, 60, 90), 0.3, np.float32))
     assert drawn.mask.shape == (60, 90)
 
 
 def test_the_coin_falls_on_either_side(background: np.ndarray):
-    def first(kind: Kind, seed: int) -> bytes:
+    def first(kind: ObstructionKind, seed: int) -> bytes:
         return np.asarray(kind.draw(np.random.default_rng(seed), AUTOMOTIVE, background).mask).tobytes()
 
     both = DirtRaindrop()

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from sim.obstruction import Raindrop, View
+from sim.obstruction import CameraView, Raindrop
 from sim.obstruction.raindrop import Drop, refracted
 
-VIEW = View((256, 256), 7.4e-6, 8e-3)
+VIEW = CameraView((256, 256), 7.4e-6, 8e-3)
 SQUARE: dict[str, Any] = {"tilt_rad": (0.0, 0.0), "elongation": (1.0, 1.0), "contrast": (1.0, 1.0)}
 INDEX = 1.333
 
@@ -116,7 +116,7 @@ def test_half_a_disc_and_half_an_ellipse(elongation: float):
 
 
 def test_a_drop_of_2_mm_at_5_cm():
-    view = View((512, 512), 3.7e-6, 8e-3)
+    view = CameraView((512, 512), 3.7e-6, 8e-3)
     kind = Raindrop(depth_m=(0.05, 0.05), radius_m=(2e-3, 2e-3), elongation=(1.0, 1.0), per_m2=(0.0, 0.0))
     grey = np.full((3, 512, 512), 0.5, np.float32)
     for seed in range(30):

@@ -5,10 +5,10 @@ import pytest
 
 from fab.errors import InputError
 from sim.light import srgb_from_linear
-from sim.obstruction import ReleaseDirt, ReleaseFence, ReleaseRaindrop, View
+from sim.obstruction import CameraView, ReleaseDirt, ReleaseFence, ReleaseRaindrop
 
-AUTOMOTIVE = View((512, 512), 3.7e-6, 8e-3)
-DSLR = View((256, 256), 25.8e-6, 50e-3)
+AUTOMOTIVE = CameraView((512, 512), 3.7e-6, 8e-3)
+DSLR = CameraView((256, 256), 25.8e-6, 50e-3)
 GREY = np.full((3, 512, 512), 0.5, np.float32)
 
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from sim.obstruction import View
+from sim.obstruction import CameraView
 
-DSLR = View((512, 512), 12.9e-6, 50e-3)
-AUTOMOTIVE = View((512, 512), 3.7e-6, 8e-3)
+DSLR = CameraView((512, 512), 12.9e-6, 50e-3)
+AUTOMOTIVE = CameraView((512, 512), 3.7e-6, 8e-3)
 
 
 def test_sizes_in_pixels_by_hand():
@@ -19,11 +19,11 @@ def test_sizes_in_pixels_by_hand():
 def test_a_pixel_and_the_frame_at_a_distance():
     # 3.7 um at 8 mm from the lens is 55.5 um at 12 cm; 512 of them are 28.4 mm.
     assert AUTOMOTIVE.pixel_at_m(0.12) == pytest.approx(55.5e-6)
-    assert View((256, 512), 3.7e-6, 8e-3).extent_m(0.12) == pytest.approx((14.208e-3, 28.416e-3))
+    assert CameraView((256, 512), 3.7e-6, 8e-3).extent_m(0.12) == pytest.approx((14.208e-3, 28.416e-3))
 
 
 def test_directions_are_centred_and_row_zero_is_the_lowest():
-    y, x = View((4, 3), 2e-6, 1e-3).slopes()
+    y, x = CameraView((4, 3), 2e-6, 1e-3).slopes()
     np.testing.assert_allclose(y[:, 0], [-3e-3, -1e-3, 1e-3, 3e-3], rtol=1e-6)
     np.testing.assert_allclose(x[0], [-2e-3, 0, 2e-3], rtol=1e-6)
 
@@ -42,7 +42,7 @@ def test_directions_are_centred_and_row_zero_is_the_lowest():
 )
 def test_nonsense_is_refused(shape: tuple[int, int], pixel_m: float, focal_m: float, name: str):
     with pytest.raises(ValueError, match=f"`{name}` must be"):
-        View(shape, pixel_m, focal_m)
+        CameraView(shape, pixel_m, focal_m)
 
 
 @pytest.mark.parametrize("depth_m", [0.0, -0.1, float("nan")])
@@ -52,7 +52,7 @@ def test_nothing_stands_behind_the_lens(depth_m: float):
 
 
 def test_a_background_fills_the_frame_in_three_colours():
-    View((4, 6), 1e-6, 1e-3).require(np.zeros((3, 4, 6), np.float32))
+    CameraView((4, 6), 1e-6, 1e-3).require(np.zeros((3, 4, 6), np.float32))
     for shape in ((1, 4, 6), (3, 6, 4)):
         with pytest.raises(ValueError, match=r"`background` must have the shape \(3, 4, 6\)"):
-            View((4, 6), 1e-6, 1e-3).require(np.zeros(shape, np.float32))
+            CameraView((4, 6), 1e-6, 1e-3).require(np.zeros(shape, np.float32))
