@@ -1,6 +1,6 @@
 """A network's file: its weights, its shape, and what it was trained on and with.
 
-    network.npz     an archive (`doedesign.runs.archive`)
+    network.npz     an archive (`fab.archive`)
         header      format, layout, what it is about
         .down[0].blocks[0].weights ...      one array for each place in the network
 
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from doedesign.recon.network import Network, NetworkShape
-from doedesign.runs.archive import read_archive, write_archive
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from sim.camera import Camera
 from sim.metrics import mean_wavelength_m

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from doedesign import __version__
-from doedesign.runs.archive import read_archive, write_archive
+from fab.archive import read_archive, write_archive
 from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic

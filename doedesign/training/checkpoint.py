@@ -1,6 +1,6 @@
 """Checkpoints of training: one file that holds everything a step changes, whole or not at all.
 
-    checkpoint.npz      an archive (`doedesign.runs.archive`)
+    checkpoint.npz      an archive (`fab.archive`)
         header          format, whose it is, step; name, shape and kind of every array
         array00000 ...  the arrays, in the order of the state's leaves
 
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.runs.archive import read_archive, write_archive
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 
 __all__ = ["FORMAT", "read_checkpoint", "settled", "write_checkpoint"]

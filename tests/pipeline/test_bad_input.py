@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import doedesign.runs.archive
+import fab.archive
 from doedesign.cli import main
 from sim.store import write_height
 
@@ -171,7 +171,7 @@ def test_disk_that_takes_no_more(copied, tiny, cli, content, tmp_path, monkeypat
 
 def test_disk_that_fills_up_in_the_middle(finished, tiny, cli, content, tmp_path, monkeypatch):
     """The run stands at its last checkpoint, and goes on when there is room again."""
-    run, write = tmp_path / "run", doedesign.runs.archive.write_atomic
+    run, write = tmp_path / "run", fab.archive.write_atomic
     room = iter(range(1))  # one checkpoint
 
     def filling(path, data):
@@ -180,7 +180,7 @@ def test_disk_that_fills_up_in_the_middle(finished, tiny, cli, content, tmp_path
         write(path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(doedesign.runs.archive, "write_atomic", filling)
+        patch.setattr(fab.archive, "write_atomic", filling)
         refuse(cli("optimize", tiny, "--out", run), run / "checkpoint.npz", "No space left")
     assert {path.name for path in run.iterdir()} == {"manifest.json", "spec.toml", "checkpoint.npz"}
     done = cli("optimize", tiny, "--out", run)

@@ -21,8 +21,8 @@ import pytest
 from PIL import Image
 
 import doedesign.commands.train as command
-import doedesign.runs.archive
 import doedesign.training.results
+import fab.archive
 from doedesign.build import camera_from_spec
 from doedesign.capture.images import decoded, sample_files
 from doedesign.cli import exit_code, main
@@ -393,7 +393,7 @@ def test_a_process_that_is_told_to_end(
 
 def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The training stands at its last checkpoint, and goes on when there is room again."""
-    write, room = doedesign.runs.archive.write_atomic, iter(range(2))
+    write, room = fab.archive.write_atomic, iter(range(2))
 
     def filling(path: Path, data: bytes) -> None:
         if next(room, None) is None:
@@ -406,7 +406,7 @@ def test_a_disk_that_fills_up(run: Path, images: Path, whole: Path, tmp_path: Pa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(doedesign.runs.archive, "write_atomic", filling)
+        patch.setattr(fab.archive, "write_atomic", filling)
         code, said = trained(run, tmp_path / "out", images)
     assert code == 2
     assert "checkpoint.npz: the disk must have room" in said

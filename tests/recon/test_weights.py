@@ -12,7 +12,7 @@ import pytest
 
 from doedesign.recon.network import Network, NetworkShape, count_parameters
 from doedesign.recon.weights import FORMAT, read_network, write_network
-from doedesign.runs.archive import read_archive, write_archive
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import canonical_json
 from tests.recon.drawn_networks import drawn

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.runs.archive import read_archive, write_archive
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 
 HEADER = {"format": "something 1", "list": [1, 2.5, None, "Å"]}

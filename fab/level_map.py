@@ -1,0 +1,160 @@
+"""LevelMap: the state of a quantised DOE. Everything else, heights and masks alike, is derived from it.
+
+A level map says for every pixel of a grid which level of a staircase it has. Outside the clear aperture, where chrome
+covers the plate, it holds the top level, blank glass: that is seen to here, once, when a map is made. A file of one
+(`write_level_map`) keeps the bit planes of the level numbers, packed eight pixels to a byte, and loses nothing.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.archive import read_archive, write_archive
+from fab.errors import InputError
+from fab.files import sha256_bytes
+from fab.grid import Grid
+from fab.height import HeightMap
+from fab.levels import Levels, height_of, quantise, quantise_wrapped, require_levels
+from fab.masks import level_map_from_planes, planes
+from fab.units import format_length
+
+__all__ = ["LevelMap", "read_level_map", "write_level_map"]
+
+FORMAT = "doedesign level map 1"
+
+
+@dataclass(frozen=True, eq=False)
+class LevelMap:
+    """Level numbers of every pixel of a DOE.
+
+    Two maps are equal only if they are the same object, so that a map may be the key of a cache; compare `digest`.
+
+    Attributes:
+        level: ``[y, x]`` uint8 level numbers, row 0 at the lowest y; blank glass (the top level) outside the aperture,
+            whatever was given there. Read-only.
+        levels: the staircase.
+        grid: the raster.
+        aperture_m: diameter of the relief, metres.
+        name: the owner's name for it.
+    """
+
+    level: NDArray[np.uint8]
+    levels: Levels
+    grid: Grid
+    aperture_m: float
+    name: str = "doe"
+
+    def __post_init__(self) -> None:
+        """Check the values and leave the glass blank outside the aperture.
+
+        Raises:
+            InputError: the array is no level map of the staircase, its shape is not the grid's, or the aperture does
+                not fit the raster.
+        """
+        checked = require_levels(np.asarray(self.level), self.levels)
+        if checked.shape != self.grid.shape:
+            rule = f"must have the grid's shape {self.grid.shape}"
+            raise InputError("level map", rule, checked.shape, "Use its own grid.")
+        side_m = min(self.grid.extent_m)
+        if not 0 < self.aperture_m <= side_m * (1 + 1e-9):
+            rule = f"must lie from 0 to the shorter side of the raster, {format_length(side_m)}"
+            raise InputError("aperture", rule, format_length(self.aperture_m), "Give the diameter of the relief.")
+        blank = np.where(self.grid.inside_circle(self.aperture_m), checked, np.uint8(self.levels.count - 1))
+        blank.setflags(write=False)
+        object.__setattr__(self, "level", blank)
+
+    @classmethod
+    def from_height(cls, height: HeightMap, levels: Levels, name: str = "doe", *, wrapped: bool = False) -> "LevelMap":
+        """Give every pixel of a height map the nearest level.
+
+        Args:
+            height: the heights, metres.
+            levels: the staircase.
+            name: the owner's name for it.
+            wrapped: whether heights repeat after one wave of the design (`fab.levels.quantise_wrapped`).
+
+        Raises:
+            InputError: a height above the staircase that is not to be wrapped, or the aperture does not fit.
+        """
+        level = (quantise_wrapped if wrapped else quantise)(height.height_m, levels)
+        return cls(level, levels, height.grid, height.aperture_m, name)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Pixels ``(ny, nx)``."""
+        return self.grid.shape
+
+    @cached_property
+    def height_m(self) -> NDArray[np.float32]:
+        """``[y, x]`` height above the deepest floor, metres; blank glass outside the aperture. Read-only."""
+        height = height_of(self.level, self.levels).astype(np.float32)
+        height.setflags(write=False)
+        return height
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the level numbers, row by row."""
+        return sha256_bytes(self.level.tobytes())
+
+    def planes(self) -> NDArray[np.uint8]:
+        """Etch masks ``[bit, y, x]``: 1 where mask `bit` is open (`fab.masks.planes`)."""
+        return planes(self.level, self.levels)
+
+    def with_level(self, level: NDArray[np.integer]) -> "LevelMap":
+        """The same DOE with other level numbers ``[y, x]``."""
+        return replace(self, level=level)
+
+    def __str__(self) -> str:
+        """Return "quick: 320 x 320 pixels of 1.85 um in 16 levels of 75 nm"."""
+        ny, nx = self.shape
+        return f"{self.name}: {ny} x {nx} pixels of {format_length(self.grid.pitch_m)} in {self.levels.told}"
+
+
+def write_level_map(path: str | Path, level_map: LevelMap) -> None:
+    """Write a level map without loss; the same map gives the same bytes.
+
+    Raises:
+        InputError: the system refuses the path.
+    """
+    levels, grid = level_map.levels, level_map.grid
+    header = {
+        "format": FORMAT,
+        "name": level_map.name,
+        "shape": list(grid.shape),
+        "pitch_m": grid.pitch_m,
+        "aperture_m": level_map.aperture_m,
+        "levels": levels.count,
+        "level_step_m": levels.step_m,
+        "etch_depths_m": list(levels.depths_m),
+        "units": "SI; planes[k] is 1 where mask k is open, eight pixels to a byte along x, row 0 at the lowest y",
+    }
+    write_archive(path, header, {"planes": np.packbits(level_map.planes(), axis=-1)})
+
+
+def read_level_map(path: str | Path) -> LevelMap:
+    """Read what `write_level_map` wrote.
+
+    Raises:
+        InputError: the file is missing, damaged, changed since it was written, or no level map.
+    """
+    path = Path(path)
+    cure = "Write it again from its run."
+    header, arrays = read_archive(path, "level map", cure)
+    try:
+        if header["format"] != FORMAT:
+            raise InputError(str(path), f'must say format "{FORMAT}"', repr(header["format"]), cure)
+        ny, nx = (int(n) for n in header["shape"])
+        levels = Levels(int(header["levels"]), float(header["level_step_m"]), tuple(header["etch_depths_m"]))
+        grid = Grid((ny, nx), float(header["pitch_m"]))
+        bits = np.unpackbits(arrays["planes"], axis=-1, count=nx)
+        if bits.shape != (levels.bits, ny, nx):
+            raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", bits.shape, cure)
+        level = level_map_from_planes(bits, levels)
+        return LevelMap(level, levels, grid, float(header["aperture_m"]), str(header["name"]))
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(str(path), "must be a level map", f"{type(error).__name__}: {error}", cure) from error
