@@ -12,7 +12,7 @@ from doedesign.report.pictures import draw_psfs, draw_split
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_variation, variation_to_toml
-from doedesign.tolerancing.draws import EXPECTED, variation_at
+from fab.draws import EXPECTED, variation_at
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process, Variation

@@ -20,10 +20,10 @@ from doedesign.runs.folder import open_run
 from doedesign.spec import variation_to_toml
 from doedesign.tolerancing.analysis import QUANTITIES, limit_text, obeys, yield_of
 from doedesign.tolerancing.budget import Budget
-from doedesign.tolerancing.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
 from doedesign.tolerancing.pool import OutOfModel, Work, evaluate_here, predicted_bank
 from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
+from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
 from fab.process import DEVIATIONS, error_names

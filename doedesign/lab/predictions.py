@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from doedesign.prediction import Drawn, Prediction, plate_rows, predict, process_with_moves
 from doedesign.report.pictures import draw_psfs
 from doedesign.tolerancing.analysis import table_of
-from doedesign.tolerancing.draws import EXPECTED, one_at_a_time_keys, variation_at
 from doedesign.tolerancing.sensitivity import one_at_a_time
+from fab.draws import EXPECTED, one_at_a_time_keys, variation_at
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels

@@ -8,7 +8,6 @@
 
 Reading order:
 
-    draws         which plates a study looks at; a key for each, from which it can be made again alone
     pool          plates on all cores of this machine
     cluster       plates on a Dask cluster
     journal       finished plates on the disk

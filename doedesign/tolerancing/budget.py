@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.tolerancing.analysis import Yield
-from doedesign.tolerancing.draws import chosen_errors
+from fab.draws import chosen_errors
 from fab.process import Process
 
 FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.tolerancing.analysis import CONFIDENCE, PlateTable
-from doedesign.tolerancing.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
+from fab.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
 from fab.process import DEVIATIONS, Process
 from fab.sampling import source_of, varying
 

@@ -25,18 +25,6 @@ from doedesign.tolerancing.analysis import (
 )
 from doedesign.tolerancing.budget import FACTORS, Budget, budget_of
 from doedesign.tolerancing.cluster import evaluate_there
-from doedesign.tolerancing.draws import (
-    EXPECTED,
-    NOMINAL,
-    budget_keys,
-    chosen_errors,
-    corner_keys,
-    normal_keys,
-    one_at_a_time_keys,
-    sobol_keys,
-    sources_of,
-    variation_at,
-)
 from doedesign.tolerancing.journal import Journal
 from doedesign.tolerancing.pool import (
     Evaluate,
@@ -49,6 +37,18 @@ from doedesign.tolerancing.pool import (
     predicted_rows,
 )
 from doedesign.tolerancing.sensitivity import Change, Share, one_at_a_time, sobol
+from fab.draws import (
+    EXPECTED,
+    NOMINAL,
+    budget_keys,
+    chosen_errors,
+    corner_keys,
+    normal_keys,
+    one_at_a_time_keys,
+    sobol_keys,
+    sources_of,
+    variation_at,
+)
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.levels import Levels
@@ -139,7 +139,7 @@ class Study:
         return sources_of(self.process)
 
     def variation(self, key: str) -> Variation:
-        """The plate a key stands for; see `doedesign.tolerancing.draws`.
+        """The plate a key stands for; see `fab.draws`.
 
         Raises:
             InputError: no such key.

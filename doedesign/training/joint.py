@@ -33,7 +33,6 @@ from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
 from doedesign.spec.training import TrainSpec
-from doedesign.tolerancing.draws import variation_at
 from doedesign.training.hosts import on_all, own_copy, parts_of
 from doedesign.training.loss import TERMS, Weights, losses
 from doedesign.training.optics import (
@@ -46,6 +45,7 @@ from doedesign.training.optics import (
     TrainingScene,
     shots,
 )
+from fab.draws import variation_at
 from fab.errors import InputError
 from fab.levels import height_of
 from fab.process import Process

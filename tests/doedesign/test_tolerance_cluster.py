@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from doedesign.tolerancing import Study, study
-from doedesign.tolerancing.draws import normal_keys
 from doedesign.tolerancing.pool import Rows, Work
+from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import Variation, variation_of
 

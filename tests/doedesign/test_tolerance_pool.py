@@ -21,8 +21,8 @@ from typing import Any
 import pytest
 
 from doedesign.tolerancing import Study, study
-from doedesign.tolerancing.draws import normal_keys
 from doedesign.tolerancing.pool import default_workers
+from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import variation_of
 

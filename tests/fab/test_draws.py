@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from doedesign.tolerancing.draws import (
+from fab.draws import (
     budget_keys,
     chosen_errors,
     corner_keys,
