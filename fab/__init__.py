@@ -10,6 +10,7 @@ Map of the package, in the order the work flows:
     levels    Levels: height <-> level number
     masks     level map <-> bit planes, one plane per etch mask
     process   Process, Variation: what a lab does and how far it strays; one plate's errors
+    figure    house style, layout, PNG files and notebook HTML of all pictures
     sampling  draws of a process: Monte-Carlo, corners, Sobol, one at a time
     stock     numbers of named processes, each with its source
     polygons  bitmap <-> rectangles (numba), circles as annulus sectors

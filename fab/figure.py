@@ -1,0 +1,264 @@
+"""Figures that all pictures share: house style, layout, PNG files, scale bars and large maps made small.
+
+A picture is a function that draws and returns what it drew: axes where one panel is enough, a figure (or a sub-figure
+at the place of the axes that it was given) where several are. `save` writes it. matplotlib's constrained layout places
+everything. A new figure is drawn in the house style, whatever the user's settings are, and a picture on the user's own
+axes in the user's style. Maps are averaged here, not by matplotlib, which would turn rings of three cells into moire.
+"""
+
+import base64
+import io
+import math
+import textwrap
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.files import write_atomic
+from fab.units import MM, format_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+
+__all__ = [
+    "CHROME",
+    "DPI",
+    "FAINT",
+    "HEIGHTS",
+    "INK",
+    "LIGHT",
+    "LINE",
+    "MARK",
+    "SERIES",
+    "SMALL",
+    "bare",
+    "evenly_spaced",
+    "extent_of",
+    "html_of",
+    "length_text",
+    "panels",
+    "png_bytes",
+    "save",
+    "scale_bar",
+    "shrunk",
+    "single",
+]
+
+INK, FAINT, CHROME, MARK, LINE = "#222222", "#9aa0a6", "#8c8f94", "#d1495b", "#14507a"
+HEIGHTS, LIGHT = "viridis", "inferno"
+# The hues of M. Okabe and K. Ito, which stay apart for colour-blind readers.
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+SMALL = 8  # points
+DPI = 160
+_STYLE = {
+    "figure.dpi": DPI,
+    "savefig.dpi": "figure",
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 4,
+    "axes.labelpad": 2,
+    "axes.linewidth": 0.8,
+    "axes.formatter.useoffset": False,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.4,
+    "grid.alpha": 0.5,
+    "image.origin": "lower",
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "legend.fontsize": SMALL,
+    "legend.frameon": False,
+    "legend.columnspacing": 1.2,
+    "lines.linewidth": 1.4,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+}
+# matplotlib keeps its settings for the whole process; one picture at a time changes them, and puts them back.
+_STYLING = threading.RLock()
+
+
+@contextmanager
+def _house_style() -> Iterator[None]:
+    import matplotlib as mpl
+
+    defaults = {key: value for key, value in mpl.rcParamsDefault.items() if not key.startswith("backend")}
+    settings: Any = defaults | _STYLE
+    with _STYLING, mpl.rc_context(settings):
+        yield
+
+
+@cache
+def _figure_class() -> "type[Figure]":
+    from matplotlib.figure import Figure
+
+    class Picture(Figure):
+        """A figure that notebooks show, without pyplot."""
+
+        def _repr_png_(self) -> bytes:
+            return png_bytes(self)
+
+    return Picture
+
+
+@contextmanager
+def panels(
+    ax: "Axes | None",
+    size_in: tuple[float, float],
+    title: str = "",
+    note: str = "",
+    layout: Literal["constrained", "compressed"] = "constrained",
+) -> "Iterator[FigureBase]":
+    """Open a new figure in the house style, or a sub-figure in the place of some axes.
+
+    Args:
+        ax: axes of a subplot, which the sub-figure replaces; None for a new figure.
+        size_in: width and height of a new figure, inches.
+        title: a line above all; a long one is shortened.
+        note: small text below all, wrapped to the width.
+        layout: "compressed" for a grid of pictures of fixed aspect.
+
+    Yields:
+        The figure to draw on; its layout engine places everything.
+
+    Raises:
+        ValueError: the axes are no subplot.
+    """
+    if ax is not None:
+        place = ax.get_subplotspec()
+        parent = ax.get_figure()
+        if place is None or parent is None:
+            raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
+        ax.remove()
+        figure = parent.add_subfigure(place)
+        _head_and_foot(figure, size_in[0], title, note)
+        yield figure
+        return
+    with _house_style():
+        figure = _figure_class()(figsize=size_in, layout=layout)
+        # A right margin, which matplotlib's own wrapping of the note would leave out.
+        _head_and_foot(figure, size_in[0], title, textwrap.fill(note, max(20, int(17 * size_in[0]))))
+        yield figure
+
+
+@contextmanager
+def single(ax: "Axes | None", size_in: tuple[float, float], title: str = "", note: str = "") -> "Iterator[Axes]":
+    """Open axes for a picture of one panel: those given, whose title `title` becomes, or those of a new figure."""
+    if ax is None:
+        with panels(None, size_in, title, note) as figure:
+            yield figure.subplots()
+    else:
+        ax.set_title(title, parse_math=False)
+        yield ax
+
+
+def _head_and_foot(figure: "FigureBase", width_in: float, title: str, note: str) -> None:
+    if title:
+        line = textwrap.shorten(title, int(12 * width_in), placeholder="…")
+        figure.suptitle(line, x=0.01, ha="left", fontsize=12, parse_math=False)
+    if note:
+        figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, wrap=True, linespacing=1.3, parse_math=False)
+
+
+def png_bytes(drawn: "Axes | FigureBase") -> bytes:
+    """PNG file of the whole figure that a picture was drawn on; a fresh drawing of the same gives the same bytes."""
+    stream = io.BytesIO()
+    figure: Any = drawn.get_figure(root=True)
+    with _house_style():
+        # The default metadata would name the version of matplotlib.
+        figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def save(drawn: "Axes | FigureBase", path: str | Path) -> None:
+    """Write the figure that a picture was drawn on as a PNG file.
+
+    Raises:
+        InputError: the system refuses the path.
+    """
+    write_atomic(path, png_bytes(drawn))
+
+
+def html_of(title: str, rows: Mapping[str, object], drawn: "Axes | FigureBase | None" = None) -> str:
+    """HTML for notebooks: a title, a table of named values, and a picture as an inline PNG."""
+    lines = "".join(f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in rows.items())
+    image = ""
+    if drawn is not None:
+        encoded = base64.b64encode(png_bytes(drawn)).decode()
+        image = f'<img alt="{escape(title)}" style="max-width: 100%" src="data:image/png;base64,{encoded}">'
+    return f"<div><strong>{escape(title)}</strong><table>{lines}</table>{image}</div>"
+
+
+def length_text(length_m: float) -> str:
+    """A length in words for a picture: "1.85 µm", and "∞" for a source at infinity."""
+    if math.isinf(length_m):
+        return "∞"
+    return format_length(float(f"{length_m:.4g}")).replace("um", "µm")
+
+
+def bare(axes: "Axes") -> None:
+    """Take the numbers off both axes."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def scale_bar(axes: "Axes", width_m: float) -> None:
+    """Replace the axes' numbers by a bar of a round length, a quarter of the width `width_m` or less, below them."""
+    bare(axes)
+    wanted = width_m / 4
+    power = 10.0 ** math.floor(math.log10(wanted))
+    length = power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
+    share = length / width_m
+    line: Any = {"color": INK, "lw": 2.5, "solid_capstyle": "butt", "clip_on": False}
+    axes.plot([0, share], [-0.05, -0.05], transform=axes.transAxes, scalex=False, scaley=False, **line)
+    axes.text(share + 0.03, -0.05, length_text(length), transform=axes.transAxes, va="center", fontsize=SMALL)
+
+
+def extent_of(shape: tuple[int, ...], pitch_m: float, unit_m: float = MM) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of a centred raster ``(ny, nx)``, in a unit."""
+    up, right = (n * pitch_m / unit_m / 2 for n in shape)
+    return -right, right, -up, up
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """Positions of at most `most` of `count` entries, the first and the last among them."""
+    if count <= most:
+        return list(range(count))
+    return [round(i * (count - 1) / max(most - 1, 1)) for i in range(most)]
+
+
+def _mean_over_parts(values: NDArray[np.floating], count: int) -> NDArray[np.floating]:
+    """Means over `count` equal parts of the first axis, whose borders may lie within a sample."""
+    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
+    whole, rest = np.divmod(np.linspace(0, len(values), count + 1), 1)
+    at = whole.astype(np.intp)
+    up_to = sums[at] + rest[:, None] * (sums[np.minimum(at + 1, len(values))] - sums[at])
+    return (np.diff(up_to, axis=0) * (count / len(values))).astype(np.float32)
+
+
+def shrunk(values: NDArray[np.floating], most: int, kind: Literal["mean", "smooth"] = "mean") -> NDArray[np.floating]:
+    """Average a map so that neither side has more than `most` samples; a smaller map is returned as it is.
+
+    Args:
+        values: the map, ``[y, x]``.
+        most: samples per side that the picture can show.
+        kind: "mean" over equal parts of the map, which keeps its total, or "smooth" by a Lanczos filter, which leaves
+            no moire of fine regular structure.
+    """
+    ny, nx = (min(n, most) for n in values.shape)
+    if (ny, nx) == values.shape:
+        return values
+    if kind == "mean":
+        return _mean_over_parts(_mean_over_parts(values, ny).T, nx).T
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(values.astype(np.float32)).resize((nx, ny), Image.Resampling.LANCZOS))
