@@ -16,8 +16,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from doedesign.capture.images import Pictures, crop, decoded, linear_light, sample_files
+from doedesign.capture.images import Pictures, crop, linear_light, sample_files
 from doedesign.capture.scenes import SceneData
+from fab.pictures import read_display
 from sim.obstruction import CameraView, Dirt, Fence, ObstructionKind, Raindrop
 
 SHAPE = (512, 512)
@@ -52,10 +53,10 @@ def streams(items: int) -> None:
 
 def parts(rounds: int) -> None:
     """Print what an item is made of, on one thread."""
-    picture, rng = decoded(sample_files()[0]), np.random.default_rng(0)
+    picture, rng = read_display(sample_files()[0]), np.random.default_rng(0)
     background = linear_light(crop(picture, SHAPE, (0.5, 0.5)))
     calls: dict[str, Callable[[], object]] = {
-        "decode a PNG of 741 x 497": lambda: decoded(sample_files()[0]),
+        "decode a PNG of 741 x 497": lambda: read_display(sample_files()[0]),
         "crop and linear light": lambda: linear_light(crop(picture, SHAPE, (0.5, 0.5))),
         "draw dirt": lambda: Dirt().draw(rng, VIEW, background),
         "draw raindrops": lambda: Raindrop().draw(rng, VIEW, background),

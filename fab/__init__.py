@@ -5,6 +5,7 @@ Map of the package, in the order the work flows:
     errors    InputError (the user's mistake, exit 2) and CheckFailed (a proof that failed, exit 1)
     units     text with a unit -> SI number, and back; the only border of the package
     files     atomic files and folders, digests, canonical JSON
+    pictures  PNG, TIFF and other pictures: the one place that decodes and encodes them
     grid      Grid: the pixel raster of a plate
     height    HeightMap, and the reader of maps a user brings (.npy, .tif, .png)
     levels    Levels: height <-> level number

@@ -6,22 +6,22 @@ colour are taken as they lie; the others are marked as not valid, nothing is int
 its top, so rows are turned over; arrays here have row 0 at the lowest y.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from fab.errors import InputError
-from fab.files import explain_os_error
+from fab.pictures import MOST_PIXELS, decoding, read_pixels
 
 Channel = Literal["red", "green", "blue"]
 
 FRAME_FILES = (".exr", ".tif", ".tiff", ".png")
 RAW_FILES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
-_MOST_PIXELS = 1 << 28
 _CHANNELS = ("red", "green", "blue")
 _CURE = "Write the file again from its source."
 
@@ -66,26 +66,10 @@ def read_frame(
         raise InputError(str(path), f"an image must be one of {kinds}", suffix or "no suffix", "Convert it first.")
     if suffix == ".exr":
         return _read_exr(path, channel, pixel_m)
-    reader = {".png": _read_png}.get(suffix, _read_tiff if suffix in FRAME_FILES else _read_raw)
-    frame = _guarded(path, lambda: reader(path, channel, allow_8bit))
+    frame = _read_raw(path, channel) if suffix in RAW_FILES else _read_picture(path, channel, allow_8bit)
     if not np.isfinite(frame.counts).all():
         raise InputError(str(path), "every pixel must be finite", "NaN or infinity", _CURE)
     return frame
-
-
-def _guarded(path: Path, read: Callable[[], CameraFrame]) -> CameraFrame:
-    try:
-        return read()
-    except InputError:
-        raise
-    except OSError as error:
-        if error.errno is None:
-            raise InputError(str(path), "the file must be whole and of its kind", str(error), _CURE) from error
-        raise explain_os_error(error, path) from error
-    # The libraries raise what they like on a damaged file; all of it means the same to the user.
-    except Exception as error:
-        got = str(error) or type(error).__name__
-        raise InputError(str(path), "the file must be whole and hold one image", got, _CURE) from error
 
 
 def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> CameraFrame:
@@ -105,51 +89,49 @@ def _read_exr(path: Path, channel: Channel | None, pixel_m: float | None) -> Cam
     return _frame(counts[0], clipped_at=None)
 
 
-def _read_tiff(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
-        if len(file.pages) != 1 or len(page.shape) not in (2, 3) or not 0 < np.prod(page.shape) <= _MOST_PIXELS:
-            got = f"{len(file.pages)} pages of shape {page.shape}"
-            raise InputError(str(path), "the file must hold one image", got, "Give one file per exposure.")
-        values = page.asarray()
+def _read_picture(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
+    values = read_pixels(path)
     if values.ndim == 3:
+        if path.suffix.lower() == ".png":
+            cure = "Save a TIFF, which keeps 16 bits of each colour."
+            raise InputError(str(path), "a PNG must be grey", f"colours (shape {values.shape})", cure)
         if values.shape[2] != 3:
             raise InputError(str(path), "an image must be grey or RGB", f"shape {values.shape}", "Keep one channel.")
         values = values[:, :, _CHANNELS.index(_named(path, channel))]
-    return _frame(_deep_enough(path, values, allow_8bit)[::-1])
+    if values.dtype.kind not in "fu":
+        raise InputError(str(path), "pixels must be counts or floats", values.dtype, "Save 16-bit counts.")
+    if values.dtype.itemsize == 1 and not allow_8bit:
+        cure = "Save 16 bits; or set allow_8bit = true and expect little."
+        raise InputError(str(path), "a measured PSF needs 16 bits per pixel", "8 bits", cure)
+    return _frame(values)
 
 
-def _read_png(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
-    from PIL import Image
+@contextmanager
+def open_raw(path: Path) -> Iterator[Any]:
+    """Open a camera's RAW file with rawpy.
 
-    with Image.open(path, formats=["PNG"]) as image:
-        image.verify()  # reading the pixels skips their checksum
-    with Image.open(path, formats=["PNG"]) as image:
-        if image.mode not in ("L", "I;16", "I;16B", "I"):
-            got = f"colours (mode {image.mode})"
-            raise InputError(str(path), "a PNG must be grey", got, "Save a TIFF, which keeps 16 bits of each colour.")
-        values = np.asarray(image)
-    # 16 bits come as 32 where the library has no such mode.
-    narrow = values.astype(np.uint16) if values.dtype == np.int32 else values
-    return _frame(_deep_enough(path, narrow, allow_8bit)[::-1])
-
-
-def _read_raw(path: Path, channel: Channel | None, allow_8bit: bool) -> CameraFrame:
+    Raises:
+        InputError: rawpy is not installed, or the file is missing or damaged.
+    """
     try:
         import rawpy
     except ImportError as error:
-        cure = "pip install 'doedesign[raw]', or convert the file to 16-bit TIFF without any processing."
+        cure = "pip install 'doedesign[raw]', or convert the file to TIFF without any processing first."
         raise InputError(str(path), "camera RAW needs rawpy", "no such package", cure) from error
-    path.stat()  # a missing file in the system's own words
-    with rawpy.imread(str(path)) as raw:
+    with decoding(path):
+        path.stat()  # a missing file in the system's own words
+        with rawpy.imread(str(path)) as raw:
+            yield raw
+
+
+def _read_raw(path: Path, channel: Channel | None) -> CameraFrame:
+    with open_raw(path) as raw:
         counts = np.array(raw.raw_image_visible)
         colours = np.array(raw.raw_colors_visible)
         names = raw.color_desc.decode()
         mosaic = len(set(names[: raw.num_colors])) > 1 and int(colours.max()) > 0
         black, white = float(np.mean(raw.black_level_per_channel)), float(raw.white_level)
-    if counts.ndim != 2 or not 0 < counts.size <= _MOST_PIXELS:
+    if counts.ndim != 2 or not 0 < counts.size <= MOST_PIXELS:
         raise InputError(str(path), "a RAW image must hold one value per pixel", counts.shape, "Give the sensor's own.")
     valid = np.ones(counts.shape, bool)
     if mosaic:
@@ -163,15 +145,6 @@ def _named(path: Path, channel: Channel | None) -> Channel:
         rule = "of a picture in colour one channel must be chosen"
         raise InputError(str(path), rule, "none", 'Set channel = "green", the one that sees the probe.')
     return channel
-
-
-def _deep_enough(path: Path, values: Num[np.ndarray, "y x"], allow_8bit: bool) -> Num[np.ndarray, "y x"]:
-    if values.dtype.kind not in "fu":
-        raise InputError(str(path), "pixels must be counts or floats", values.dtype, "Save 16-bit counts.")
-    if values.dtype.itemsize == 1 and not allow_8bit:
-        cure = "Save 16 bits; or set allow_8bit = true and expect little."
-        raise InputError(str(path), "a measured PSF needs 16 bits per pixel", "8 bits", cure)
-    return values
 
 
 def _frame(

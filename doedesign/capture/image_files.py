@@ -4,7 +4,6 @@ EXR holds the numbers as they are. PNG holds `count / 65535 * full_scale`, round
 (noise below black) becomes 0. A depth is stored there as its inverse, so that infinity is 0.
 """
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fab.errors import InputError
-from fab.files import explain_os_error, write_atomic
+from fab.pictures import read_pixels, write_pixels
 from sim.store import read_picture, write_picture
 
 _COUNTS = 65535
@@ -75,8 +73,8 @@ def write_image(
         write_picture(folder / f"{name}.exr", dict(zip(channels, image, strict=True)), {"what": what})
         return Stored(f"{name}.exr", what, channels)
     values = 1 / image if inverse else image
-    counts = np.rint(np.clip(values / full_scale, 0, 1) * _COUNTS).astype(">u2")
-    write_atomic(folder / f"{name}.png", _png_bytes(counts[:, ::-1]))
+    counts = np.rint(np.clip(values / full_scale, 0, 1) * _COUNTS).astype(np.uint16)
+    write_pixels(folder / f"{name}.png", counts[0] if len(counts) == 1 else counts.transpose(1, 2, 0))
     return Stored(f"{name}.png", what, channels, full_scale, inverse)
 
 
@@ -94,38 +92,10 @@ def read_image(folder: Path, stored: Mapping[str, Any]) -> Float[np.ndarray, "c 
     if path.suffix == ".exr":
         channels, _ = read_picture(path)
         return np.stack([channels[name] for name in stored["channels"]])
-    values = _png_counts(path).astype(np.float32) * np.float32(stored["full_scale"] / _COUNTS)
+    counts = read_pixels(path)
+    planes = counts[None] if counts.ndim == 2 else counts.transpose(2, 0, 1)
+    values = planes.astype(np.float32) * np.float32(stored["full_scale"] / _COUNTS)
     if stored.get("inverse"):
         with np.errstate(divide="ignore"):
             values = 1 / values
     return values
-
-
-def _png_bytes(counts: np.ndarray) -> bytes:
-    """A PNG of `[c, y, x]` counts, the first row on top."""
-    import png
-
-    planes, height, width = counts.shape
-    rows = np.ascontiguousarray(counts.transpose(1, 2, 0)).reshape(height, width * planes)
-    stream = io.BytesIO()
-    writer = png.Writer(width, height, greyscale=planes == 1, bitdepth=16)
-    writer.write_packed(stream, (row.tobytes() for row in rows))
-    return stream.getvalue()
-
-
-def _png_counts(path: Path) -> np.ndarray:
-    """Counts `[c, y, x]` of a 16-bit PNG, row 0 at the lowest y."""
-    import png
-
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    try:
-        width, height, rows, info = png.Reader(bytes=data).read()
-        counts = np.stack([np.frombuffer(row, np.uint16) for row in rows])
-        return counts.reshape(height, width, info["planes"]).transpose(2, 0, 1)[:, ::-1]
-    # What the reader raises on a damaged file depends on where the damage is.
-    except Exception as error:
-        rule = "must be the 16-bit PNG that was written"
-        raise InputError(str(path), rule, f'"{error}"', "Remove the folder and simulate again.") from error

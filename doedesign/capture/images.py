@@ -16,22 +16,18 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes
-
-if TYPE_CHECKING:
-    from PIL.Image import Image as PillowImage
+from fab.pictures import read_display
 
 PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 SAMPLES = ("motorcycle_left.png", "rocket.jpg", "coffee.png", "astronaut.png", "chelsea.png", "camera.png")
 BUDGET_BYTES = 1 << 30
 
-_MOST_PIXELS = 1 << 28
 _SHOWN = 5  # names of skipped files in one message
 
 Picture = UInt8[np.ndarray, "y x 3"]
@@ -71,64 +67,6 @@ def picture_files(folder: Path | None) -> tuple[Path, ...]:
         rule = f"must hold pictures ({', '.join(PICTURE_FILES)})"
         raise InputError(str(folder), rule, "none", "Put pictures there, or leave --images out for a first look.")
     return found
-
-
-def decoded(path: Path, most_px: int | None = None) -> Picture:
-    """Decode one picture.
-
-    Args:
-        path: the file.
-        most_px: pixels that its shorter side may keep.
-
-    Returns:
-        `[y, x, colour]` display values, row 0 at the lowest y.
-
-    Raises:
-        InputError: no whole picture, or one too large or of a kind that has no display values.
-    """
-    from PIL import Image, ImageOps
-
-    try:
-        with Image.open(path) as image:
-            _require_display_values(image)
-            if most_px is not None:
-                # JPEG can be decoded at an eighth of its size and up in much less time.
-                shrink = most_px / min(image.size)
-                image.draft("RGB", (round(image.width * shrink), round(image.height * shrink)))
-            upright = ImageOps.exif_transpose(_eight_bits(image))
-            shorter = min(upright.size)
-            if most_px is not None and shorter > most_px:
-                size = tuple(max(1, round(n * most_px / shorter)) for n in upright.size)
-                upright = upright.resize((size[0], size[1]), Image.Resampling.BOX)
-            return np.ascontiguousarray(np.asarray(upright, np.uint8)[::-1])
-    except OSError as error:
-        if error.errno is not None:
-            raise explain_os_error(error, path) from error
-        raise _broken(path, error) from error
-    # What the decoders raise on a damaged file depends on where the damage is.
-    except Exception as error:
-        raise _broken(path, error) from error
-
-
-def _require_display_values(image: "PillowImage") -> None:
-    if not 0 < image.width * image.height <= _MOST_PIXELS:
-        raise ValueError(f"{image.width} x {image.height} pixels, more than {_MOST_PIXELS}")
-    if image.mode in ("F", "LAB", "HSV"):
-        raise ValueError(f"pixels of the kind {image.mode}, which are no display values")
-
-
-def _eight_bits(image: "PillowImage") -> "PillowImage":
-    from PIL import Image
-
-    if image.mode.startswith("I"):  # sixteen bits of grey
-        values = np.asarray(image).astype(np.int64)
-        return Image.fromarray(((values * 255 + 32767) // 65535).clip(0, 255).astype(np.uint8)).convert("RGB")
-    return image.convert("RGB")
-
-
-def _broken(path: Path, error: Exception) -> InputError:
-    got = " ".join(str(error).replace(f"'{path}'", "it").split()) or type(error).__name__
-    return InputError(str(path), "must be a whole picture", f'"{got}"', "Replace or remove the file.")
 
 
 @dataclass
@@ -176,7 +114,7 @@ class Pictures:
             if path in self._kept:
                 return self._kept[path]
             try:
-                picture = decoded(path, self.most_px)
+                picture = read_display(path, self.most_px)
             except InputError as error:
                 self._skip(path, error)
                 return None

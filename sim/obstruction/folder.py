@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from fab.errors import InputError
 from fab.files import explain_os_error, read_json
+from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import UM
 from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb
@@ -28,10 +29,9 @@ from sim.obstruction.view import CameraView
 
 __all__ = ["MASK_FILES", "MaskFolder", "MaskPicture", "read_mask"]
 
-MASK_FILES = (".png", ".tif", ".tiff")
+MASK_FILES = (".png", *TIFF_FILES)
 
 _MOST_PIXELS = 1 << 26
-_CURE = "Write the file again from its source, or take it out of the folder."
 
 
 class MaskPicture(NamedTuple):
@@ -189,42 +189,13 @@ def read_mask(path: Path) -> MaskPicture:
     Raises:
         InputError: the file is missing, broken, too large, or no picture; it covers nothing; or its size is no length.
     """
-    try:
-        values = _pixels(path)
-    except InputError:
-        raise
-    except OSError as error:
-        if error.errno is not None:
-            raise explain_os_error(error, path) from error
-        raise InputError(str(path), "the file must be whole and of its kind", error, _CURE) from error
-    # The library raises what it likes on a damaged file; all of it means the same to the user.
-    except Exception as error:
-        got = str(error) or type(error).__name__
-        raise InputError(str(path), "the file must be whole and hold one image", got, _CURE) from error
-    mask, colour = _parted(values[::-1])
+    values = read_pixels(path, most_pixels=_MOST_PIXELS, others="RGBA")
+    full = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+    values = np.clip(np.nan_to_num(values.astype(np.float32)) / np.float32(full), 0, 1)
+    mask, colour = _parted(values.reshape(*values.shape[:2], -1))
     if not mask.any():
         raise InputError(str(path), "a mask must cover something", "black", "White, or opaque, is what covers.")
     return MaskPicture(mask, colour, _sidecar_pitch_m(path.with_suffix(".json"), mask.shape[1]))
-
-
-def _pixels(path: Path) -> Float[np.ndarray, "y x k"]:
-    """Pixels of a file from 0 to 1, float32."""
-    from PIL import Image
-
-    formats = ["PNG"] if path.suffix.lower() == ".png" else ["TIFF"]
-    if formats == ["PNG"]:
-        with Image.open(path, formats=formats) as image:
-            image.verify()  # reading the pixels skips their checksum
-    with Image.open(path, formats=formats) as image:
-        if image.width * image.height > _MOST_PIXELS:
-            rule = f"a mask must have at most {_MOST_PIXELS} pixels"
-            raise InputError(str(path), rule, f"{image.width} x {image.height}", "Make it smaller.")
-        known = image.mode in ("L", "LA", "RGB", "RGBA", "F") or image.mode.startswith("I")
-        values = np.asarray(image if known else image.convert("RGBA"))
-    # 16 bits come as 32 where the library has no such mode.
-    full = 1.0 if values.dtype.kind == "f" else 255.0 if values.dtype.itemsize == 1 else 65535.0
-    values = np.nan_to_num(values.astype(np.float32)) / np.float32(full)
-    return np.clip(values.reshape(*values.shape[:2], -1), 0, 1)
 
 
 def _parted(values: Float[np.ndarray, "y x k"]) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "c y x"] | None]:

@@ -12,13 +12,13 @@ from doedesign.capture.images import (
     SAMPLES,
     Pictures,
     crop,
-    decoded,
     linear_light,
     picture_files,
     sample_files,
     told_skips,
 )
 from fab.errors import InputError
+from fab.pictures import read_display
 
 
 def save(path: Path, values: np.ndarray, **options) -> Path:
@@ -46,48 +46,9 @@ def folder(tmp_path: Path) -> Path:
 def test_the_samples_are_there_without_a_download():
     files = picture_files(None)
     assert [path.name for path in files] == list(SAMPLES)
-    picture = decoded(sample_files()[0], 64)
+    picture = read_display(sample_files()[0], 64)
     assert min(picture.shape[:2]) == 64
     assert picture.std() > 20  # a photograph, not a blank
-
-
-@pytest.mark.parametrize(("suffix", "exact"), [("png", True), ("tif", True), ("bmp", True), ("webp", False)])
-def test_the_lowest_row_comes_first(tmp_path: Path, suffix: str, exact: bool):
-    values = np.repeat(np.arange(0, 240, 10).astype(np.uint8)[:, None, None], 3, 2) * np.ones((1, 20, 1), np.uint8)
-    picture = decoded(save(tmp_path / f"ramp.{suffix}", values))
-    assert picture.shape == values.shape
-    assert np.abs(picture[::-1].astype(int) - values).max() <= (0 if exact else 8)  # WebP loses a little
-
-
-def test_a_turned_camera(tmp_path: Path):
-    values = noise((6, 4, 3))
-    exif = Image.Exif()
-    exif[0x0112] = 6  # to be turned a quarter clockwise
-    picture = decoded(save(tmp_path / "turned.png", values, exif=exif))
-    assert np.array_equal(picture[::-1], np.rot90(values, -1))
-
-
-def test_sixteen_bits_grey_palette_and_transparency(tmp_path: Path):
-    deep = np.array([[0, 128, 65535], [257 * 7, 257 * 200, 40000]], np.uint16)
-    assert decoded(save(tmp_path / "deep.png", deep))[::-1, :, 1].tolist() == [[0, 0, 255], [7, 200, 156]]
-    grey = noise((5, 7))
-    assert np.array_equal(decoded(save(tmp_path / "grey.png", grey))[::-1, :, 2], grey)
-    clear = noise((5, 7, 4))
-    assert np.array_equal(decoded(save(tmp_path / "clear.png", clear))[::-1], clear[..., :3])
-    Image.fromarray(grey).convert("P").save(tmp_path / "palette.gif")
-    assert decoded(tmp_path / "palette.gif").shape == (5, 7, 3)
-    Image.fromarray(noise((5, 7)).astype(np.float32)).save(tmp_path / "float.tif")
-    with pytest.raises(InputError, match="no display values"):
-        decoded(tmp_path / "float.tif")
-
-
-def test_large_pictures_are_shrunk_by_averaging(tmp_path: Path):
-    values = np.zeros((64, 96, 3), np.uint8)
-    values[:, ::2] = 200  # columns that picking every other one would lose
-    small = decoded(save(tmp_path / "stripes.png", values), 32)
-    assert small.shape == (32, 48, 3)
-    assert np.all(small == 100)
-    assert decoded(tmp_path / "stripes.png", 200).shape == (64, 96, 3)
 
 
 def test_display_values_become_linear_light():

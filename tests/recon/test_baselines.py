@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from skimage.restoration import richardson_lucy as by_scikit_image
 
-from doedesign.capture.images import crop, decoded, linear_light, sample_files
+from doedesign.capture.images import crop, linear_light, sample_files
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
+from fab.pictures import read_display
 from sim.imaging.convolve import convolve, plan_otf
 from sim.sensor import Sensor, developed, expose
 
@@ -32,7 +33,7 @@ def blurred(light, psf):
 
 @pytest.fixture(scope="module")
 def light() -> np.ndarray:
-    return linear_light(crop(decoded(sample_files()[2], 160), (128, 150), (0.5, 0.5)))
+    return linear_light(crop(read_display(sample_files()[2], 160), (128, 150), (0.5, 0.5)))
 
 
 @pytest.fixture(scope="module")

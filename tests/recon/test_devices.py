@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from doedesign.capture.images import decoded, sample_files
+from doedesign.capture.images import sample_files
 from doedesign.recon.weights import read_network
 from doedesign.training import joint as train
 from doedesign.training.history import read_history
@@ -96,6 +96,7 @@ import os, sys
 from fab.files import write_atomic
 import doedesign.commands.train as command
 from doedesign.cli import main
+from fab.pictures import read_display
 
 out, written = sys.argv[3], []
 def audit(event, args):
@@ -151,7 +152,7 @@ def test_two_hosts_train_as_one_and_stop_together(tmp_path: Path) -> None:
     run, images = finished_run(tmp_path, SPEC), tmp_path / "images"
     images.mkdir()
     for k, path in enumerate(sample_files()):
-        Image.fromarray(decoded(path, 96)[::-1][:64, :64]).save(images / f"{k}.png")
+        Image.fromarray(read_display(path, 96)[::-1][:64, :64]).save(images / f"{k}.png")
     alone, both = tmp_path / "alone", tmp_path / "both"
     assert ended([start([run, images, alone, "--occlusion", "paper"], tmp_path / "cache")], 0) == [True]
 

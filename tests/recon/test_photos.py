@@ -176,7 +176,7 @@ def with_nan(path: Path) -> None:
 
 REFUSED = {
     "palette.png": (lambda p: Image.fromarray(counts(np.uint8)).quantize(8).save(p), "pixels of the kind P"),
-    "alpha.png": (lambda p: Image.fromarray(counts(np.uint8, 4)).save(p), "pixels of the kind RGBA"),
+    "alpha.png": (lambda p: Image.fromarray(counts(np.uint8, 4)).save(p), r"pixels of shape \(9, 14, 4\)"),
     "bits.png": (lambda p: Image.fromarray(counts(np.uint8, 1)).convert("1").save(p), "pixels of the kind 1"),
     "animated.png": (animated, "an animation of 2 pictures"),
     "text.png": (lambda p: p.write_text("no picture"), "must be whole and of its kind"),

@@ -24,7 +24,7 @@ import doedesign.commands.train as command
 import doedesign.training.results
 import fab.archive
 from doedesign.build import camera_from_spec
-from doedesign.capture.images import decoded, sample_files
+from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code, main
 from doedesign.commands.train import TrainingSettings, train
 from doedesign.recon.weights import read_network
@@ -36,6 +36,7 @@ from doedesign.training.joint import Trainer, layout_of
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.files import read_json, sha256_file, write_atomic
+from fab.pictures import read_display
 from sim.psf_bank import psf_bank
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
@@ -111,7 +112,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six crops of photographs, and a second copy of each under another name."""
     folder = tmp_path_factory.mktemp("images")
     for k, path in enumerate(sample_files()):
-        crop = decoded(path, 96)[::-1][20:68, 10:66]
+        crop = read_display(path, 96)[::-1][20:68, 10:66]
         for copy in "ab":
             Image.fromarray(crop).save(folder / f"{k}{copy}.png")
     return folder

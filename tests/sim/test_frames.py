@@ -124,7 +124,7 @@ def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path):
     with pytest.raises(InputError, match="counts or floats"):
         read_frame(tmp_path / "signed.tiff")
     tifffile.imwrite(tmp_path / "stack.tiff", np.stack([image, image]), photometric="minisblack")
-    with pytest.raises(InputError, match="one image, but got 2 pages"):
+    with pytest.raises(InputError, match="one grey or colour picture, but got 2 pages"):
         read_frame(tmp_path / "stack.tiff")
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "colour.png")
     with pytest.raises(InputError, match="a PNG must be grey"):
