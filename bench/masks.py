@@ -28,11 +28,11 @@ from fab.grid import Grid
 from fab.layout.doe import mask_layout
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.layout.polygons import rectangles
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.masks import planes, unetched_outside
 from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verification.verify import read_level_map
+from fab.verification.verify import read_drawn_levels
 
 LEVELS = Levels(16, 75 * NM)
 _CHUNK = bytes(1 << 22)
@@ -62,6 +62,11 @@ def white_map(count: int) -> NDArray[np.uint8]:
 MAPS = {"ring": ring_map, "field": field_map, "white": white_map}
 
 
+def bench_map(kind: str, count: int, pitch_m: float = UM) -> LevelMap:
+    """Return one of the maps as wide as its aperture."""
+    return LevelMap(MAPS[kind](count), LEVELS, Grid((count, count), pitch_m), count * pitch_m, f"bench {kind}")
+
+
 def timed(work: Callable[[], object]) -> float:
     """Return the seconds that a call takes."""
     start = time.perf_counter()
@@ -87,30 +92,27 @@ def write_floor(path: Path, size: int) -> None:
             stream.write(_CHUNK[: size - start])
 
 
-def generate(level_map: NDArray[np.uint8], grid: Grid, path: Path) -> Layout:
+def generate(level_map: LevelMap, path: Path) -> Layout:
     """Draw a map and write it as GDSII: planes, rectangles, file."""
-    layout = mask_layout(level_map, LEVELS, grid, grid.extent_m[0], "BENCH")
+    layout = mask_layout(level_map, "BENCH")
     write_gds(path, layout)
     return layout
 
 
-def read_back(path: Path, grid: Grid, expected: NDArray[np.uint8]) -> None:
+def read_back(path: Path, expected: LevelMap) -> None:
     """Read the file with the own reader and compare every pixel."""
-    if not np.array_equal(read_level_map(path, LEVELS, pixel_edges(grid), "BENCH"), expected):
+    if not np.array_equal(read_drawn_levels(path, LEVELS, pixel_edges(expected.grid), "BENCH"), expected.level):
         raise AssertionError("the file does not hold the map")
 
 
 def full_size(kind: str, count: int, folder: Path) -> dict[str, float]:
     """Measure one map at full size: ratios to the write floor, and the OASIS file."""
-    level_map, grid = MAPS[kind](count), Grid((count, count), UM)
+    level_map = bench_map(kind, count)
     gds, other, oasis = folder / "masks.gds", folder / "floor.bin", folder / "masks.oas"
-    layout = generate(level_map, grid, gds)
+    layout = generate(level_map, gds)
     size = gds.stat().st_size
-    expected = unetched_outside(level_map, LEVELS, grid, grid.extent_m[0])
-    write_s, floor_s, write_ratio = ratio(
-        lambda: generate(level_map, grid, gds), lambda: write_floor(other, size), pairs=5
-    )
-    read_s, _, read_ratio = ratio(lambda: read_back(gds, grid, expected), lambda: write_floor(other, size), pairs=5)
+    write_s, floor_s, write_ratio = ratio(lambda: generate(level_map, gds), lambda: write_floor(other, size), pairs=5)
+    read_s, _, read_ratio = ratio(lambda: read_back(gds, level_map), lambda: write_floor(other, size), pairs=5)
     oasis_s = timed(lambda: write_oasis(oasis, gds, layout.layers))
     return {
         "rectangles": sum(map(len, layout.cells[0].shapes.values())),
@@ -145,9 +147,8 @@ def own_plane(plane: NDArray[np.uint8], path: Path) -> None:
 
 def against_klayout(kind: str, count: int, folder: Path) -> float:
     """Return how many times slower KLayout's boxes are, over all planes of a crop."""
-    bit_planes = planes(MAPS[kind](count), LEVELS)
     times = []
-    for plane in bit_planes:
+    for plane in bench_map(kind, count).planes():
         own_plane(plane, folder / "own.gds")
         own = statistics.median(timed(lambda p=plane: own_plane(p, folder / "own.gds")) for _ in range(3))
         times.append((timed(lambda p=plane: klayout_pixels(p, folder / "klayout.gds")), own))
@@ -164,15 +165,14 @@ def child(task: str, kind: str, count: int) -> dict[str, float]:
 
 def task_peak(kind: str, count: int, folder: Path) -> None:
     """Generate and read back once."""
-    level_map, grid = MAPS[kind](count), Grid((count, count), UM)
-    generate(level_map, grid, folder / "masks.gds")
-    read_back(folder / "masks.gds", grid, unetched_outside(level_map, LEVELS, grid, grid.extent_m[0]))
+    level_map = bench_map(kind, count)
+    generate(level_map, folder / "masks.gds")
+    read_back(folder / "masks.gds", level_map)
 
 
 def task_order(kind: str, count: int, folder: Path) -> None:
     """Write and verify a whole order at the pitch of the automotive design."""
-    grid = Grid((count, count), 1.85 * UM)
-    write_order(folder / "order", MAPS[kind](count), LEVELS, grid, grid.extent_m[0], f"bench {kind}", {})
+    write_order(folder / "order", bench_map(kind, count, 1.85 * UM))
 
 
 def run_task(task: str, kind: str, count: int) -> None:

@@ -22,6 +22,7 @@ from bench.reference import wrapped_map
 from doedesign.build import process_from_spec
 from doedesign.spec.process import ProcessSpec
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels, quantise
 from fab.order.write import write_order
 
@@ -35,10 +36,10 @@ def one(cells: int) -> None:
     full_m = LEVELS.count * LEVELS.step_m
     level = quantise(np.mod(wrapped_map(cells, smooth_cells=4.0), full_m), LEVELS)
     process = process_from_spec(ProcessSpec(levels=16, level_step_m=75e-9, stock="contact_aligner"))
-    grid = Grid((cells, cells), PITCH_M)
+    level_map = LevelMap(level, LEVELS, Grid((cells, cells), PITCH_M), cells * PITCH_M, "bench")
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        write_order(Path(folder) / "order", level, LEVELS, grid, cells * PITCH_M, "bench", {}, process=process)
+        write_order(Path(folder) / "order", level_map, process=process)
         took = time.perf_counter() - begun
     print(took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2)
 

@@ -20,8 +20,8 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.prediction import Drawn, predict
 from doedesign.spec import load_spec
 from doedesign.tolerancing.pool import Work, evaluate_here, predicted_rows
+from fab.level_map import LevelMap
 from fab.levels import Levels, height_of, quantise
-from fab.masks import unetched_outside
 from fab.process import Process
 from fab.sampling import normal_draw
 from sim.psf_bank import psf_bank
@@ -38,7 +38,7 @@ def make_task(cells: int) -> tuple[Drawn, Process]:
     full = levels.count * levels.step_m
     height = np.mod(wrapped_map(cells, smooth_cells=4.0), full)
     level = quantise(height, levels)
-    level = unetched_outside(level, levels, camera.grid, spec.doe.aperture_m)
+    level = LevelMap(level, levels, camera.grid, spec.doe.aperture_m).level
     drawn = Drawn("bench", level, levels, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
     return drawn, process_from_spec(spec.process)
 

@@ -8,22 +8,23 @@ unmeasured pair. KLayout's checks are given a crop, since they are slow where a 
 """
 
 import argparse
+import math
 import statistics
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.masks import LEVELS, MAPS, ratio, row, timed
+from bench.masks import LEVELS, bench_map, ratio, row, timed
 from fab.grid import Grid
 from fab.layout.compensation import grown, read_back
 from fab.layout.doe import mask_layout
 from fab.layout.geometry import pixel_edges
 from fab.layout.polygons import rectangles
-from fab.masks import planes, unetched_outside
+from fab.level_map import LevelMap
 from fab.rules.check import Rules, check
-from fab.rules.repair import repaired
-from fab.units import NM, UM
+from fab.rules.repair import repair
+from fab.units import UM
 
 RULES = Rules(2 * UM, 2 * UM)
 _MOVE = 120
@@ -44,31 +45,24 @@ def klayout_checks(plane: NDArray[np.uint8]) -> None:
 
 def check_table(kind: str, count: int, crop: int) -> None:
     """Print the check against the drawing, and against KLayout."""
-    level_map, grid = MAPS[kind](count), Grid((count, count), UM)
-    aperture_m = count * UM
-    check_s, draw_s, share = ratio(
-        lambda: check(level_map, LEVELS, grid, aperture_m, RULES),
-        lambda: mask_layout(level_map, LEVELS, grid, aperture_m, "BENCH"),
-        pairs=7,
-    )
+    level_map = bench_map(kind, count)
+    check_s, draw_s, share = ratio(lambda: check(level_map, RULES), lambda: mask_layout(level_map, "BENCH"), pairs=7)
     row(f"{kind}: four planes drawn as rectangles", draw_s, "s", "", None)
     row(f"{kind}: rules of four planes", check_s, "s", "", None)
     row(f"{kind}: ... over the drawing", share, "x", "<= 0.5", share <= 0.5)
-    small = np.ascontiguousarray(level_map[:crop, :crop])
-    own = statistics.median(
-        timed(lambda: check(small, LEVELS, Grid(small.shape, UM), 2 * crop * UM, RULES)) for _ in range(5)
-    )
-    other = sum(timed(lambda p=plane: klayout_checks(p)) for plane in planes(small, LEVELS))
+    small = LevelMap(level_map.level[:crop, :crop], LEVELS, Grid((crop, crop), UM), math.inf)
+    own = statistics.median(timed(lambda: check(small, RULES)) for _ in range(5))
+    other = sum(timed(lambda p=plane: klayout_checks(p)) for plane in small.planes())
     row(f"{kind}: KLayout's checks over ours, {crop} x {crop}", other / own, "x", "", None)
 
 
 def repair_table(kind: str, count: int) -> None:
     """Print the repair of a plate for two minimum sizes."""
-    level_map, grid = MAPS[kind](count), Grid((count, count), UM)
+    level_map = bench_map(kind, count)
     for least in (2, 3):
         rules = Rules(least * UM, least * UM)
         start = time.perf_counter()
-        cost = repaired(level_map, LEVELS, grid, count * UM, rules, 1 / (16 * 75 * NM))[1]
+        cost = repair(level_map, rules).cost
         seconds = time.perf_counter() - start
         name = f"{kind}: repair to {least} um, {count} x {count}"
         row(name, seconds, "s", "< 30", seconds < 30)
@@ -79,9 +73,8 @@ def repair_table(kind: str, count: int) -> None:
 
 def compensation_table(kind: str, count: int) -> None:
     """Print the drawing of four planes with moved edges, and reading them back."""
-    grid = Grid((count, count), UM)
-    bit_planes = planes(unetched_outside(MAPS[kind](count), LEVELS, grid, count * UM), LEVELS)
-    edges = pixel_edges(grid)
+    level_map = bench_map(kind, count)
+    bit_planes, edges = level_map.planes(), pixel_edges(level_map.grid)
     for move in (_MOVE, -_MOVE):
         start = time.perf_counter()
         shapes = [grown(plane, edges, move) for plane in bit_planes]
@@ -102,8 +95,8 @@ def main() -> None:
     full, plate = 4400 // scale, 2400 // scale
     print(f"rules, {LEVELS.count} levels, lines and spaces of 2 um; {full} x {full} pixels of 1 um unless stated")
     # Compiled before anything is timed.
-    repaired(MAPS["white"](64), LEVELS, Grid((64, 64), UM), 64 * UM, RULES, 1 / (16 * 75 * NM))
-    compiled = planes(MAPS["white"](16), LEVELS)[0]
+    repair(bench_map("white", 64), RULES)
+    compiled = bench_map("white", 16).planes()[0]
     edges = pixel_edges(Grid((16, 16), UM))
     for move in (1, -1):
         read_back(grown(compiled, edges, move), edges, move)

@@ -19,9 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.masks import field_map, ring_map
-from fab.grid import Grid
-from fab.levels import Levels
+from bench.masks import bench_map
 from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
@@ -29,7 +27,6 @@ from fab.solids.step import step_volumes_m3
 from fab.solids.substrate import ChromeRing, Rings, Substrate, substrate_step, substrate_volumes_m3
 from fab.units import MM, NM, UM
 
-LEVELS = Levels(16, 75 * NM)
 BASE = 5 * UM
 TARGET_STEP_S, TARGET_MESH_S = 15.0, 15.0
 CASES = ("step", "ring", "field", "reduced")
@@ -91,18 +88,17 @@ def bench_case(case: str, quick: bool) -> None:
         if case == "step":
             bench_step(quick, folder)
         else:
-            small = Grid((20, 20), UM)
-            tiny = relief_mesh(reduced_cells(ring_map(20), LEVELS, small, 5))
+            tiny = relief_mesh(reduced_cells(bench_map("ring", 20), 5))
             for write in (write_3mf, write_glb, write_stl):
                 write(folder / "first", tiny)
             closed_volume_m3(tiny)
             count = 1100 if case == "reduced" and quick else 4400 if case == "reduced" else 250 if quick else 1000
-            grid, level_map = Grid((count, count), UM), {"field": field_map}.get(case, ring_map)(count)
+            level_map = bench_map("field" if case == "field" else "ring", count)
             if case == "reduced":
-                cells, took = timed(lambda: reduced_cells(level_map, LEVELS, grid, 400))
+                cells, took = timed(lambda: reduced_cells(level_map, 400))
                 print(f"  {count}x{count} reduced by {cells.block} in {took:.2f} s")
             else:
-                cells = window_cells(level_map, LEVELS, grid, whole(grid))
+                cells = window_cells(level_map, whole(level_map.grid))
             bench_mesh(case, cells, folder)
     print(f"    peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2:.2f} GB", flush=True)
 

@@ -16,9 +16,9 @@ from doedesign.build import camera_from_spec
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawn_in_masks, levels_of_run
 from fab.files import MANIFEST_NAME, sha256_bytes
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.masks import unetched_outside
 from fab.process import Normal, Process, Variation
 from fab.units import NM
 from sim.camera import Camera
@@ -78,7 +78,7 @@ def drawn_of(run: Run, masks: Path | None = None) -> Drawn:
         level = drawn_in_masks(folder, drawing)
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     else:
-        level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
+        level = LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m).level
     scene, camera = run.spec.scene, camera_from_spec(run.spec)
     moves_m = moves_m if any(moves_m) else ()
     return Drawn(run.spec.name, level, drawing.levels, camera, scene.near_m, scene.far_m, moves_m)

@@ -13,8 +13,9 @@ from doedesign.build import camera_from_spec
 from doedesign.calibration import Family, Targets, explanations
 from doedesign.prediction import Drawn, Prediction, predict
 from doedesign.runs.folder import Run
-from doedesign.runs.level_maps import LevelMap, levels_of_run
-from fab.masks import unetched_outside
+from doedesign.runs.level_maps import LevelMap as RunMap
+from doedesign.runs.level_maps import levels_of_run
+from fab.level_map import LevelMap
 from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour
@@ -52,7 +53,7 @@ def say(text: str) -> None:
 class Bench:
     """A design before light of two wavelengths."""
 
-    drawing: LevelMap
+    drawing: RunMap
     camera: Camera
     near_m: float
 
@@ -78,7 +79,7 @@ def lifted(bench: Bench, lift: int) -> Drawn:
     """The design raised by some steps, modulo one wave. Kept, since predictions know a design by its level map."""
     drawing = bench.drawing
     raised = (drawing.level + lift) % drawing.levels.count
-    level = unetched_outside(raised, drawing.levels, drawing.grid, drawing.aperture_m)
+    level = LevelMap(raised, drawing.levels, drawing.grid, drawing.aperture_m).level
     return Drawn(f"lift {lift}", level, drawing.levels, bench.camera, (bench.near_m,), ())
 
 

@@ -5,6 +5,7 @@ covers the plate, it holds the top level, blank glass: that is seen to here, onc
 (`write_level_map`) keeps the bit planes of the level numbers, packed eight pixels to a byte, and loses nothing.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +22,7 @@ from fab.levels import Levels, height_of, quantise, quantise_wrapped, require_le
 from fab.masks import level_map_from_planes, planes
 from fab.units import format_length
 
-__all__ = ["LevelMap", "read_level_map", "write_level_map"]
+__all__ = ["LevelMap", "level_digest", "read_level_map", "write_level_map"]
 
 FORMAT = "doedesign level map 1"
 
@@ -37,7 +38,8 @@ class LevelMap:
             whatever was given there. Read-only.
         levels: the staircase.
         grid: the raster.
-        aperture_m: diameter of the relief, metres.
+        aperture_m: diameter of the relief, metres; infinite where all of the raster is relief, as in a piece that was
+            cut out of a DOE.
         name: the owner's name for it.
     """
 
@@ -59,7 +61,7 @@ class LevelMap:
             rule = f"must have the grid's shape {self.grid.shape}"
             raise InputError("level map", rule, checked.shape, "Use its own grid.")
         side_m = min(self.grid.extent_m)
-        if not 0 < self.aperture_m <= side_m * (1 + 1e-9):
+        if not 0 < self.aperture_m <= side_m * (1 + 1e-9) and self.aperture_m != math.inf:
             rule = f"must lie from 0 to the shorter side of the raster, {format_length(side_m)}"
             raise InputError("aperture", rule, format_length(self.aperture_m), "Give the diameter of the relief.")
         blank = np.where(self.grid.inside_circle(self.aperture_m), checked, np.uint8(self.levels.count - 1))
@@ -97,7 +99,7 @@ class LevelMap:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the level numbers, row by row."""
-        return sha256_bytes(self.level.tobytes())
+        return level_digest(self.level)
 
     def planes(self) -> NDArray[np.uint8]:
         """Etch masks ``[bit, y, x]``: 1 where mask `bit` is open (`fab.masks.planes`)."""
@@ -113,6 +115,11 @@ class LevelMap:
         return f"{self.name}: {ny} x {nx} pixels of {format_length(self.grid.pitch_m)} in {self.levels.told}"
 
 
+def level_digest(level: NDArray[np.uint8]) -> str:
+    """Return the SHA-256 of level numbers ``[y, x]``, row by row."""
+    return sha256_bytes(np.ascontiguousarray(level).data)
+
+
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
     """Write a level map without loss; the same map gives the same bytes.
 
@@ -125,7 +132,7 @@ def write_level_map(path: str | Path, level_map: LevelMap) -> None:
         "name": level_map.name,
         "shape": list(grid.shape),
         "pitch_m": grid.pitch_m,
-        "aperture_m": level_map.aperture_m,
+        "aperture_m": None if level_map.aperture_m == math.inf else level_map.aperture_m,
         "levels": levels.count,
         "level_step_m": levels.step_m,
         "etch_depths_m": list(levels.depths_m),
@@ -153,7 +160,8 @@ def read_level_map(path: str | Path) -> LevelMap:
         if bits.shape != (levels.bits, ny, nx):
             raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", bits.shape, cure)
         level = level_map_from_planes(bits, levels)
-        return LevelMap(level, levels, grid, float(header["aperture_m"]), str(header["name"]))
+        aperture_m = math.inf if header["aperture_m"] is None else float(header["aperture_m"])
+        return LevelMap(level, levels, grid, aperture_m, str(header["name"]))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

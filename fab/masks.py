@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.grid import Grid
 from fab.levels import Levels, require_levels
 
-__all__ = ["level_map_from_planes", "planes", "unetched_outside"]
+__all__ = ["level_map_from_planes", "planes"]
 
 
 def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
@@ -56,26 +55,3 @@ def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], l
     for bit in range(levels.bits):
         etched |= bit_planes[bit].astype(np.uint8) << np.uint8(bit)
     return np.uint8(levels.count - 1) - etched
-
-
-def unetched_outside(
-    level_map: NDArray[np.integer], levels: Levels, grid: Grid, aperture_m: float
-) -> NDArray[np.uint8]:
-    """Leave the glass blank outside the clear aperture, where chrome covers it.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres.
-
-    Returns:
-        A copy with the top level at every pixel whose centre lies outside the circle.
-
-    Raises:
-        InputError: the array is not a level map of this staircase, or not of the grid's shape.
-    """
-    checked = require_levels(level_map, levels)
-    if checked.shape != grid.shape:
-        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
-    return np.where(grid.inside_circle(aperture_m), checked, np.uint8(levels.count - 1))

@@ -13,6 +13,7 @@ from doedesign.runs.folder import alone_in, open_run
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
+from fab.level_map import LevelMap
 from fab.process import DEVIATIONS, Process
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.store import write_bank
@@ -56,7 +57,8 @@ def as_built(
     run = open_run(run_folder)
     drawn = drawn_of(run, masks)
     made_by = process_for(drawn.levels, run.spec.process, process)
-    measured = read_as_built(file, drawn.levels, drawn.digest())
+    level_map = LevelMap(drawn.level, drawn.levels, drawn.camera.grid, drawn.camera.aperture_m, drawn.name)
+    measured = read_as_built(file, level_map)
     plate = plate_of(measured, made_by)
     say(_told(plate))
     folder = run.path("as-built")

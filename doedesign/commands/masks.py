@@ -1,12 +1,9 @@
 """`doedesign masks` and `doedesign verify`: a height map becomes a mask order, and an order is proved."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from doedesign.build import camera_from_spec, matching, process_from_spec, wafer_from_spec
 from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
@@ -14,21 +11,18 @@ from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
 from doedesign.runs.folder import open_run
-from doedesign.runs.level_maps import LevelMap
+from doedesign.runs.level_maps import LevelMap as RunMap
 from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.layout.frame import Frame
-from fab.layout.geometry import Chrome, pixel_edges
+from fab.layout.geometry import Chrome
 from fab.layout.marks import alignment_site
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.manifest.records import map_digest
-from fab.masks import unetched_outside
-from fab.order.order import Order
-from fab.order.write import write_order
+from fab.order.order import Order, plan_order
+from fab.order.write import write_planned
 from fab.process import Process, Variation
-from fab.rules.check import Rules, check
-from fab.rules.repair import repaired
 from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
 from fab.runsheet.write import write_run_sheet
 from fab.solids.patch import Patch
@@ -39,7 +33,7 @@ Say = Callable[[str], None]
 
 def write_masks(
     source: Path,
-    drawing: LevelMap,
+    drawing: RunMap,
     out: Path | None,
     *,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
@@ -80,14 +74,30 @@ def write_masks(
         "name": drawing.file.name if spec is None else spec.name,
         "height_sha256": sha256_file(drawing.file),
     }
-    level, repair = _printable(spec, drawing, process, on_violation, say)
-    if repair is not None:
-        origin["repair"] = repair
+    level_map = LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m, drawing.name)
+    try:
+        order = plan_order(
+            level_map,
+            process=process,
+            wafer=wafer_from_spec(filled),
+            chrome=chrome,
+            patch=patch,
+            source=origin,
+            on_violation=on_violation,
+            waves_per_metre=_waves_per_metre(spec),
+            say=say,
+        )
+    except InputError as error:
+        cure = error.cure.replace("have the level map repaired", "take --on-violation fix")
+        raise InputError(error.where, error.rule, error.got, cure) from error
+    if order.repair is not None and spec is not None:
+        repair = {**order.source["repair"], "psf": _psf_cost(spec, level_map, order.level_map, say)}
+        order = replace(order, source={**order.source, "repair": repair})
 
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
         plate, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
-        dbu_m = pixel_edges(order.grid).dbu_m
-        draw_wafer(fresh / plate, order.wafer, frame, order.aperture_m, dbu_m, f"{order.stem}: what lies where")
+        dbu_m, aperture_m = order.dbu_m, order.level_map.aperture_m
+        draw_wafer(fresh / plate, order.wafer, frame, aperture_m, dbu_m, f"{order.stem}: what lies where")
         site = alignment_site(order.plates, dbu_m)
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
         say("writing the run sheet")
@@ -96,54 +106,22 @@ def write_masks(
         if found.clean:
             return [plate, marks, *sheets]
         title = f"{order.stem}: where the masks break the rules of {process.name}"
-        draw_rules(fresh / name, found, order.level_map, order.levels, order.grid, order.aperture_m, title)
+        draw_rules(fresh / name, found, title)
         return [plate, marks, *sheets, name]
 
-    proof = write_order(
-        folder,
-        level,
-        drawing.levels,
-        drawing.grid,
-        drawing.aperture_m,
-        drawing.name,
-        origin,
-        chrome=chrome,
-        process=process,
-        wafer=wafer_from_spec(filled),
-        patch=patch,
-        add=add,
-        say=say,
-    )
-    return folder, proof
+    written = write_planned(folder, order, add=add, say=say)
+    return folder, written.report
 
 
-def _printable(
-    spec: Spec | None, drawing: LevelMap, process: Process, on_violation: Literal["warn", "fail", "fix"], say: Say
-) -> tuple[NDArray[np.uint8], dict[str, Any] | None]:
-    """Check what a process prints of a drawing; return the level map to draw, and what its repair cost if it had one.
-
-    Raises:
-        InputError: the process cannot print it and `on_violation` is "fail".
-    """
-    level = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    rules = Rules.of(process)
-    report = check(level, drawing.levels, drawing.grid, drawing.aperture_m, rules)
-    for headline in report.headlines():
-        say(f"warning: {headline}")
-    if on_violation == "fail" and not report.printable:
-        cure = "Design with a coarser pitch or fewer levels, choose another process, or take --on-violation fix."
-        raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    if on_violation != "fix" or report.clean:
-        return level, None
-    return _fixed(spec, drawing, level, rules, say)
+def _waves_per_metre(spec: Spec | None) -> float | None:
+    return None if spec is None else camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m)
 
 
 def _run_sheet(
     spec: Spec | None, folder: Path, order: Order, frame: Frame, probe_m: float, say: Say
 ) -> tuple[RunSheet, bytes | None]:
     """The run sheet of an order in the making, and the picture of what the lab should see."""
-    dbu_m = pixel_edges(order.grid).dbu_m
-    moves_m = [move * dbu_m for move in order.edge_moves()]
+    moves_m = [move * order.dbu_m for move in order.edge_moves()]
     told = None if spec is None else _foretold(spec, order, moves_m, probe_m, say)
     files = {
         plate.name: PhotomaskFile(
@@ -156,13 +134,11 @@ def _run_sheet(
     }
     sheet = RunSheet(
         stem=order.stem,
-        level_map_sha256=map_digest(order.level_map),
-        levels=order.levels,
+        level_map=order.level_map,
         plates=order.plates,
         files=files,
         process=order.process,
-        aperture_m=order.aperture_m,
-        opening_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[0],
+        opening_m=2 * order.chrome.radii_m(order.level_map)[0],
         wafer=order.wafer,
         places=frame.places,
         dies=tuple(
@@ -178,7 +154,7 @@ def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, sa
     from doedesign.prediction import Drawn
 
     camera, scene = camera_from_spec(spec), spec.scene
-    drawn = Drawn(spec.name, order.level_map, order.levels, camera, scene.near_m, scene.far_m)
+    drawn = Drawn(spec.name, order.level_map.level, order.level_map.levels, camera, scene.near_m, scene.far_m)
     try:
         return predict_sheet(drawn, order.process, spec.optics.design_wavelength_m, probe_m, moves_m)
     except InputError as error:
@@ -199,37 +175,16 @@ def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     return Process(levels, name=made.name, **said)
 
 
-def _fixed(
-    spec: Spec | None, drawing: LevelMap, level: NDArray[np.uint8], rules: Rules, say: Say
-) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-    """Change a level map until the process prints it; say what that costs."""
-    levels = drawing.levels
-    rate = 1 / (levels.count * levels.step_m)
-    if spec is not None:
-        rate = camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m)
-    say("repairing the level map")
-    fixed, cost = repaired(level, levels, drawing.grid, drawing.aperture_m, rules, rate)
-    left = f", {cost.broken_after} of {cost.broken_before} broken places are left" if cost.broken_after else ""
-    say(
-        f"repaired: {100 * cost.changed_share:.3g} % of the pixels changed, {100 * (1 - cost.efficiency):.2g} % of the "
-        f"light goes astray{left}"
-    )
-    record: dict[str, Any] = asdict(cost)
-    if spec is not None:
-        record["psf"] = _psf_cost(spec, levels, level, fixed, say)
-    return fixed, record
-
-
-def _psf_cost(
-    spec: Spec, levels: Levels, before: NDArray[np.uint8], after: NDArray[np.uint8], say: Say
-) -> list[dict[str, Any]]:
-    """What light does with the map before and after a repair, colour by colour and depth by depth."""
+def _psf_cost(spec: Spec, before: LevelMap, after: LevelMap, say: Say) -> list[dict[str, Any]]:
+    """Compare what light does with a map before and after a repair, colour by colour and depth by depth."""
     from doedesign.prediction import Drawn, predict
 
     camera, scene = camera_from_spec(spec), spec.scene
     rows = [
-        predict(Drawn(spec.name, level, levels, camera, scene.near_m, scene.far_m), Process(levels), Variation()).rows
-        for level in (before, after)
+        predict(
+            Drawn(spec.name, one.level, one.levels, camera, scene.near_m, scene.far_m), Process(one.levels), Variation()
+        ).rows
+        for one in (before, after)
     ]
     told = []
     for old, new in zip(*rows, strict=True):

@@ -17,8 +17,8 @@ from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
+from fab.level_map import LevelMap
 from fab.levels import height_of
-from fab.masks import unetched_outside
 from sim.camera import Camera
 from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
@@ -38,15 +38,17 @@ def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[
         CheckFailed: the masks draw something else than the run's quantised map.
     """
     drawing = levels_of_run(run)
-    blank = unetched_outside(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    quantised = height_of(blank, drawing.levels).astype(np.float32)
-    designs = {"continuous": read_any_height(run.path("height_continuous.exr")).height_m, "quantised": quantised}
+    level_map = LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
+    designs = {
+        "continuous": read_any_height(run.path("height_continuous.exr")).height_m,
+        "quantised": level_map.height_m,
+    }
     folder = masks or Path("masks") / run.spec.name
     if masks is None and not (folder / MANIFEST_NAME).is_file():
         say(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
         return designs
     rebuilt = drawn_in_masks(folder, drawing)
-    different = rebuilt != blank
+    different = rebuilt != level_map.level
     if different.any():
         y, x = (int(i) for i in np.argwhere(different)[0])
         where = f"{int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"

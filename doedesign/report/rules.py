@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from doedesign.report.canvas import MARK, length_text, note, picture, place, scale_bar, wrapped
 from fab.grid import Grid
 from fab.layout.polygons import run_lengths
-from fab.levels import Levels
-from fab.masks import planes, unetched_outside
 from fab.rules.check import PlaneRules, Rules, RulesReport, shortest_run
 
 if TYPE_CHECKING:
@@ -33,15 +31,7 @@ _COLOURS = (_SPACE, _LINE, _NARROW_SPACE, _NARROW_LINE)
 _LONGEST_RUN = 255
 
 
-def draw_rules(
-    path: str | Path,
-    report: RulesReport,
-    level_map: NDArray[np.uint8],
-    levels: Levels,
-    grid: Grid,
-    aperture_m: float,
-    title: str,
-) -> None:
+def draw_rules(path: str | Path, report: RulesReport, title: str) -> None:
     """Draw where every etch mask breaks a rule: the whole mask, and below it the surroundings of its worst place.
 
     In the overview a block of pixels is coloured if anything in it is broken, the stronger the more of it is. Few
@@ -49,18 +39,15 @@ def draw_rules(
 
     Args:
         path: the PNG file.
-        report: what `fab.rules.check.check` said of the map.
-        level_map: `[y, x]` the levels that were checked.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres.
+        report: what `fab.rules.check.check` said of a level map.
         title: what stands above the picture.
 
     Raises:
-        InputError: not a level map of the levels and the grid, or the system refuses the path.
+        InputError: the system refuses the path.
     """
-    inside = grid.inside_circle(aperture_m)
-    shown = planes(unetched_outside(level_map, levels, grid, aperture_m), levels)
+    grid = report.level_map.grid
+    inside = grid.inside_circle(report.level_map.aperture_m)
+    shown = report.level_map.planes()
     columns = min(len(report.planes), _MOST_COLUMNS)
     rows = -(-len(report.planes) // columns)
     width = max(_LEFT + columns * (_SIDE + _GAP), 6.4)

@@ -159,7 +159,7 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
     Raises:
         InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
     """
-    from fab.verification.verify import read_level_map  # it needs what only those who draw have: training goes without
+    from fab.verification.verify import read_drawn_levels  # it needs what only those who draw have: training goes without
 
     manifest = read_manifest(folder)
     levels, grid = manifest.staircase(), manifest.grid()
@@ -175,7 +175,7 @@ def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
             "Give the masks of this run (--masks).",
         )
     combined, moves = folder / manifest.combined_gds, manifest.edge_moves()
-    return read_level_map(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)
+    return read_drawn_levels(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)
 
 
 def _told(grid: Grid, levels: Levels) -> str:

@@ -22,7 +22,7 @@ from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, r
 from fab.layout.split import Split
 from fab.layout.structures import process_monitor
 from fab.layout.wafer import READING, Wafer
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.units import MM, UM, format_length
 
 __all__ = ["APERTURE", "BLANK", "DIE", "OUTLINES", "WAFER", "Frame", "draw_frame"]
@@ -65,15 +65,12 @@ class Frame(NamedTuple):
 def draw_frame(
     wafer: Wafer,
     plates: Sequence[Photomask],
-    levels: Levels,
+    level_map: LevelMap,
     *,
     splits: Sequence[Split],
     stem: str,
-    digest: str,
-    pitch_m: float,
     minimum_line_m: float,
     chrome_m: float,
-    aperture_m: float,
     dbu_m: float,
 ) -> Frame:
     """Draw everything around a DOE.
@@ -81,14 +78,11 @@ def draw_frame(
     Args:
         wafer: what is filled.
         plates: the masks in the order in which they are used.
-        levels: the staircase.
+        level_map: the DOE.
         splits: how the DOE is drawn, the plate as ordered first; the others take one die each, the last ones.
         stem: name of the job; that of the top cell. The cells of the DOE are named after it and the split's code.
-        digest: digest of the level map, for the labels.
-        pitch_m: edge of a DOE pixel, metres.
         minimum_line_m: narrowest line that the process prints, metres.
         chrome_m: diameter of the DOE with its chrome, metres.
-        aperture_m: diameter of the clear aperture, metres.
         dbu_m: database unit, metres.
 
     Returns:
@@ -99,7 +93,7 @@ def draw_frame(
     """
     marks = die_marks(plates, dbu_m)
     site = alignment_site(plates, dbu_m)
-    monitor = process_monitor(levels, plates, pitch_m, dbu_m, minimum_line_m)
+    monitor = process_monitor(level_map.levels, plates, level_map.grid.pitch_m, dbu_m, minimum_line_m)
     marks, side_m = _below(marks, chrome_m)
     pitch = wafer.pitch_m or math.ceil(side_m / MM - 1e-6) * MM
     if pitch < side_m - dbu_m:
@@ -109,11 +103,12 @@ def draw_frame(
     wafer.require_room(raster)
     dies = _raster(raster, pitch)
     unit = _Unit(dbu_m)
+    aperture = unit.circle(level_map.aperture_m)
     names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
     die_cells = [
         Cell(
             f"{stem}_DIE" if number == 0 else f"{stem}_{split.code}_DIE",
-            {DIE: unit.square(pitch), APERTURE: unit.circle(aperture_m), **_titled(marks, split, plates[0]).shapes},
+            {DIE: unit.square(pitch), APERTURE: aperture, **_titled(marks, split, plates[0]).shapes},
             (Reference(f"{stem}_{split.code}"),),
         )
         for number, split in enumerate(splits)
@@ -129,7 +124,7 @@ def draw_frame(
             Reference(names["TEST"], 0, unit(monitor_m)),
         ),
     )
-    labels = _labels(plates, wafer, stem, digest, dbu_m)
+    labels = _labels(plates, wafer, stem, level_map.digest, dbu_m)
     top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
     sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
     # Every die has its marks; the coordinates are told for the one in the middle.

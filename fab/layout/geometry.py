@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import annulus_sectors, doubled_area
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, format_length
 
@@ -219,19 +220,13 @@ class Chrome:
     outer_m: float | None = None
     chord_error_m: float = 5e-9
 
-    def radii_m(self, grid: Grid, aperture_m: float) -> tuple[float, float]:
-        """Return the radius of the opening and the outer radius for one plate.
-
-        Args:
-            grid: the raster of the plate.
-            aperture_m: diameter of its clear aperture, metres.
-
-        Returns:
-            Inner and outer radius in metres.
+    def radii_m(self, level_map: LevelMap) -> tuple[float, float]:
+        """Return the radius of the opening and the outer radius for one DOE, metres.
 
         Raises:
             InputError: nothing of the opening, or nothing of the chrome, would be left.
         """
+        grid, aperture_m = level_map.grid, level_map.aperture_m
         inner = aperture_m / 2 - self.overlap_m
         outer = self.outer_m
         if outer is None:
@@ -326,12 +321,11 @@ def chrome_layer(levels: Levels) -> Layer:
     return Layer(max(5, levels.bits + 1), 0, "CHROME")
 
 
-def chrome_shapes(grid: Grid, aperture_m: float, dbu_m: float, chrome: Chrome) -> Shapes:
+def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
     """Draw the chrome around the clear aperture as an annulus.
 
     Args:
-        grid: the raster of the plate.
-        aperture_m: diameter of the clear aperture, metres.
+        level_map: the DOE.
         dbu_m: database unit, metres.
         chrome: overlap, outer radius and chord error.
 
@@ -341,7 +335,7 @@ def chrome_shapes(grid: Grid, aperture_m: float, dbu_m: float, chrome: Chrome) -
     Raises:
         InputError: the radii leave nothing, or do not fit 32-bit coordinates.
     """
-    inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(grid, aperture_m))
+    inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(level_map))
     if outer > _LIMIT:
         got = format_length(outer * dbu_m)
         raise InputError("chrome outer radius", "must fit 32-bit coordinates", got, "Choose a smaller one.")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, UM
 
@@ -33,7 +34,6 @@ __all__ = [
     "PlateEntry",
     "SplitEntry",
     "WaferEntry",
-    "map_digest",
     "plane_digest",
     "read_manifest",
 ]
@@ -239,6 +239,10 @@ class Manifest:
         """Return every cell of the DOE with what its etch layers draw."""
         return {self.doe_cell: self.masks, **{split.cell: split.layers for split in self.splits}}
 
+    def level_map(self, level: NDArray[np.uint8]) -> LevelMap:
+        """Return the level map of the order from its level numbers ``[y, x]``."""
+        return LevelMap(level, self.staircase(), self.grid(), self.aperture_m, self.name)
+
     def staircase(self) -> Levels:
         """Return the levels of the order, with the depth that stands at every mask."""
         depths = [round(mask.depth_nm * NM, 18) for mask in sorted(self.masks, key=lambda mask: mask.bit)]
@@ -257,11 +261,6 @@ class Manifest:
         """Return the bytes of the manifest file, with the digest of everything else in it under ``sha256``."""
         content = asdict(self)
         return canonical_json({**content, "sha256": sha256_bytes(canonical_json(content))})
-
-
-def map_digest(level_map: NDArray[np.uint8]) -> str:
-    """Return the SHA-256 of a level map's bytes, row by row."""
-    return sha256_bytes(np.ascontiguousarray(level_map).data)
 
 
 def plane_digest(plane: NDArray[np.uint8]) -> str:

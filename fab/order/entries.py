@@ -1,4 +1,4 @@
-"""What the manifest says of an order: its masks, its chrome, its plates, its wafer and its splits."""
+"""Entries of the manifest of an order: its masks, its chrome, its plates, its wafer and its splits."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,14 @@ from fab.manifest.records import (
 from fab.order.order import Order
 from fab.units import MM, NM, UM, format_length
 
-__all__ = ["chrome_entry", "edges_told", "mask_entry", "plate_entry", "split_entry", "wafer_entry"]
+__all__ = ["chrome_entry", "describe_edges", "mask_entry", "plate_entry", "split_entry", "wafer_entry"]
 
 
 def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
-    """What the manifest says of an etch mask, from the drawing and from its plane before the edges moved."""
-    layer = etch_layer(bit, order.levels)
-    runs = (None if run is None else round(run * order.grid.pitch_m / UM, 6) for run in smallest_runs(plane))
-    width_um, space_um = runs
+    """Return the manifest's entry of an etch mask, from the drawing and from its plane before the edges moved."""
+    levels, pitch_m = order.level_map.levels, order.level_map.grid.pitch_m
+    layer = etch_layer(bit, levels)
+    width_um, space_um = (None if run is None else round(run * pitch_m / UM, 6) for run in smallest_runs(plane))
     stem = order.mask_stem(bit)
     return MaskEntry(
         mask=bit + 1,
@@ -40,7 +40,7 @@ def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8])
         datatype=layer.datatype,
         file=f"{stem}.gds",
         cell=stem,
-        depth_nm=round(order.levels.etch_depth_m(bit) / NM, 9),
+        depth_nm=round(levels.etch_depth_m(bit) / NM, 9),
         edge_move_nm=round(order.edge_moves()[bit] * layout.dbu_m / NM, 9),
         polygon_means=CONVENTIONS["etch layers"],
         smallest_width_um=width_um,
@@ -51,9 +51,9 @@ def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8])
 
 
 def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
-    """What the manifest says of the chrome around the clear aperture."""
-    layer = chrome_layer(order.levels)
-    inner, outer = (round(radius / layout.dbu_m) for radius in order.chrome.radii_m(order.grid, order.aperture_m))
+    """Return the manifest's entry of the chrome around the clear aperture."""
+    layer = chrome_layer(order.level_map.levels)
+    inner, outer = (round(radius / layout.dbu_m) for radius in order.chrome.radii_m(order.level_map))
     return ChromeEntry(
         layer=layer.number,
         datatype=layer.datatype,
@@ -70,7 +70,7 @@ def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
 
 
 def plate_entry(order: Order, plate: Photomask) -> PlateEntry:
-    """What the manifest says of a mask as the shop makes it."""
+    """Return the manifest's entry of a mask as the shop makes it."""
     dark_field = plate.tone == "clear"
     return PlateEntry(
         mask=plate.name,
@@ -86,7 +86,7 @@ def plate_entry(order: Order, plate: Photomask) -> PlateEntry:
 
 
 def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
-    """What the manifest says of the wafer, and of what lies where on it."""
+    """Return the manifest's entry of the wafer, and of what lies where on it."""
     wafer = order.wafer
     places = {name: [round(x / UM, 6), round(y / UM, 6)] for name, (x, y) in sorted(frame.places.items())}
     return WaferEntry(
@@ -100,7 +100,7 @@ def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
 
 
 def split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float) -> SplitEntry:
-    """What the manifest says of a die that draws the DOE differently; `cell` is that of its DOE."""
+    """Return the manifest's entry of a die that draws the DOE differently; `cell` is that of its DOE."""
     layers = [
         DrawnEntry(
             layer=layer.number,
@@ -115,7 +115,7 @@ def split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float
     return SplitEntry(cell.name, split.words, die, layers)
 
 
-def edges_told(edges: PixelEdges) -> str:
+def describe_edges(edges: PixelEdges) -> str:
     """Say in words how pixel edges were rounded to the database unit."""
     unit = format_length(edges.dbu_m)
     if edges.shift_m == 0:

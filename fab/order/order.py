@@ -1,29 +1,27 @@
 """A mask order in numbers, before it becomes files: what is drawn, for whom, and what everything is called."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Literal
 
 from fab.errors import InputError
-from fab.grid import Grid
 from fab.layout.compensation import edge_moves
 from fab.layout.geometry import Chrome, pixel_edges
 from fab.layout.part import Photomask, photomasks_of
 from fab.layout.split import Split, splits_of
 from fab.layout.wafer import Wafer
-from fab.levels import Levels
-from fab.manifest.records import map_digest
+from fab.level_map import LevelMap
 from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check
+from fab.rules.repair import Repair, repaired
 from fab.solids.patch import Patch
 from fab.units import NM
 
-__all__ = ["Order", "order_id"]
+__all__ = ["OnViolation", "Order", "order_id", "plan_order"]
+
+OnViolation = Literal["warn", "fail", "fix"]
 
 # What is left of 32 characters beside "DOE_" and the longest ending, "_M6_B5_1234P5NM".
 _LONGEST_ID = 13
@@ -34,52 +32,51 @@ class Order:
     """A mask order in numbers, before it becomes files.
 
     Attributes:
-        name: the name its owner gave it.
-        level_map: level numbers ``[y, x]``, blank outside the clear aperture.
-        levels: the staircase.
-        grid: the raster.
-        aperture_m: diameter of the clear aperture, metres.
-        chrome: how the chrome is drawn.
-        source: where the height map came from.
+        rules: the level map to draw, checked against what the process prints.
         process: in which order the masks are etched, and what their polygons are on the plates.
         wafer: what the masks are filled with.
+        chrome: how the chrome is drawn.
+        source: where the level map came from, for the manifest; JSON values only.
         patch: a window that is wanted as a solid at full resolution, if any.
+        repair: how the level map was changed for the process to print it, if it was.
     """
 
-    name: str
-    level_map: NDArray[np.uint8]
-    levels: Levels
-    grid: Grid
-    aperture_m: float
-    chrome: Chrome
-    source: Mapping[str, Any]
+    rules: RulesReport
     process: Process
     wafer: Wafer
+    chrome: Chrome
+    source: Mapping[str, Any] = field(default_factory=dict)
     patch: Patch | None = None
+    repair: Repair | None = None
 
     @property
+    def level_map(self) -> LevelMap:
+        """The DOE as it is drawn."""
+        return self.rules.level_map
+
+    @cached_property
     def plates(self) -> tuple[Photomask, ...]:
         """The masks in the order in which they are used."""
         process, wafer = self.process, self.wafer
-        return photomasks_of(self.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
-
-    @cached_property
-    def rules(self) -> RulesReport:
-        """Check every etch mask against what the process prints."""
-        return check(self.level_map, self.levels, self.grid, self.aperture_m, Rules.of(self.process))
+        return photomasks_of(self.level_map.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
 
     def edge_moves(self) -> tuple[int, ...]:
         """How far the edges of every mask are moved outward against the bias of the process, database units."""
         if not self.wafer.compensate:
-            return (0,) * self.levels.bits
+            return (0,) * self.process.masks
         usual = self.process.expected()
-        own = usual.cd_bias_m or (0.0,) * self.levels.bits
-        return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], pixel_edges(self.grid).dbu_m)
+        own = usual.cd_bias_m or (0.0,) * self.process.masks
+        return edge_moves([float(usual.common_cd_bias_m + bias) for bias in own], self.dbu_m)
+
+    @property
+    def dbu_m(self) -> float:
+        """Database unit of the drawing, metres."""
+        return pixel_edges(self.level_map.grid).dbu_m
 
     @property
     def splits(self) -> tuple[Split, ...]:
         """How the dies draw the DOE, the plate as ordered first."""
-        return splits_of(self.wafer, self.levels, self.edge_moves(), pixel_edges(self.grid).dbu_m)
+        return splits_of(self.wafer, self.level_map.levels, self.edge_moves(), self.dbu_m)
 
     def plate_stem(self, plate: Photomask) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
@@ -90,12 +87,48 @@ class Order:
     @property
     def stem(self) -> str:
         """What all file names begin with."""
-        return f"DOE_{order_id(self.name, map_digest(self.level_map))}"
+        return f"DOE_{order_id(self.level_map.name, self.level_map.digest)}"
 
     def mask_stem(self, bit: int) -> str:
         """Return the name of an etch mask's file (without suffix) and cell."""
-        depth = f"{self.levels.etch_depth_m(bit) / NM:.1f}".removesuffix(".0").replace(".", "P")
+        depth = f"{self.level_map.levels.etch_depth_m(bit) / NM:.1f}".removesuffix(".0").replace(".", "P")
         return f"{self.stem}_M{bit + 1}_B{bit}_{depth}NM"
+
+
+def plan_order(
+    level_map: LevelMap,
+    *,
+    process: Process | None = None,
+    wafer: Wafer | None = None,
+    chrome: Chrome | None = None,
+    patch: Patch | None = None,
+    source: Mapping[str, Any] | None = None,
+    on_violation: OnViolation = "warn",
+    waves_per_metre: float | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Order:
+    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`.
+
+    Raises:
+        InputError: the process cannot print the map and `on_violation` is "fail", or an argument is out of range.
+    """
+    process = process or Process(level_map.levels)
+    report = check(level_map, Rules.of(process))
+    for headline in report.headlines():
+        say(f"warning: {headline}")
+    if on_violation == "fail" and not report.printable:
+        cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
+        raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
+    order = Order(report, process, wafer or Wafer(), chrome or Chrome(), source or {}, patch)
+    if on_violation == "fix" and not report.clean:
+        say("repairing the level map")
+        repair = repaired(report, waves_per_metre)
+        source = {**order.source, "repair": asdict(repair.cost)}
+        order = replace(order, rules=repair.rules, repair=repair, source=source)
+        say(f"repaired: {repair.cost}")
+    if patch is not None:
+        patch.require(order.level_map)
+    return order
 
 
 def order_id(name: str, digest: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.grid import Grid
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.units import MM, NM, UM, format_length
 
 if TYPE_CHECKING:
@@ -78,9 +78,10 @@ def _show(
     return image
 
 
-def _draw_chrome(axes: "Axes", grid: Grid, aperture_m: float, radii_m: tuple[float, float]) -> None:
+def _draw_chrome(axes: "Axes", level_map: LevelMap, radii_m: tuple[float, float]) -> None:
     from matplotlib.patches import Circle
 
+    grid, aperture_m = level_map.grid, level_map.aperture_m
     inner, outer = (radius / MM for radius in radii_m)
     axes.add_patch(Circle((0, 0), outer, color=_CHROME, lw=0))
     axes.add_patch(Circle((0, 0), inner, color=_GLASS, lw=0))
@@ -101,12 +102,11 @@ def _draw_chrome(axes: "Axes", grid: Grid, aperture_m: float, radii_m: tuple[flo
     _scale_bar(axes, 2.06 * outer)
 
 
-def _draw_heights(
-    figure: "Figure", axes: "list[Axes]", level_map: NDArray[np.uint8], levels: Levels, grid: Grid
-) -> None:
+def _draw_heights(figure: "Figure", axes: "list[Axes]", level_map: LevelMap) -> None:
     """Draw the level map as a whole and through the window, with one colour scale."""
     from matplotlib.patches import Rectangle
 
+    level, levels, grid = level_map.level, level_map.levels, level_map.grid
     window = _window(grid)
     step_nm = levels.step_m / NM
     heights_nm = (levels.heights_m() / NM).astype(np.float32)
@@ -116,12 +116,12 @@ def _draw_heights(
         f"height, mean over blocks: {grid.shape[1]} x {grid.shape[0]} pixels of {grid.pitch_m / UM:.6g} \N{MICRO SIGN}m"
     )
     # The means of equal steps are exact; they are what keeps the picture the same to the last bit.
-    means = _blocks(level_map) * step_nm if levels.is_binary else _blocks(heights_nm[level_map])
+    means = _blocks(level) * step_nm if levels.is_binary else _blocks(heights_nm[level])
     _show(axes[0], means, _box_mm(grid), title, **look)
     x0, x1, y0, y1 = _box_mm(grid, window)
     axes[0].add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=_MARK, lw=1.5))
-    title = f"height, window of {level_map[window].shape[1]} pixels (red in the overview)"
-    shown = level_map[window] * step_nm if levels.is_binary else heights_nm[level_map[window]]
+    title = f"height, window of {level[window].shape[1]} pixels (red in the overview)"
+    shown = level[window] * step_nm if levels.is_binary else heights_nm[level[window]]
     image = _show(axes[1], shown, _box_mm(grid, window), title, **look)
     bar = figure.colorbar(image, ax=axes[1], fraction=0.046, pad=0.03)
     ticks = np.arange(levels.count) * step_nm if levels.is_binary else levels.by_height()[1] / NM
@@ -130,24 +130,12 @@ def _draw_heights(
     bar.set_label("height above the deepest floor (nm)", **_TEXT)
 
 
-def preview_png(
-    name: str,
-    bit_planes: NDArray[np.uint8],
-    level_map: NDArray[np.uint8],
-    levels: Levels,
-    grid: Grid,
-    aperture_m: float,
-    chrome_m: tuple[float, float],
-) -> bytes:
+def preview_png(title: str, level_map: LevelMap, chrome_m: tuple[float, float]) -> bytes:
     """Draw a mask set: heights, chrome, and every etch mask as a whole and through a window.
 
     Args:
-        name: what stands above the picture.
-        bit_planes: ``[bit, y, x]``, 1 where etched.
-        level_map: the level numbers that the planes make, ``[y, x]``.
-        levels: the staircase.
-        grid: the raster.
-        aperture_m: diameter of the clear aperture, metres.
+        title: what stands above the picture.
+        level_map: the DOE.
         chrome_m: radius of the chrome's opening and its outer radius, metres.
 
     Returns:
@@ -157,18 +145,19 @@ def preview_png(
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
+    levels, grid = level_map.levels, level_map.grid
     columns = max(3, levels.bits)
     figure = Figure(figsize=(4.1 * columns, 4.1 * columns / 3 + 8.6), dpi=_DPI, layout="constrained")
-    figure.suptitle(name, fontsize=13, x=0.01, ha="left")
+    figure.suptitle(title, fontsize=13, x=0.01, ha="left")
     rows = figure.add_gridspec(2, 1, height_ratios=(4.1 * columns / 3, 8.2))
     top, bottom = (figure.add_subfigure(rows[i]) for i in range(2))
     upper = top.subplots(1, 3)
-    _draw_heights(figure, list(upper[:2]), level_map, levels, grid)
-    _draw_chrome(upper[2], grid, aperture_m, chrome_m)
+    _draw_heights(figure, list(upper[:2]), level_map)
+    _draw_chrome(upper[2], level_map, chrome_m)
     window = _window(grid)
     look = {"cmap": LinearSegmentedColormap.from_list("etch", [_GLASS, _ETCHED]), "vmin": 0, "vmax": 1}
     lower = bottom.subplots(2, columns, squeeze=False)
-    for bit, plane in enumerate(bit_planes):
+    for bit, plane in enumerate(level_map.planes()):
         depth = format_length(levels.etch_depth_m(bit))
         share = f"{100 * np.count_nonzero(plane) / plane.size:.1f} %"
         _show(

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.gds.writer import write_gds, write_oasis
-from fab.grid import Grid
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
 from fab.layout.geometry import (
@@ -38,7 +37,7 @@ from fab.layout.geometry import (
     pixel_edges,
 )
 from fab.layout.wafer import Wafer
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import (
     CONVENTIONS,
@@ -46,12 +45,10 @@ from fab.manifest.records import (
     CellEntry,
     FileEntry,
     Manifest,
-    map_digest,
     read_manifest,
 )
-from fab.masks import planes, unetched_outside
-from fab.order.entries import chrome_entry, edges_told, mask_entry, plate_entry, split_entry, wafer_entry
-from fab.order.order import Order
+from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entry, wafer_entry
+from fab.order.order import OnViolation, Order, plan_order
 from fab.order.preview import preview_png
 from fab.process import Process
 from fab.solids.patch import Patch
@@ -59,7 +56,7 @@ from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
 from fab.verification.verify import VerificationReport, verify_order
 
-__all__ = ["Add", "mask_file", "write_order"]
+__all__ = ["Add", "WrittenOrder", "mask_file", "write_order", "write_planned"]
 
 _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 
@@ -100,9 +97,9 @@ def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
     return Layout(layout.dbu_m, tuple(cells))
 
 
-def _write_map(path: Path, level_map: NDArray[np.uint8]) -> None:
+def _write_map(path: Path, level: NDArray[np.uint8]) -> None:
     try:
-        np.save(path, level_map, allow_pickle=False)
+        np.save(path, level, allow_pickle=False)
     except OSError as error:
         raise explain_os_error(error, path) from error
 
@@ -111,14 +108,11 @@ def _frame(order: Order, dbu_m: float) -> Frame:
     return draw_frame(
         order.wafer,
         order.plates,
-        order.levels,
+        order.level_map,
         splits=order.splits,
         stem=order.stem,
-        digest=map_digest(order.level_map),
-        pitch_m=order.grid.pitch_m,
         minimum_line_m=order.process.minimum_line_m,
-        chrome_m=2 * order.chrome.radii_m(order.grid, order.aperture_m)[1],
-        aperture_m=order.aperture_m,
+        chrome_m=2 * order.chrome.radii_m(order.level_map)[1],
         dbu_m=dbu_m,
     )
 
@@ -131,16 +125,7 @@ def _around(order: Order, layout: Layout) -> list[CellEntry]:
 def _drawn_does(order: Order) -> Layout:
     """Draw the DOE in all the ways that the dies ask for, the plate as ordered first."""
     drawn = [
-        mask_layout(
-            order.level_map,
-            order.levels,
-            order.grid,
-            order.aperture_m,
-            f"{order.stem}_{split.code}",
-            order.chrome,
-            split.moves,
-            split.bits,
-        )
+        mask_layout(order.level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
         for split in order.splits
     ]
     return Layout(drawn[0].dbu_m, tuple(one.top for one in drawn))
@@ -185,19 +170,20 @@ def _file_entry(folder: Path, content: FileContent) -> FileEntry:
 
 def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
     """Write everything but the manifest, and return it."""
+    level_map = order.level_map
+    levels, grid = level_map.levels, level_map.grid
     say("drawing the masks")
     drawn = _drawn_does(order)
     frame = _frame(order, drawn.dbu_m)
     splits = [
-        split_entry(split, cell, frame.splits.index(number) + 1, order.levels, drawn.dbu_m)
+        split_entry(split, cell, frame.splits.index(number) + 1, levels, drawn.dbu_m)
         for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
         if number
     ]
     layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
     doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
     del drawn
-    bit_planes = planes(order.level_map, order.levels)
-    masks = [mask_entry(order, layout, bit, plane) for bit, plane in enumerate(bit_planes)]
+    masks = [mask_entry(order, layout, bit, plane) for bit, plane in enumerate(level_map.planes())]
     chrome = chrome_entry(order, layout)
     gds, oasis, levels_file, preview = (
         f"{order.stem}_{end}" for end in ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
@@ -206,24 +192,12 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     dbu_m = layout.dbu_m
     del layout
     say("drawing the preview")
-    _write_map(folder / levels_file, order.level_map)
-    digest = map_digest(order.level_map)
-    title = f"{order.stem}: {order.levels.told}, level map {digest[:12]}"
-    radii_m = order.chrome.radii_m(order.grid, order.aperture_m)
-    picture = preview_png(title, bit_planes, order.level_map, order.levels, order.grid, order.aperture_m, radii_m)
+    _write_map(folder / levels_file, level_map.level)
+    title = f"{order.stem}: {levels.told}, level map {level_map.digest[:12]}"
+    picture = preview_png(title, level_map, order.chrome.radii_m(level_map))
     (folder / preview).write_bytes(picture)
     say("drawing the solids")
-    shown = PlateModel(
-        order.level_map,
-        order.levels,
-        order.grid,
-        order.aperture_m,
-        order.chrome,
-        order.wafer,
-        frame.die_m,
-        frame.dies,
-        order.patch,
-    )
+    shown = PlateModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
     # What is added takes long where it follows light; the solids are drawn meanwhile.
     with ThreadPoolExecutor(1) as pool:
         solids = pool.submit(write_models, folder, order.stem, shown)
@@ -233,18 +207,18 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     contents += [FileContent(name, Path(name).suffix[1:].upper()) for name in others]
     return Manifest(
         format=FORMAT,
-        name=order.name,
+        name=level_map.name,
         source=dict(order.source),
         conventions=CONVENTIONS,
-        levels=order.levels.count,
-        step_nm=round(order.levels.step_m / NM, 9),
-        shape=list(order.grid.shape),
-        pitch_um=round(order.grid.pitch_m / UM, 12),
-        aperture_mm=round(order.aperture_m / MM, 9),
+        levels=levels.count,
+        step_nm=round(levels.step_m / NM, 9),
+        shape=list(grid.shape),
+        pitch_um=round(grid.pitch_m / UM, 12),
+        aperture_mm=round(level_map.aperture_m / MM, 9),
         dbu_nm=round(dbu_m / NM, 9),
-        pixel_edges=edges_told(pixel_edges(order.grid)),
+        pixel_edges=describe_edges(pixel_edges(grid)),
         level_map_file=levels_file,
-        level_map_sha256=digest,
+        level_map_sha256=level_map.digest,
         combined_gds=gds,
         combined_oasis=oasis,
         preview=preview,
@@ -272,53 +246,79 @@ def _require_own(folder: Path) -> None:
         raise InputError(str(folder), rule, f"also {extra[0]!r}", "Move that file, or choose another folder.")
 
 
+class WrittenOrder(NamedTuple):
+    """A mask order on the disk.
+
+    Attributes:
+        folder: where its files lie.
+        order: what was drawn.
+        report: the read-back, every check passed.
+    """
+
+    folder: Path
+    order: Order
+    report: VerificationReport
+
+
 def write_order(
     folder: str | Path,
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    aperture_m: float,
-    name: str,
-    source: Mapping[str, Any],
+    level_map: LevelMap,
     *,
-    chrome: Chrome | None = None,
     process: Process | None = None,
     wafer: Wafer | None = None,
+    chrome: Chrome | None = None,
     patch: Patch | None = None,
-    add: Add = lambda *_: (),
+    source: Mapping[str, Any] | None = None,
+    on_violation: OnViolation = "warn",
+    waves_per_metre: float | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> VerificationReport:
+) -> WrittenOrder:
     """Write a mask order and prove it; the folder appears only if the proof holds.
 
     Args:
         folder: the final folder; missing, empty, or an earlier order, which is replaced.
-        level_map: level numbers ``[y, x]``; outside the clear aperture the glass is left blank.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres.
-        name: the owner's name for it; file names are made from it.
-        source: where the height map came from, for the manifest; JSON values only.
-        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
-        process: order of the etches and tone of the masks; an ideal process if left out.
+        level_map: the DOE; file names are made from its name.
+        process: order of the etches, tone of the masks and what is printed; an ideal process if left out.
         wafer: what the masks are filled with; the defaults of `Wafer` if left out.
+        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
         patch: a window to write as a solid at full resolution, too.
-        add: writes further files into the folder and returns their names; what needs light to be written.
+        source: where the level map came from, for the manifest; JSON values only.
+        on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
+        waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
         say: told the name of each step as it begins.
-
-    Returns:
-        The report of the read-back, every check passed.
 
     Raises:
         InputError: an argument is out of range; the folder holds anything else than an earlier order;
             the system refuses it.
         CheckFailed: what was read back differs; nothing is left at the final path.
     """
-    _require_own(Path(folder))
-    blank = unetched_outside(level_map, levels, grid, aperture_m)
-    made = process or Process(levels)
-    order = Order(name, blank, levels, grid, aperture_m, chrome or Chrome(), source, made, wafer or Wafer(), patch)
-    if patch is not None:
-        patch.require(blank, levels, grid)
+    order = plan_order(
+        level_map,
+        process=process,
+        wafer=wafer,
+        chrome=chrome,
+        patch=patch,
+        source=source,
+        on_violation=on_violation,
+        waves_per_metre=waves_per_metre,
+        say=say,
+    )
+    return write_planned(folder, order, say=say)
+
+
+def write_planned(
+    folder: str | Path, order: Order, *, add: Add = lambda *_: (), say: Callable[[str], None] = lambda _: None
+) -> WrittenOrder:
+    """Write an order that `plan_order` made, and prove it; see `write_order`.
+
+    Args:
+        folder: the final folder.
+        order: what is drawn.
+        add: writes further files into the folder and returns their names; what needs light to be written.
+        say: told the name of each step as it begins.
+    """
+    folder = Path(folder)
+    _require_own(folder)
     with atomic_folder(folder) as fresh:
         manifest = _write_files(fresh, order, add, say)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
@@ -326,4 +326,4 @@ def write_order(
         report = verify_order(fresh)
         report.require()
         say("moving the folder into place")
-    return report
+    return WrittenOrder(folder, order, report)

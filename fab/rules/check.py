@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.geometry import pixel_edges
-from fab.levels import Levels, require_levels
+from fab.level_map import LevelMap
 from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
@@ -166,16 +166,18 @@ class OffGrid:
     worst_m: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RulesReport:
     """What the rules say of a mask set.
 
     Attributes:
+        level_map: the DOE that was checked.
         rules: the rules.
         planes: one entry per etch mask, mask 0 first.
         off_grid: the raster against the mask writer's address grid.
     """
 
+    level_map: LevelMap
     rules: Rules
     planes: tuple[PlaneRules, ...]
     off_grid: OffGrid
@@ -313,29 +315,21 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
     return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
 
 
-def check(level_map: NDArray[np.integer], levels: Levels, grid: Grid, aperture_m: float, rules: Rules) -> RulesReport:
+def check(level_map: LevelMap, rules: Rules) -> RulesReport:
     """Check every etch mask of a level map.
 
     Args:
-        level_map: level numbers ``[y, x]``; outside the clear aperture nothing is etched, whatever they are.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres.
+        level_map: the DOE; outside its clear aperture nothing is etched.
         rules: what the masks may hold.
 
     Returns:
         The numbers of every mask, its worst places, and the raster against the address grid.
-
-    Raises:
-        InputError: the array is not a level map of this staircase, or not of the grid's shape.
     """
-    checked = require_levels(level_map, levels)
-    if checked.shape != grid.shape:
-        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
-    spans = _spans(grid, aperture_m)
-    area = int(np.sum(np.clip(spans[:, 1], 0, grid.shape[1]) - np.clip(spans[:, 0], 0, None)))
-    words = bits.pack(checked, levels.bits, np.clip(spans, 0, grid.shape[1]))
+    grid, aperture_m = level_map.grid, level_map.aperture_m
+    spans = np.clip(_spans(grid, aperture_m), 0, grid.shape[1])
+    area = int(np.sum(spans[:, 1] - spans[:, 0]))
+    words = bits.pack(level_map.level, level_map.levels.bits, spans)
     with ThreadPoolExecutor() as pool:
         tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)
-    return RulesReport(rules, planes, _off_grid(grid, rules))
+    return RulesReport(level_map, rules, planes, _off_grid(grid, rules))

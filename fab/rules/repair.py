@@ -1,12 +1,12 @@
 """Repair of a level map whose masks are too fine: new levels for the pixels that break a rule, few and near.
 
-A mask must not be mended by itself, since a pixel that is moved in one bit plane jumps by the depth of that etch. Here
+No mask is repaired by itself, since a pixel that is moved in one bit plane jumps by the depth of that etch. Here
 levels change, and a level is judged by all its bits at once.
 
 A move sets a small rectangle of pixels to the level of one of its neighbours. Moves are weighed by what they do to the
 rules (the pixels by which runs are too short, and the kissing corners, of every mask) and to the light (1 - cos of the
 phase error against the map that was asked for). Sweeps over the offending pixels take the best move of each, while the
-weight of a broken rule rises: cheap repairs come first and dear ones only where they are needed.
+weight of a broken rule rises: cheap repairs come first and expensive ones only where they are needed.
 
 What is left is frozen: the plate is divided into squares as wide as the rules demand, and every square in which
 something is broken becomes one level. Squares that reach beyond the clear aperture become blank glass. Frozen squares
@@ -23,13 +23,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.masks import unetched_outside
-from fab.rules.check import Rules, check, shortest_run
+from fab.rules.check import Rules, RulesReport, check, shortest_run
 from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
 
-__all__ = ["RepairCost", "repaired"]
+__all__ = ["Repair", "RepairCost", "repair", "repaired"]
 
 # How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -48,7 +47,7 @@ class RepairCost:
     Attributes:
         changed_share: share of the pixels that got another level.
         rms_height_m: rms of the change of height, metres.
-        efficiency: |mean exp(2 pi i dh rate)|^2: the share of the light that still goes where it was meant to.
+        efficiency: |mean exp(2 pi i dh waves_per_metre)|^2: share of the light that still goes where it was meant to.
         broken_before: places that broke a rule, over all masks.
         broken_after: places that still do.
     """
@@ -58,6 +57,30 @@ class RepairCost:
     efficiency: float
     broken_before: int
     broken_after: int
+
+    def __str__(self) -> str:
+        """Return "1.2 % of the pixels changed, 0.3 % of the light goes astray"."""
+        left = f", {self.broken_after} of {self.broken_before} broken places are left" if self.broken_after else ""
+        return (
+            f"{100 * self.changed_share:.3g} % of the pixels changed, {100 * (1 - self.efficiency):.2g} % of the light "
+            f"goes astray{left}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """A repaired level map.
+
+    Attributes:
+        level_map: the repaired map.
+        cost: what changed. `RepairCost.broken_after` says honestly what could not be repaired: corners that touch, at
+            worst; no narrow line and no narrow space.
+        rules: the rules checked on the repaired map.
+    """
+
+    level_map: LevelMap
+    cost: RepairCost
+    rules: RulesReport
 
 
 @njit(cache=True, nogil=True)
@@ -162,8 +185,7 @@ def _freeze_all(task: RepairTask, shift: int) -> bool:
             return bool(frozen.any())
 
 
-def _mend(task: RepairTask) -> None:
-    """Repair in place."""
+def _repair_in_place(task: RepairTask) -> None:
     for weight in _WEIGHTS:
         _sweep_all(task, weight, changed_too=False)
     # From here on no width is given up for a corner, so that what is frozen stays sound.
@@ -178,69 +200,61 @@ def _mend(task: RepairTask) -> None:
             pass
 
 
-def _phases(levels: Levels, waves_per_m: float) -> NDArray[np.float64]:
+def _phases(levels: Levels, waves_per_metre: float) -> NDArray[np.float64]:
     """Return by how many radians the light of every level ``[a]`` is ahead of that of every other ``[b]``."""
     if levels.is_binary:
         number = np.arange(levels.count)
-        return 2 * math.pi * waves_per_m * levels.step_m * np.subtract.outer(number, number)
-    return 2 * math.pi * waves_per_m * np.subtract.outer(levels.heights_m(), levels.heights_m())
+        return 2 * math.pi * waves_per_metre * levels.step_m * np.subtract.outer(number, number)
+    return 2 * math.pi * waves_per_metre * np.subtract.outer(levels.heights_m(), levels.heights_m())
 
 
-def repaired(
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    aperture_m: float,
-    rules: Rules,
-    waves_per_m: float,
-) -> tuple[NDArray[np.uint8], RepairCost]:
-    """Change as few levels as can be, as little as can be, until no mask breaks a rule.
+def repair(level_map: LevelMap, rules: Rules, waves_per_metre: float | None = None) -> Repair:
+    """Change as few levels as possible, as little as possible, until no mask breaks a rule.
 
     Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres; nothing changes outside, where the glass stays blank.
+        level_map: the DOE; nothing changes outside its clear aperture, where the glass stays blank.
         rules: narrowest line and space. With neither there is nothing to repair.
-        waves_per_m: waves of light per metre of height, (n - 1) / wavelength; says which levels are near each other.
-
-    Returns:
-        The repaired map, blank outside the clear aperture, and what it costs. `RepairCost.broken_after` says honestly
-        what could not be repaired: corners that touch, at worst; no narrow line and no narrow space.
+        waves_per_metre: waves of light per metre of height, (n - 1) / wavelength, which says which levels are near each
+            other; one wave over the period of the staircase by default.
 
     Raises:
-        InputError: not a level map of this staircase and grid, a rate that is not positive, or a minimum of more than
-            32 pixels.
+        InputError: waves per metre that are not positive, or a minimum of more than 32 pixels.
     """
-    if not 0 < waves_per_m < math.inf:
-        raise InputError("waves per metre", "must be positive and finite", waves_per_m, "Give (n - 1) / wavelength.")
+    return repaired(check(level_map, rules), waves_per_metre)
+
+
+def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repair:
+    """Repair a level map that was checked; see `repair`."""
+    level_map, rules = before.level_map, before.rules
+    levels, grid, wanted = level_map.levels, level_map.grid, level_map.level
+    waves = 1 / levels.period_m if waves_per_metre is None else waves_per_metre
+    if not 0 < waves < math.inf:
+        raise InputError("waves per metre", "must be positive and finite", waves, "Give (n - 1) / wavelength.")
     line, space = (shortest_run(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
     if max(line, space) > _WIDEST:
         rule = f"the narrowest line and space must not exceed {_WIDEST} pixels"
         raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")
-    wanted = unetched_outside(level_map, levels, grid, aperture_m)
-    before = check(wanted, levels, grid, aperture_m, rules)
-    free = grid.inside_circle(aperture_m)
-    mended = wanted
+    free, after = grid.inside_circle(level_map.aperture_m), before
     if not before.clean:
         # Moves and the runs beside them reach no farther than this.
         pad = 2 * max(line, space) + 2
         top = levels.count - 1
         # By what is etched, the top level first.
-        error = 1 - np.cos(_phases(levels, waves_per_m)[::-1, ::-1])
+        error = 1 - np.cos(_phases(levels, waves)[::-1, ::-1])
         target = np.pad(np.uint8(top) - wanted, pad)
         task = RepairTask(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
-        _mend(task)
-        mended = np.uint8(top) - task.etched[pad:-pad, pad:-pad]
+        _repair_in_place(task)
+        after = check(level_map.with_level(np.uint8(top) - task.etched[pad:-pad, pad:-pad]), rules)
     # How often which level took the place of which.
-    pairs = np.bincount(mended[free].astype(np.int64) * levels.count + wanted[free], minlength=levels.count**2)
+    number = after.level_map.level[free].astype(np.int64) * levels.count + wanted[free]
+    pairs = np.bincount(number, minlength=levels.count**2)
     shares = pairs.reshape(levels.count, levels.count) / max(pairs.sum(), 1)
     rises_m = np.subtract.outer(levels.heights_m(), levels.heights_m())
-    after = before if before.clean else check(mended, levels, grid, aperture_m, rules)
-    return mended, RepairCost(
+    cost = RepairCost(
         changed_share=1.0 - float(np.trace(shares)) if pairs.any() else 0.0,
         rms_height_m=math.sqrt(float(np.sum(shares * rises_m**2))),
-        efficiency=float(abs(np.sum(shares * np.exp(1j * _phases(levels, waves_per_m)))) ** 2) if pairs.any() else 1.0,
+        efficiency=float(abs(np.sum(shares * np.exp(1j * _phases(levels, waves)))) ** 2) if pairs.any() else 1.0,
         broken_before=sum(plane.breaks for plane in before.planes),
         broken_after=sum(plane.breaks for plane in after.planes),
     )
+    return Repair(after.level_map, cost, after)

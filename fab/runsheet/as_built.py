@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from fab.errors import InputError
 from fab.files import read_json
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.runsheet.write import BARS, FORMAT, PADS
 from fab.units import NM, UM
 
@@ -236,13 +236,12 @@ def _edge_moves_m(path: Path, data: Mapping[str, Any]) -> dict[str, float]:
     return {str(row.get("plate")): _sheet_number(path, row, "edge_move_nm") * NM for row in rows}
 
 
-def read_as_built(path: Path, levels: Levels, level_map_sha256: str) -> AsBuilt:
+def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
     """Read a run sheet that was filled in.
 
     Args:
         path: the JSON file.
-        levels: the staircase of the design.
-        level_map_sha256: digest of the design's level map (`fab.manifest.records.map_digest`).
+        level_map: the design that the wafer was made from.
 
     Returns:
         What was measured.
@@ -254,8 +253,9 @@ def read_as_built(path: Path, levels: Levels, level_map_sha256: str) -> AsBuilt:
     if data.get("format") != FORMAT:
         cure = "Give the filled JSON of the run sheet that `doedesign masks` wrote."
         raise InputError(str(path), f'the format must be "{FORMAT}"', _short(data.get("format")), cure)
-    if data.get("level_map_sha256") != level_map_sha256:
-        rule = f"must be the run sheet of this design (level map {level_map_sha256[:12]})"
+    levels, digest = level_map.levels, level_map.digest
+    if data.get("level_map_sha256") != digest:
+        rule = f"must be the run sheet of this design (level map {digest[:12]})"
         cure = "Give the run that the wafer was made from, or its masks (--masks)."
         raise InputError(str(path), rule, _short(data.get("level_map_sha256"))[:14], cure)
     moves = _edge_moves_m(path, data)
@@ -278,7 +278,7 @@ def read_as_built(path: Path, levels: Levels, level_map_sha256: str) -> AsBuilt:
         table.finish()
     predicted = data.get("predicted")
     return AsBuilt(
-        level_map_sha256=level_map_sha256,
+        level_map_sha256=digest,
         masks=masks,
         chrome=chrome,
         corner_radius_m=_scaled(corner, UM),

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from fab.errors import InputError
 from fab.layout.part import Photomask
 from fab.layout.wafer import Wafer
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.process import Process
 from fab.units import NM
 
@@ -102,12 +102,10 @@ class RunSheet:
 
     Attributes:
         stem: what all files of the order begin with.
-        level_map_sha256: digest of the level map; tells one design from another.
-        levels: the staircase.
+        level_map: the DOE; its digest tells one design from another.
         plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`).
         files: the file of every plate, by the plate's name.
         process: what the lab does and how far it strays.
-        aperture_m: diameter of the relief.
         opening_m: diameter of the opening in the chrome.
         wafer: the substrate, and the blanks of the masks.
         places: named points to measure at, from the middle of the wafer in metres, named as in `fab.layout.marks` and
@@ -121,12 +119,10 @@ class RunSheet:
     """
 
     stem: str
-    level_map_sha256: str
-    levels: Levels
+    level_map: LevelMap
     plates: tuple[Photomask, ...]
     files: Mapping[str, PhotomaskFile]
     process: Process
-    aperture_m: float
     opening_m: float
     wafer: Wafer
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)

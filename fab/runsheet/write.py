@@ -248,9 +248,9 @@ def record(sheet: RunSheet) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "job": sheet.stem,
-        "level_map_sha256": sheet.level_map_sha256,
-        "levels": sheet.levels.count,
-        "aperture_mm": round(sheet.aperture_m / MM, 9),
+        "level_map_sha256": sheet.level_map.digest,
+        "levels": sheet.level_map.levels.count,
+        "aperture_mm": round(sheet.level_map.aperture_m / MM, 9),
         "opening_um": _um(sheet.opening_m),
         "process": {
             "name": process.name,
@@ -272,7 +272,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "vernier_step_um": _um(VERNIER_STEP_M),
         "reference": sheet.plates[0].name,
         "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps, start=1)],
-        "staircase_nm": [_nm(depth) for depth in depths_m(sheet.levels)],
+        "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
         "predicted": None if sheet.outlook is None else _outlook_record(sheet.outlook),
         "measured": _blanks(sheet),

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.levels import Levels, require_levels
+from fab.level_map import LevelMap
+from fab.levels import Levels
 
-__all__ = ["Columns", "Window", "reduced_cells", "require_map", "whole", "window_cells"]
+__all__ = ["Columns", "Window", "reduced_cells", "whole", "window_cells"]
 
 _MOST_CELLS = 4_000_000
 # Heights that differ by less than this part of the relief are one height that was rounded differently.
@@ -82,26 +83,6 @@ def whole(grid: Grid) -> Window:
     return Window(0, 0, *grid.shape)
 
 
-def require_map(level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> NDArray[np.uint8]:
-    """Check that an array is a level map of a staircase on a grid.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster.
-
-    Returns:
-        The same numbers as a C-ordered uint8 array.
-
-    Raises:
-        InputError: it is not.
-    """
-    checked = require_levels(level_map, levels)
-    if checked.shape != grid.shape:
-        raise InputError("level map", f"must have the grid's shape {grid.shape}", checked.shape, "Use its own grid.")
-    return checked
-
-
 @dataclass(frozen=True, eq=False)
 class Columns:
     """A relief of columns on a rectangular raster.
@@ -159,58 +140,38 @@ def _heights_m(levels: Levels) -> NDArray[np.float64]:
     return _joined(heights, _CLOSEST * float(heights.max()))
 
 
-def window_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window) -> Columns:
-    """Take a window of a map at full resolution.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        window: the pixels to take.
-
-    Returns:
-        One column per pixel, where the window lies on the plate.
+def window_cells(level_map: LevelMap, window: Window) -> Columns:
+    """Take a window of a map at full resolution: one column per pixel, where the window lies on the DOE.
 
     Raises:
-        InputError: the map does not belong to the levels or the grid, the window leaves the map or holds
-            more than 4 million pixels.
+        InputError: the window leaves the map or holds more than 4 million pixels.
     """
-    checked = require_map(level_map, levels, grid)
-    window.require(grid)
+    window.require(level_map.grid)
     if window.rows * window.columns > _MOST_CELLS:
         rule = f"a mesh may have at most {_MOST_CELLS} columns"
         got = f"{window.rows} x {window.columns}"
         raise InputError("window", rule, got, "Choose a smaller window or a reduced map.")
-    heights = _heights_m(levels)
-    return Columns(heights[window.cut(checked)], *window.edges_m(grid), float(heights.max()))
+    heights = _heights_m(level_map.levels)
+    return Columns(heights[window.cut(level_map.level)], *window.edges_m(level_map.grid), float(heights.max()))
 
 
-def reduced_cells(level_map: NDArray[np.integer], levels: Levels, grid: Grid, most: int = 1000) -> Columns:
+def reduced_cells(level_map: LevelMap, most: int = 1000) -> Columns:
     """Reduce a map to columns of the mean height of square blocks of pixels; the volume stays.
 
-    The block is the smallest that leaves at most `most` columns along the longer side. Blocks at the high end
-    of an axis are cut where the map ends. A mean across a jump of one wave stands between its
-    two sides: a reduced map is for looking at and for weighing, not for optics.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        most: columns along the longer side, 1 to 2000.
-
-    Returns:
-        The columns and the block.
+    The block is the smallest that leaves at most `most` columns (1 to 2000) along the longer side. Blocks at the high
+    end of an axis are cut where the map ends. A mean across a jump of one wave stands between its two sides: a reduced
+    map is for looking at and for weighing, not for optics.
 
     Raises:
-        InputError: the map does not belong to the levels or the grid, or `most` is out of range.
+        InputError: `most` is out of range.
     """
-    checked = require_map(level_map, levels, grid)
+    grid = level_map.grid
     if not 1 <= most <= math.isqrt(_MOST_CELLS):
         rule = f"the columns along a side must be 1 to {math.isqrt(_MOST_CELLS)}"
         raise InputError("mesh", rule, most, "Choose another number of columns.")
     block = -(-max(grid.shape) // most)
-    heights = _heights_m(levels)
+    heights = _heights_m(level_map.levels)
     x_m, y_m = whole(grid).edges_m(grid)
     x, y = (np.append(edges[:-1:block], edges[-1]) for edges in (x_m, y_m))
-    means = _joined(_block_means(checked, heights, block), _CLOSEST * float(heights.max()))
+    means = _joined(_block_means(level_map.level, heights, block), _CLOSEST * float(heights.max()))
     return Columns(means, x, y, float(heights.max()), block)

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import write_atomic
-from fab.grid import Grid
-from fab.levels import Levels, height_of
-from fab.solids.columns import Window, require_map, whole
+from fab.level_map import LevelMap
+from fab.levels import Levels
+from fab.solids.columns import Window, whole
 from fab.units import MM, format_length
 
 __all__ = ["write_greymap", "write_npy", "write_tiff", "write_zemax_sag"]
@@ -32,12 +32,14 @@ _FEWEST_ZEMAX = 5
 _ROWS = 256
 
 
-def _said(levels: Levels, grid: Grid, metres_per_count: float, rounding_m: float) -> str:
+def _said(level_map: LevelMap, metres_per_count: float, counts: NDArray[np.int64]) -> str:
+    levels = level_map.levels
+    rounding_m = float(np.abs(counts * metres_per_count - levels.heights_m()).max())
     close = "exact" if rounding_m < 1e-15 else f"rounded by at most {rounding_m:.2e} m"
     return (
         f"Height above the deepest etched floor = count x {metres_per_count!r} m ({close}). "
         f"{levels.count} levels; the highest is the blank surface. "
-        f"Square pixels of {format_length(grid.pitch_m)}. The first row is the one at the highest y, "
+        f"Square pixels of {format_length(level_map.grid.pitch_m)}. The first row is the one at the highest y, "
         "the first column the one at the lowest x; seen from the side of the relief."
     )
 
@@ -60,11 +62,7 @@ def _exact_scale(levels: Levels) -> tuple[NDArray[np.int64], float]:
     return _full_scale(levels, 65535)
 
 
-def _rounding_m(levels: Levels, counts: NDArray[np.int64], scale_m: float) -> float:
-    return float(np.abs(counts * scale_m - levels.heights_m()).max())
-
-
-def write_tiff(path: str | Path, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> float:
+def write_tiff(path: str | Path, level_map: LevelMap) -> float:
     """Write the heights as a 16-bit grey TIFF, first row at the highest y.
 
     Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded
@@ -73,28 +71,26 @@ def write_tiff(path: str | Path, level_map: NDArray[np.integer], levels: Levels,
 
     Args:
         path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
+        level_map: the DOE.
 
     Returns:
         Metres per count; count times this is the height above the deepest floor.
 
     Raises:
-        InputError: the map does not belong to the levels or the grid, or the file cannot be written.
+        InputError: the file cannot be written.
     """
     import tifffile
 
-    checked = require_map(level_map, levels, grid)
-    counts, scale_m = _exact_scale(levels)
+    counts, scale_m = _exact_scale(level_map.levels)
+    per_cm = 0.01 / level_map.grid.pitch_m
     stream = io.BytesIO()
     tifffile.imwrite(
         stream,
-        counts.astype(np.uint16)[checked[::-1]],
+        counts.astype(np.uint16)[level_map.level[::-1]],
         photometric="minisblack",
         compression="zlib",
-        description=_said(levels, grid, scale_m, _rounding_m(levels, counts, scale_m)),
-        resolution=(0.01 / grid.pitch_m, 0.01 / grid.pitch_m),
+        description=_said(level_map, scale_m, counts),
+        resolution=(per_cm, per_cm),
         resolutionunit="CENTIMETER",
         metadata=None,
         software="doedesign",
@@ -103,25 +99,18 @@ def write_tiff(path: str | Path, level_map: NDArray[np.integer], levels: Levels,
     return scale_m
 
 
-def write_npy(path: str | Path, level_map: NDArray[np.integer], levels: Levels) -> None:
+def write_npy(path: str | Path, level_map: LevelMap) -> None:
     """Write the heights as a bare array: float64 metres above the deepest floor, ``[y, x]``, row 0 at the lowest y.
 
-    Args:
-        path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-
     Raises:
-        InputError: the map does not belong to the levels, or the file cannot be written.
+        InputError: the file cannot be written.
     """
     stream = io.BytesIO()
-    np.save(stream, height_of(level_map, levels), allow_pickle=False)
+    np.save(stream, level_map.levels.heights_m()[level_map.level], allow_pickle=False)
     write_atomic(path, stream.getvalue())
 
 
-def write_greymap(
-    path: str | Path, level_map: NDArray[np.integer], levels: Levels, grid: Grid, bits: Literal[8, 16] = 8
-) -> float:
+def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
     """Write the picture that greyscale and two-photon writers expose: PNG, white highest, linear in height.
 
     Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is rounded to
@@ -130,25 +119,22 @@ def write_greymap(
 
     Args:
         path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
+        level_map: the DOE.
         bits: per pixel, 8 or 16.
 
     Returns:
         Metres per count.
 
     Raises:
-        InputError: the map does not belong to the levels or the grid, or the file cannot be written.
+        InputError: the file cannot be written.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    checked = require_map(level_map, levels, grid)
-    counts, scale_m = _full_scale(levels, 2**bits - 1)
-    pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[checked[::-1]]
+    counts, scale_m = _full_scale(level_map.levels, 2**bits - 1)
+    pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level[::-1]]
     text = PngInfo()
-    text.add_text("Description", _said(levels, grid, scale_m, _rounding_m(levels, counts, scale_m)))
+    text.add_text("Description", _said(level_map, scale_m, counts))
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, format="PNG", pnginfo=text)
     write_atomic(path, stream.getvalue())
@@ -156,12 +142,7 @@ def write_greymap(
 
 
 def write_zemax_sag(
-    path: str | Path,
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    window: Window | None = None,
-    side: Literal["exit", "entry"] = "exit",
+    path: str | Path, level_map: LevelMap, window: Window | None = None, side: Literal["exit", "entry"] = "exit"
 ) -> None:
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
@@ -174,35 +155,33 @@ def write_zemax_sag(
 
     Args:
         path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
+        level_map: the DOE.
         window: the pixels to write; all of them if left out. The decentre in the header puts them where they are.
         side: on which side of the glass the relief is.
 
     Raises:
-        InputError: fewer than 5 points along an axis, a window off the map, a map that does not belong to the
-            levels or the grid, a suffix that OpticStudio does not read, or a file that cannot be written.
+        InputError: fewer than 5 points along an axis, a window off the map, a suffix that OpticStudio does not read, or
+            a file that cannot be written.
     """
     if Path(path).suffix.upper() != ".DAT":
         raise InputError(str(path), "OpticStudio reads grid sags from .DAT files", Path(path).suffix, "Use .DAT.")
-    checked = require_map(level_map, levels, grid)
+    grid = level_map.grid
     window = window or whole(grid)
     window.require(grid)
     if min(window.rows, window.columns) < _FEWEST_ZEMAX:
         rule = f"OpticStudio needs at least {_FEWEST_ZEMAX} points along either axis"
         raise InputError("grid sag", rule, f"{window.rows} x {window.columns}", "Choose a larger window.")
-    heights = levels.heights_m()
+    heights = level_map.levels.heights_m()
     sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
     lines = [f"{sag + 0.0:12.9f} 0 0 0 0\r\n".encode() for sag in sag_mm]  # + 0.0: no minus before a zero
     if len({len(line) for line in lines}) != 1:  # pragma: no cover - a relief deeper than a centimetre
         raise InputError(
             "grid sag", "the relief must be less than 10 mm deep", format_length(heights.max()), "Check it."
         )
-    table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(levels.count, -1)
+    table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(heights.size, -1)
     x_mm, y_mm = (value / MM for value in window.centre_m(grid))
     pitch_mm = f"{grid.pitch_m / MM:.12g}"
     header = f"{window.columns} {window.rows} {pitch_mm} {pitch_mm} 0 {x_mm:.12g} {y_mm:.12g}\r\n"
-    pixels = window.cut(checked)[::-1]
+    pixels = window.cut(level_map.level)[::-1]
     body = (table[pixels[start : start + _ROWS]].tobytes() for start in range(0, window.rows, _ROWS))
     write_atomic(path, b"".join([header.encode(), *body]))

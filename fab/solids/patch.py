@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles
-from fab.levels import Levels
-from fab.solids.columns import Columns, Window, require_map, window_cells
+from fab.level_map import LevelMap
+from fab.solids.columns import Columns, Window, window_cells
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
@@ -64,28 +64,28 @@ class Patch:
         window.require(grid)
         return window
 
-    def require(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> None:
+    def require(self, level_map: LevelMap) -> None:
         """Check that the files of the patch stay small enough to be opened.
 
         Raises:
             InputError: it is too large for a mesh, or has too many boxes for STEP, or reaches beyond the map.
         """
-        window = self.window(grid)
+        window = self.window(level_map.grid)
         if window.rows > _MOST_PIXELS:
             rule = f"a mesh at full resolution may have at most {_MOST_PIXELS} x {_MOST_PIXELS} pixels"
-            cure = f"Choose an edge of at most {format_length(_MOST_PIXELS * grid.pitch_m)}."
+            cure = f"Choose an edge of at most {format_length(_MOST_PIXELS * level_map.grid.pitch_m)}."
             raise InputError("patch", rule, f"{window.rows} x {window.columns}", cure)
         if self.step:
-            _tops(require_map(level_map, levels, grid), window, _MOST_BOXES)
+            _tops(level_map, window, _MOST_BOXES)
 
-    def cells(self, level_map: NDArray[np.integer], levels: Levels, grid: Grid) -> Columns:
+    def cells(self, level_map: LevelMap) -> Columns:
         """Return the columns of the patch."""
-        return window_cells(level_map, levels, grid, self.window(grid))
+        return window_cells(level_map, self.window(level_map.grid))
 
 
-def _tops(level_map: NDArray[np.uint8], window: Window, most_boxes: int) -> dict[int, NDArray[np.int32]]:
+def _tops(level_map: LevelMap, window: Window, most_boxes: int) -> dict[int, NDArray[np.int32]]:
     """Return the rectangles of every level in a window, or refuse too many."""
-    cut = window.cut(level_map)
+    cut = window.cut(level_map.level)
     tops = {int(level): rectangles((cut == level).astype(np.uint8)) for level in np.unique(cut)}
     count = sum(len(found) for found in tops.values())
     if count > most_boxes:
@@ -95,11 +95,10 @@ def _tops(level_map: NDArray[np.uint8], window: Window, most_boxes: int) -> dict
     return tops
 
 
-def patch_body(
-    level_map: NDArray[np.integer], levels: Levels, grid: Grid, window: Window, base_m: float = _BASE_M
-) -> Body:
+def patch_body(level_map: LevelMap, window: Window, base_m: float = _BASE_M) -> Body:
     """Return volume and centre of all the boxes that `patch_step` writes."""
-    heights_m = levels.heights_m()[window.cut(require_map(level_map, levels, grid))] + base_m
+    levels, grid = level_map.levels, level_map.grid
+    heights_m = levels.heights_m()[window.cut(level_map.level)] + base_m
     x_m, y_m = ((edges[1:] + edges[:-1]) / 2 for edges in window.edges_m(grid))
     total = math.fsum(heights_m.ravel())
     bottom_m = -float(levels.heights_m().max()) - base_m
@@ -112,21 +111,13 @@ def patch_body(
 
 
 def patch_step(
-    path: str | Path,
-    level_map: NDArray[np.integer],
-    levels: Levels,
-    grid: Grid,
-    window: Window,
-    base_m: float = _BASE_M,
-    most_boxes: int = _MOST_BOXES,
+    path: str | Path, level_map: LevelMap, window: Window, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
 ) -> None:
     """Write a window of a map as STEP. The part is named PATCH and lies where the window does.
 
     Args:
         path: the file.
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
+        level_map: the DOE.
         window: the pixels to write.
         base_m: glass below the deepest floor, metres.
         most_boxes: refuse windows that need more; at most 20000, which make a file of about 140 MB.
@@ -134,16 +125,16 @@ def patch_step(
     Raises:
         InputError: too many boxes, a window off the map, or a file that cannot be written.
     """
-    checked = require_map(level_map, levels, grid)
-    window.require(grid)
+    window.require(level_map.grid)
     if not 0 < base_m < math.inf:
         raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")
     if not 1 <= most_boxes <= _NO_MORE_BOXES:
         rule = f"a STEP patch may be allowed 1 to {_NO_MORE_BOXES} boxes"
         raise InputError("patch", rule, most_boxes, "Write a mesh (3MF, STL) of a larger window.")
-    tops = _tops(checked, window, most_boxes)
-    x_m, y_m = window.edges_m(grid)
-    z_m = levels.heights_m() - levels.heights_m().max()
+    tops = _tops(level_map, window, most_boxes)
+    x_m, y_m = window.edges_m(level_map.grid)
+    heights_m = level_map.levels.heights_m()
+    z_m = heights_m - heights_m.max()
     bottom = float(z_m.min()) - base_m
     corners = (
         (float(x_m[x0]), float(y_m[y0]), bottom, float(x_m[x1]), float(y_m[y1]), float(z_m[level]))

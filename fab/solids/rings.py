@@ -11,12 +11,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fab.grid import Grid
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.solids.substrate import Rings
 from fab.units import NM
 
-__all__ = ["pixel_share", "ring_levels", "rings_of"]
+__all__ = ["pixel_share", "ring_levels", "rings_from_levels"]
 
 # A narrower rest of a ring at the aperture belongs to the ring before it.
 _REST_M = 1 * NM
@@ -56,32 +55,26 @@ def _ring_levels(level_map, inside, out):  # pragma: no cover - compiled
     return True
 
 
-def ring_levels(
-    level_map: NDArray[np.uint8], levels: Levels, grid: Grid, aperture_m: float
-) -> NDArray[np.uint8] | None:
+def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
     """Return the rings that a map is the raster of.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-        grid: the raster of the map.
-        aperture_m: diameter of the clear aperture, metres; pixels outside are not looked at.
 
     Returns:
         The level of every ring from the axis to the edge of the aperture, ``(n,)``; or None if the map is no raster of
         rings. Rings in which no pixel's centre lies are not etched.
     """
+    grid, aperture_m = level_map.grid, level_map.aperture_m
     count = max(1, math.ceil((aperture_m / 2 - _REST_M) / grid.pitch_m))
     found = np.full(count, -1, dtype=np.int16)
-    if not _ring_levels(level_map, grid.inside_circle(aperture_m), found):
+    if not _ring_levels(level_map.level, grid.inside_circle(aperture_m), found):
         return None
-    return np.where(found < 0, levels.count - 1, found).astype(np.uint8)
+    return np.where(found < 0, level_map.levels.count - 1, found).astype(np.uint8)
 
 
-def rings_of(ring_level: NDArray[np.uint8], levels: Levels, grid: Grid, aperture_m: float) -> Rings:
-    """Return the rings as they are turned: one pixel wide each, the last one as far as the clear aperture."""
-    outer_m = np.arange(1, len(ring_level) + 1) * np.float64(grid.pitch_m)
-    outer_m[-1] = aperture_m / 2
+def rings_from_levels(ring_level: NDArray[np.uint8], level_map: LevelMap) -> Rings:
+    """Return the rings of a map as they are turned: one pixel wide each, the last one as far as the clear aperture."""
+    levels = level_map.levels
+    outer_m = np.arange(1, len(ring_level) + 1) * np.float64(level_map.grid.pitch_m)
+    outer_m[-1] = level_map.aperture_m / 2
     order, heights_m = levels.by_height()
     # STEP cannot tell levels apart that some sets of etch depths bring to almost one height.
     apart = np.diff(heights_m, append=np.inf) > _CLOSEST_M
@@ -90,11 +83,12 @@ def rings_of(ring_level: NDArray[np.uint8], levels: Levels, grid: Grid, aperture
     return Rings(outer_m, told_m[ring_level], levels.total_m)
 
 
-def pixel_share(level_map: NDArray[np.uint8], ring_level: NDArray[np.uint8], grid: Grid, aperture_m: float) -> float:
+def pixel_share(level_map: LevelMap, ring_level: NDArray[np.uint8]) -> float:
     """Return the share of the clear aperture in which the pixels of a map have another level than its rings.
 
     It is counted at a million points that cover the aperture evenly, so it is right to about 0.1 %.
     """
+    grid, aperture_m = level_map.grid, level_map.aperture_m
     number = np.arange(_SAMPLES)
     radius_m = aperture_m / 2 * np.sqrt((number + 0.5) / _SAMPLES)
     x_m, y_m = radius_m * np.cos(number * _GOLDEN_RAD), radius_m * np.sin(number * _GOLDEN_RAD)
@@ -103,4 +97,4 @@ def pixel_share(level_map: NDArray[np.uint8], ring_level: NDArray[np.uint8], gri
         np.clip(np.floor(v / grid.pitch_m + n / 2).astype(np.int64), 0, n - 1) for v, n in ((y_m, ny), (x_m, nx))
     )
     ring = np.minimum((radius_m / grid.pitch_m).astype(np.int64), len(ring_level) - 1)
-    return float(np.mean(level_map[row, column] != ring_level[ring]))
+    return float(np.mean(level_map.level[row, column] != ring_level[ring]))

@@ -17,19 +17,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fab.grid import Grid
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
-from fab.levels import Levels
+from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
 from fab.solids.columns import Columns, Window, reduced_cells
 from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_sag
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import write_3mf, write_glb, write_stl
 from fab.solids.patch import Patch, patch_body, patch_step
-from fab.solids.rings import pixel_share, ring_levels, rings_of
+from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
 from fab.solids.step import Body
 from fab.solids.substrate import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
 from fab.units import MM, format_length
@@ -48,10 +46,7 @@ class PlateModel(NamedTuple):
     """What all models show.
 
     Attributes:
-        level_map: level numbers ``[y, x]``, blank outside the clear aperture.
-        levels: the staircase.
-        grid: the raster.
-        aperture_m: diameter of the clear aperture, metres.
+        level_map: the DOE.
         chrome: how the chrome is drawn.
         wafer: the glass.
         die_m: edge of the die, metres.
@@ -59,10 +54,7 @@ class PlateModel(NamedTuple):
         patch: the window that is wanted at full resolution, if any.
     """
 
-    level_map: NDArray[np.uint8]
-    levels: Levels
-    grid: Grid
-    aperture_m: float
+    level_map: LevelMap
     chrome: Chrome
     wafer: Wafer
     die_m: float
@@ -70,58 +62,57 @@ class PlateModel(NamedTuple):
     patch: Patch | None = None
 
 
-def write_models(folder: Path, stem: str, relief: PlateModel) -> list[ModelEntry]:
-    """Write all models of a relief.
+def write_models(folder: Path, stem: str, shown: PlateModel) -> list[ModelEntry]:
+    """Write all models of a DOE.
 
     Args:
         folder: an order in the making.
         stem: what the names begin with.
-        relief: what they show.
+        shown: what they show.
 
     Returns:
         one entry per file; a file that a small map cannot have (grid sag of fewer than 5 points) is left out.
     """
-    level_map, levels, grid = relief.level_map, relief.levels, relief.grid
-    cells = reduced_cells(level_map, levels, grid, MESH_CELLS)
+    cells = reduced_cells(shown.level_map, MESH_CELLS)
     about = f"relief on {format_length(_BASE_M)} of glass, mean height of {cells.block} x {cells.block} pixels"
     return [
-        _write_plate(folder, f"{stem}_PLATE.step", relief),
-        _write_wafer(folder, f"{stem}_WAFER.step", relief),
+        _write_plate(folder, f"{stem}_PLATE.step", shown),
+        _write_wafer(folder, f"{stem}_WAFER.step", shown),
         *_write_meshes(folder, f"{stem}_RELIEF", cells, about),
-        *(_write_patch(folder, f"{stem}_PATCH", relief, relief.patch) if relief.patch else ()),
-        *_write_heights(folder, stem, level_map, levels, grid),
+        *(_write_patch(folder, f"{stem}_PATCH", shown, shown.patch) if shown.patch else ()),
+        *_write_heights(folder, stem, shown.level_map),
     ]
 
 
-def _write_plate(folder: Path, file: str, relief: PlateModel) -> ModelEntry:
+def _write_plate(folder: Path, file: str, shown: PlateModel) -> ModelEntry:
     """Write one die, with its rings if the map is radial."""
-    level_map, levels, grid, aperture_m = relief.level_map, relief.levels, relief.grid, relief.aperture_m
-    glass = Substrate("die", relief.die_m, relief.wafer.thickness_m)
-    chrome = ChromeRing(*relief.chrome.radii_m(grid, aperture_m))
-    levels_of_rings, rings = ring_levels(level_map, levels, grid, aperture_m), None
+    level_map = shown.level_map
+    glass = Substrate("die", shown.die_m, shown.wafer.thickness_m)
+    chrome = ChromeRing(*shown.chrome.radii_m(level_map))
+    levels_of_rings, rings = ring_levels(level_map), None
     about = "millimetres; one die, relief plane at z = 0, where the clear aperture is drawn flat"
     if levels_of_rings is not None:
-        rings = rings_of(levels_of_rings, levels, grid, aperture_m)
-        share = 100 * pixel_share(level_map, levels_of_rings, grid, aperture_m)
+        rings = rings_from_levels(levels_of_rings, level_map)
+        share = 100 * pixel_share(level_map, levels_of_rings)
         about = (
             f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
             f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
         )
-    substrate_step(folder / file, glass, aperture_m, chrome, rings)
+    substrate_step(folder / file, glass, level_map.aperture_m, chrome, rings)
     return _solid(file, about, substrate_bodies(glass, chrome, rings))
 
 
-def _write_wafer(folder: Path, file: str, relief: PlateModel) -> ModelEntry:
+def _write_wafer(folder: Path, file: str, shown: PlateModel) -> ModelEntry:
     """Write the wafer, with a flat unless the dies need its place."""
-    wafer = relief.wafer
-    chrome = ChromeRing(*relief.chrome.radii_m(relief.grid, relief.aperture_m))
+    wafer = shown.wafer
+    chrome = ChromeRing(*shown.chrome.radii_m(shown.level_map))
     glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m, wafer.usual_flat_m)
     told = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"
-    if not glass.flat_m or not all(glass.holds(x, y, chrome.outer_m) for x, y in relief.dies):
+    if not glass.flat_m or not all(glass.holds(x, y, chrome.outer_m) for x, y in shown.dies):
         glass, told = Substrate("wafer", wafer.diameter_m, wafer.thickness_m), "no flat"
-    wafer_step(folder / file, glass, relief.aperture_m, chrome, relief.dies)
-    about = f"millimetres; the wafer before it is diced, {told}; chrome of {len(relief.dies)} dies, no relief"
-    return _solid(file, about, wafer_bodies(glass, chrome, relief.dies))
+    wafer_step(folder / file, glass, shown.level_map.aperture_m, chrome, shown.dies)
+    about = f"millimetres; the wafer before it is diced, {told}; chrome of {len(shown.dies)} dies, no relief"
+    return _solid(file, about, wafer_bodies(glass, chrome, shown.dies))
 
 
 def _write_meshes(
@@ -147,10 +138,10 @@ def _write_meshes(
     return entries
 
 
-def _write_patch(folder: Path, name: str, relief: PlateModel, patch: Patch) -> list[ModelEntry]:
+def _write_patch(folder: Path, name: str, shown: PlateModel, patch: Patch) -> list[ModelEntry]:
     """Write a window at full resolution."""
-    level_map, levels, grid = relief.level_map, relief.levels, relief.grid
-    patch.require(level_map, levels, grid)
+    level_map, grid = shown.level_map, shown.level_map.grid
+    patch.require(level_map)
     window = patch.window(grid)
     middle = ", ".join(format_length(value) for value in window.centre_m(grid))
     about = (
@@ -160,29 +151,28 @@ def _write_patch(folder: Path, name: str, relief: PlateModel, patch: Patch) -> l
     entries = []
     if patch.step:
         file = f"{name}.step"
-        patch_step(folder / file, level_map, levels, grid, window, _BASE_M)
-        body = patch_body(level_map, levels, grid, window, _BASE_M)
+        patch_step(folder / file, level_map, window, _BASE_M)
+        body = patch_body(level_map, window, _BASE_M)
         entries.append(_solid(file, f"millimetres; boxes side by side, {about}", {"PATCH": body}, window))
-    return [*entries, *_write_meshes(folder, name, patch.cells(level_map, levels, grid), about, window)]
+    return [*entries, *_write_meshes(folder, name, patch.cells(level_map), about, window)]
 
 
-def _write_heights(
-    folder: Path, stem: str, level_map: NDArray[np.uint8], levels: Levels, grid: Grid
-) -> list[ModelEntry]:
+def _write_heights(folder: Path, stem: str, level_map: LevelMap) -> list[ModelEntry]:
     """Write the height maps."""
     tif, npy, grey, sag = (f"{stem}_{end}" for end in ("HEIGHT.tif", "HEIGHT.npy", "GREY.png", "SAG.DAT"))
-    per_count = write_tiff(folder / tif, level_map, levels, grid)
+    per_count = write_tiff(folder / tif, level_map)
     about = "height above the deepest floor, first row at the highest y"
     entries = [_entry(tif, about, metres_per_count=per_count)]
-    write_npy(folder / npy, level_map, levels)
+    write_npy(folder / npy, level_map)
     entries.append(_entry(npy, "height above the deepest floor, row 0 at the lowest y", metres_per_count=1.0))
-    per_count = write_greymap(folder / grey, level_map, levels, grid)
+    per_count = write_greymap(folder / grey, level_map)
     about = "white is the blank surface, first row at the highest y"
     entries.append(_entry(grey, about, metres_per_count=per_count))
+    grid = level_map.grid
     rows, columns = (min(n, _SAG_CELLS) for n in grid.shape)
     if min(rows, columns) >= 5:
         window = Window((grid.shape[0] - rows) // 2, (grid.shape[1] - columns) // 2, rows, columns)
-        write_zemax_sag(folder / sag, level_map, levels, grid, window)
+        write_zemax_sag(folder / sag, level_map, window)
         about = f"sag from the blank surface, the middle {rows} x {columns} pixels, seen as an exit face"
         entries.append(_entry(sag, about, window, metres_per_count=MM))
     return entries

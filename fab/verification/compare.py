@@ -15,6 +15,7 @@ from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
 from fab.layout.polygons import doubled_area, paint
+from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry, shapes_digest
 from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
 from fab.units import MM, NM, UM
@@ -30,11 +31,13 @@ class Expected:
 
     Attributes:
         manifest: the manifest of the order.
+        level_map: the DOE that they draw.
         planes: ``[bit, y, x]`` the pixels each etch mask should open.
         edges: where the pixel edges fall in the drawing.
     """
 
     manifest: Manifest
+    level_map: LevelMap
     planes: NDArray[np.uint8]
     edges: PixelEdges
 

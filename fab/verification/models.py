@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
-from fab.levels import height_of
-from fab.manifest.records import Manifest, ModelEntry
+from fab.grid import Grid
+from fab.level_map import LevelMap
+from fab.manifest.records import ModelEntry
 from fab.solids.columns import Columns, Window, reduced_cells, whole, window_cells
 from fab.solids.mesh import Mesh
 from fab.solids.meshfile import read_mesh
@@ -26,14 +27,13 @@ __all__ = ["model_problems"]
 _SINGLE = 2.0**-23
 
 
-def model_problems(folder: Path, entry: ModelEntry, manifest: Manifest, level_map: NDArray[np.uint8]) -> list[str]:
-    """Read a model back and compare it with what the manifest says and with the level map.
+def model_problems(folder: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
+    """Read a model back and compare it with what the manifest says of it and with the level map.
 
     Args:
         folder: the order.
         entry: the model; its bytes are known to be those of the manifest.
-        manifest: the manifest.
-        level_map: the level map of the order.
+        level_map: the DOE of the order.
 
     Returns:
         One sentence per difference.
@@ -43,8 +43,8 @@ def model_problems(folder: Path, entry: ModelEntry, manifest: Manifest, level_ma
         if path.suffix == ".step":
             return _step_problems(path, entry)
         if entry.volumes_mm3:
-            return _mesh_problems(path, entry, _cells(manifest, level_map, window))
-        return _height_problems(path, entry, manifest, level_map, window)
+            return _mesh_problems(path, entry, _cells(level_map, window))
+        return _height_problems(path, entry, level_map, window)
     except (InputError, CheckFailed) as error:
         return [str(error)]
 
@@ -77,11 +77,8 @@ def _volume_problems(entry: ModelEntry, found_mm3: dict[str, float]) -> list[str
     return problems
 
 
-def _cells(manifest: Manifest, level_map: NDArray[np.uint8], window: Window | None) -> Columns:
-    levels, grid = manifest.staircase(), manifest.grid()
-    if window is None:
-        return reduced_cells(level_map, levels, grid, MESH_CELLS)
-    return window_cells(level_map, levels, grid, window)
+def _cells(level_map: LevelMap, window: Window | None) -> Columns:
+    return reduced_cells(level_map, MESH_CELLS) if window is None else window_cells(level_map, window)
 
 
 def _mesh_problems(path: Path, entry: ModelEntry, cells: Columns) -> list[str]:
@@ -120,20 +117,18 @@ def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
     return problems + ([f"{stray} triangles face up outside the map"] if stray else [])
 
 
-def _height_problems(
-    path: Path, entry: ModelEntry, manifest: Manifest, level_map: NDArray[np.uint8], window: Window | None
-) -> list[str]:
-    levels, grid = manifest.staircase(), manifest.grid()
+def _height_problems(path: Path, entry: ModelEntry, level_map: LevelMap, window: Window | None) -> list[str]:
+    levels, grid = level_map.levels, level_map.grid
     try:
         found = _HEIGHTS[path.suffix](path, entry.metres_per_count or 1.0)
     # Each library raises what it likes on a damaged file.
     except Exception as error:
         return [f"it cannot be read: {error}"]
-    wanted = height_of((window or whole(grid)).cut(level_map), levels)
+    wanted = levels.heights_m()[(window or whole(grid)).cut(level_map.level)]
     problems = []
     if path.suffix == ".DAT":
         wanted = wanted - levels.total_m
-        problems = _header_problems(path, manifest, window or whole(grid))
+        problems = _header_problems(path, grid, window or whole(grid))
     if found.shape != wanted.shape:
         return [*problems, f"{found.shape} heights instead of {wanted.shape}"]
     # Grey values are rounded to half a count; text and floating point to far less.
@@ -142,9 +137,8 @@ def _height_problems(
     return [*problems, f"{wrong} heights differ from the level map"] if wrong else problems
 
 
-def _header_problems(path: Path, manifest: Manifest, window: Window) -> list[str]:
+def _header_problems(path: Path, grid: Grid, window: Window) -> list[str]:
     """Compare the unit, the pitch and the place of a grid sag."""
-    grid = manifest.grid()
     with open(path) as lines:
         *_, pitch_x, pitch_y, unit, x, y = lines.readline().split()
     found = [float(pitch_x), float(pitch_y), float(x), float(y)]

@@ -17,7 +17,7 @@ from fab.files import canonical_json
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, require_name
 from fab.layout.polygons import MAX_VERTICES, doubled_area, smallest_runs
 from fab.manifest.cells import geometry
-from fab.manifest.records import FileEntry, Manifest
+from fab.manifest.records import FileEntry
 from fab.rules.check import Rules, check
 from fab.units import MM, UM, format_length
 from fab.verification.compare import Expected
@@ -165,29 +165,18 @@ def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> li
     return problems
 
 
-def number_problems(
-    manifest: Manifest, planes: NDArray[np.uint8], level_map: NDArray[np.uint8]
-) -> dict[str, list[str]]:
-    """Take the numbers of the order form again from the level map.
-
-    Args:
-        manifest: states them.
-        planes: ``[bit, y, x]`` the pixels each etch mask opens.
-        level_map: level numbers ``[y, x]``.
-
-    Returns:
-        One sentence per difference, by the file that it concerns.
-    """
-    grid, levels = manifest.grid(), manifest.staircase()
+def number_problems(expected: Expected) -> dict[str, list[str]]:
+    """Take the numbers of the order form again from the level map: one sentence per difference, by file."""
+    manifest, pitch_m = expected.manifest, expected.level_map.grid.pitch_m
     problems: dict[str, list[str]] = {}
     for mask in manifest.masks:
-        found = [None if n is None else round(n * grid.pitch_m / UM, 6) for n in smallest_runs(planes[mask.bit])]
+        found = [None if n is None else round(n * pitch_m / UM, 6) for n in smallest_runs(expected.planes[mask.bit])]
         stated = [mask.smallest_width_um, mask.smallest_space_um]
         if found != stated:
             told = f"narrowest line and space are {found} um and not {stated} um as the manifest says"
             problems.setdefault(mask.file, []).append(told)
     try:
-        report = check(level_map, levels, grid, manifest.aperture_m, Rules(**manifest.rules.get("rules", {})))
+        report = check(expected.level_map, Rules(**manifest.rules.get("rules", {})))
     except (TypeError, InputError) as error:
         return {**problems, "manifest.json": [f"the rules cannot be read: {error}"]}
     if canonical_json(report.as_record()) != canonical_json(manifest.rules):

@@ -31,14 +31,14 @@ from fab.gds.writer import oasis_to_gds
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Layer, PixelEdges, layer_from, pixel_edges
 from fab.layout.polygons import paint
+from fab.level_map import level_digest
 from fab.levels import Levels
-from fab.manifest.records import FileEntry, Manifest, map_digest, plane_digest, read_manifest
-from fab.masks import planes
+from fab.manifest.records import FileEntry, Manifest, plane_digest, read_manifest
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
 from fab.verification.models import model_problems
 from fab.verification.shop_checks import drawing_problems, number_problems
 
-__all__ = ["Check", "VerificationReport", "read_level_map", "verify_order"]
+__all__ = ["Check", "VerificationReport", "read_drawn_levels", "verify_order"]
 
 _GDS, _OASIS = "GDSII", "OASIS"
 
@@ -112,8 +112,8 @@ def _check_nothing_else(folder: Path, manifest: Manifest) -> list[Check]:
     ]
 
 
-def _stored_map(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
-    """Return the stored level map if it can be one of this order, whatever its digest."""
+def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
+    """Return the stored level numbers if they can be those of this order, whatever their digest."""
     try:
         stored = read_npy(folder / manifest.level_map_file)
     except InputError:
@@ -122,10 +122,10 @@ def _stored_map(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
     return stored if fits and stored.max() < manifest.levels else None
 
 
-def read_level_map(
+def read_drawn_levels(
     path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
 ) -> NDArray[np.uint8]:
-    """Rebuild the level map that a combined GDSII file draws, with this package's own reader.
+    """Rebuild the level numbers that a combined GDSII file draws, with this package's own reader.
 
     Args:
         path: the combined file, bit k on layer k + 1.
@@ -160,22 +160,22 @@ def read_level_map(
 
 
 def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdges) -> tuple[NDArray[np.uint8], Check]:
-    """Return the map to compare with, and whether the stored one is that of the manifest.
+    """Return the level numbers to compare with, and whether the stored one is that of the manifest.
 
     A damaged copy of the level map must not put the blame on the masks: if the stored one is not that of the
     manifest but the one drawn in the combined file is, that one is taken.
     """
-    stored = _stored_map(folder, manifest)
+    stored = _stored_levels(folder, manifest)
     question = "the level map as in the manifest"
-    if stored is not None and map_digest(stored) == manifest.level_map_sha256:
+    if stored is not None and level_digest(stored) == manifest.level_map_sha256:
         return stored, Check(manifest.level_map_file, question, ())
     failed = Check(manifest.level_map_file, question, ("the level map is unreadable or its digest differs",))
     try:
         moves = manifest.edge_moves()
-        drawn = read_level_map(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
+        drawn = read_drawn_levels(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
     except InputError:
         drawn = None
-    if drawn is not None and map_digest(drawn) == manifest.level_map_sha256:
+    if drawn is not None and level_digest(drawn) == manifest.level_map_sha256:
         return drawn, failed
     if stored is not None:
         return stored, failed
@@ -190,8 +190,8 @@ def _check_plane_digests(expected: Expected) -> list[Check]:
     ]
 
 
-def _check_numbers(expected: Expected, reference: NDArray[np.uint8]) -> list[Check]:
-    found = number_problems(expected.manifest, expected.planes, reference)
+def _check_numbers(expected: Expected) -> list[Check]:
+    found = number_problems(expected)
     return [Check(file, "numbers of the order form", tuple(problems)) for file, problems in found.items()]
 
 
@@ -272,15 +272,16 @@ def verify_order(folder: str | Path) -> VerificationReport:
         byte_checks = {entry.file: _check_bytes(folder, entry) for entry in manifest.files}
         checks = [*byte_checks.values(), *_check_nothing_else(folder, manifest)]
         reference, map_check = _reference(folder, manifest, levels, edges)
-        expected = Expected(manifest, planes(reference, levels), edges)
-        checks += [map_check, *_check_plane_digests(expected), *_check_numbers(expected, reference)]
+        level_map = manifest.level_map(reference)
+        expected = Expected(manifest, level_map, level_map.planes(), edges)
+        checks += [map_check, *_check_plane_digests(expected), *_check_numbers(expected)]
         for entry in manifest.files:
             if entry.format in (_GDS, _OASIS):
                 checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)
         for model in manifest.models:
             # Libraries of solids and pictures are given whole files only.
             if byte_checks[model.file].passed:
-                problems = model_problems(folder, model, manifest, reference)
+                problems = model_problems(folder, model, level_map)
                 checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
     except OSError as error:
         raise explain_os_error(error, folder) from error

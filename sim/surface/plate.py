@@ -56,7 +56,7 @@ def as_fabricated(
     """Predict the plate that the masks of a level map and a process with given errors make.
 
     Args:
-        level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.masks.unetched_outside`).
+        level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.level_map.LevelMap.level`).
         camera: DOE grid, clear aperture and material; the sensor says how oblique the light is that matters.
         process: depths of the etches and where on the wafer the DOE lies.
         variation: the errors; `Variation()` gives the nominal plate bit for bit.

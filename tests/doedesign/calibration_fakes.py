@@ -16,8 +16,8 @@ from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.unknowns import unknowns_of
 from doedesign.prediction import Drawn
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.masks import unetched_outside
 from fab.process import Normal, Process, error_names
 from sim.camera import Camera, Colour
 from sim.psf_bank import PsfBank
@@ -42,7 +42,7 @@ def plate_drawn(cells: int = 200, count: int = 16, relief: float = 1.0, window: 
     level = np.floor(relief * (waves % 1) * count).astype(np.uint8) + np.uint8((1 - relief) * (count - 1))
     grid = Grid((cells, cells), PITCH_M)
     aperture = cells * PITCH_M
-    blank = unetched_outside(np.minimum(level, count - 1).astype(np.uint8), levels, grid, aperture)
+    blank = LevelMap(np.minimum(level, count - 1).astype(np.uint8), levels, grid, aperture).level
     colour = Colour("550nm", (550e-9,), (1.0,))
     focal = 1.1e-3 * cells / 320 * 1.6
     camera = Camera(grid, aperture - 10e-6, "fused_silica", (colour,), focal, PIXEL_M, window)

@@ -17,6 +17,7 @@ from doedesign.runs.folder import open_run
 from doedesign.spec import load_variation
 from fab.errors import InputError
 from fab.layout.structures import PAD_SIDES_UM
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Normal, Process, Variation
 from fab.runsheet.as_built import AsBuilt, ChromeMeasured, MaskMeasured
@@ -127,7 +128,8 @@ def drawn(run: Path) -> Drawn:
 
 
 def write_sheet(path: Path, drawn: Drawn, numbers: dict[str, Any], predicted: Any = None) -> Path:
-    data = record(sheet(LEVELS, zero_layer=True, level_map_sha256=drawn.digest(), outlook=outlook()))
+    level_map = LevelMap(drawn.level, drawn.levels, drawn.camera.grid, drawn.camera.aperture_m)
+    data = record(sheet(LEVELS, zero_layer=True, level_map=level_map, outlook=outlook()))
     if predicted is not None:
         data["predicted"] |= predicted
     path.write_text(json.dumps(data | ({"measured": numbers} if numbers else {})))

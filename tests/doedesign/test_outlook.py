@@ -11,8 +11,8 @@ from PIL import Image
 from doedesign.lab.predictions import grating_orders, matters_of, predict_sheet
 from doedesign.prediction import Drawn, predict, process_with_moves
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.masks import unetched_outside
 from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour
@@ -29,7 +29,7 @@ CAMERA = Camera(
 def drawn() -> Drawn:
     y, x = np.indices((64, 64)) - 31.5
     level = (np.mod(np.hypot(y, x) / 8, 1) * 16).astype(np.uint8)
-    level = unetched_outside(level, LEVELS, CAMERA.grid, CAMERA.aperture_m)
+    level = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m).level
     return Drawn("ring", level, LEVELS, CAMERA, (4e-3, 6e-3, 9e-3), (5.0, np.inf))
 
 

@@ -8,8 +8,8 @@ import pytest
 from doedesign.prediction import Drawn, Prediction, plate_rows, predict
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels, height_of
-from fab.masks import unetched_outside
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.metrics import energy_budget, energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m, zeroth_order
@@ -30,7 +30,7 @@ def drawn() -> Drawn:
     """A ring that keeps some light on the axis."""
     y, x = np.indices((CELLS, CELLS)) - (CELLS - 1) / 2
     level = (np.mod(np.hypot(y, x) / 8, 1) * 13).astype(np.uint8)
-    level = unetched_outside(level, LEVELS, CAMERA.grid, CAMERA.aperture_m)
+    level = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m).level
     return Drawn("ring", level, LEVELS, CAMERA, NEAR_M, FAR_M)
 
 

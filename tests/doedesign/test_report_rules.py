@@ -7,6 +7,7 @@ from doedesign.report.rules import draw_rules
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.rules.check import Rules, check
+from tests.fab.maps import level_map_from
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)
@@ -14,9 +15,8 @@ RULES = Rules(2 * UM, 2 * UM)
 
 
 def draw(path, level_map, rules=RULES, levels=SIXTEEN, share=1.0):
-    grid = Grid(level_map.shape, UM)
     aperture = share * min(level_map.shape) * UM
-    draw_rules(path, check(level_map, levels, grid, aperture, rules), level_map, levels, grid, aperture, "a set")
+    draw_rules(path, check(level_map_from(level_map, levels, UM, aperture), rules), "a set")
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
@@ -73,7 +73,7 @@ def test_pixels_are_coded_by_what_is_wrong_with_them():
 
 def test_narrow_pixels_are_those_that_the_check_counts():
     plane = np.random.default_rng(8).integers(0, 2, (40, 50)).astype(np.uint8)
-    report = check(1 - plane, Levels(2, 1e-6), Grid((40, 50), UM), 400 * UM, Rules(3 * UM, 2 * UM)).planes[0]
+    report = check(level_map_from(1 - plane, Levels(2, 1e-6)), Rules(3 * UM, 2 * UM)).planes[0]
     codes = picture._codes(plane, Rules(3 * UM, 2 * UM), UM)
     assert np.any(codes == 2)
     assert np.any(codes == 3)
@@ -89,7 +89,7 @@ def test_the_worst_place_is_inside_the_window_even_at_the_rim():
         level_map = blank((80, 80))
         level_map[y, x] = 14
         grid = Grid((80, 80), UM)
-        found = check(level_map, SIXTEEN, grid, 80 * UM, RULES).planes[0]
+        found = check(level_map_from(level_map, SIXTEEN, UM, 80 * UM), RULES).planes[0]
         row, column, side = picture._window(found, grid)
         assert found.line.narrow == 2
         assert row <= y < row + side <= 80

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.write import write_order
 
@@ -25,14 +26,15 @@ def grid() -> Grid:
 
 
 @pytest.fixture(scope="session")
-def level_map() -> np.ndarray:
-    return np.random.default_rng(7).integers(0, 16, SHAPE).astype(np.uint8)
+def level_map(levels, grid) -> LevelMap:
+    level = np.random.default_rng(7).integers(0, 16, SHAPE).astype(np.uint8)
+    return LevelMap(level, levels, grid, grid.extent_m[1], "small")
 
 
 @pytest.fixture(scope="session")
-def written_order(tmp_path_factory, level_map, levels, grid) -> Path:
+def written_order(tmp_path_factory, level_map) -> Path:
     folder = tmp_path_factory.mktemp("orders") / "small"
-    write_order(folder, level_map, levels, grid, grid.extent_m[1], "small", {"height_map": "a test"})
+    write_order(folder, level_map, source={"height_map": "a test"})
     return folder
 
 

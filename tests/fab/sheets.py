@@ -3,19 +3,30 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
+
+from fab.grid import Grid
 from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import moved, photomasks_of, prefixed
 from fab.layout.structures import process_monitor
 from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Normal, Process, error_names
 from fab.runsheet.tables import Die, Grating, Importance, PhotomaskFile, PredictedMetrics, Predictions, RunSheet
 from fab.units import NM, UM
 
-DIGEST = "0123456789abcdef" * 4
 STEM = "DOE_TEST"
 DBU_M = 1e-9
 LEVELS = Levels(16, 75 * NM)
+
+
+def doe(levels: Levels = LEVELS) -> LevelMap:
+    """A DOE of 4.44 mm."""
+    return LevelMap(np.zeros((24, 24), np.uint8), levels, Grid((24, 24), 185 * UM), 4.44e-3)
+
+
+DIGEST = doe().digest
 
 
 def spreads_of(levels: Levels, **means_and_sigmas: tuple[float, float]) -> dict[str, Normal]:
@@ -55,10 +66,10 @@ def sheet(
         for plate in plates
     }
     wafer = Wafer(chrome=chrome, zero_layer=zero_layer)
-    given = {"level_map_sha256": DIGEST, "aperture_m": 4.44e-3, "opening_m": 4.43e-3, **rest}
+    given = {"level_map": doe(levels), "opening_m": 4.43e-3, **rest}
     dies = (Die("A1", 0.0, 0.0), Die("A2", 10e-3, 0.0, 'edges of <all> masks "+50 nm"'))
     return RunSheet(
-        stem=STEM, levels=levels, plates=plates, files=files, process=process, wafer=wafer, places=places, dies=dies,
+        stem=STEM, plates=plates, files=files, process=process, wafer=wafer, places=places, dies=dies,
         **given,
     )  # fmt: skip
 

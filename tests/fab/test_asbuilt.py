@@ -12,7 +12,7 @@ from fab.errors import InputError
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from fab.runsheet.write import record
 from fab.units import NM, UM
-from tests.fab.sheets import DIGEST, LEVELS, outlook, sheet
+from tests.fab.sheets import doe, outlook, sheet
 
 
 @cache
@@ -35,7 +35,7 @@ def filled(path: Path, changes: Mapping[str, object], **about: object) -> Path:
 
 
 def read(path: Path, changes: Mapping[str, object], **about: object) -> AsBuilt:
-    return read_as_built(filled(path, changes, **about), LEVELS, DIGEST)
+    return read_as_built(filled(path, changes, **about), doe())
 
 
 def test_a_sheet_that_nobody_filled_in_measures_nothing(tmp_path):
@@ -167,4 +167,4 @@ def test_another_file_is_refused(tmp_path, about, words):
 def test_a_file_that_is_no_json_is_refused(tmp_path):
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):
-        read_as_built(tmp_path / "x.json", LEVELS, DIGEST)
+        read_as_built(tmp_path / "x.json", doe())

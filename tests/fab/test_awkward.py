@@ -11,10 +11,10 @@ from fab.grid import Grid
 from fab.layout.geometry import Chrome, pixel_edges
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.masks import planes, unetched_outside
 from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verification.verify import read_level_map
+from fab.verification.verify import read_drawn_levels
+from tests.fab.maps import wide_map
 
 BLANK = 15
 
@@ -71,14 +71,14 @@ def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_p
     monkeypatch.setattr("fab.order.write.preview_png", lambda *_: b"picture")
     levels, grid = Levels(count, 1200 * NM / count), Grid(level_map.shape, 2 * UM)
     # A circle wide enough for every pixel is wider than the raster; the aperture may not be, so corners are blank.
-    aperture_m, folder = min(grid.extent_m), tmp_path / "o"
-    report = write_order(folder, level_map, levels, grid, aperture_m, "odd", {}, chrome=Chrome(0.5 * UM))
-    assert report.passed
-    manifest, drawn = read_manifest(folder), unetched_outside(level_map, levels, grid, aperture_m)
+    folder = tmp_path / "o"
+    given = wide_map(level_map, levels, grid, "odd")
+    assert write_order(folder, given, chrome=Chrome(0.5 * UM)).report.passed
+    manifest = read_manifest(folder)
     edges = pixel_edges(grid)
     combined = folder / manifest.combined_gds
-    assert np.array_equal(read_level_map(combined, levels, edges, manifest.doe_cell), drawn)
-    for mask, plane in zip(manifest.masks, planes(drawn, levels), strict=True):
+    assert np.array_equal(read_drawn_levels(combined, levels, edges, manifest.doe_cell), given.level)
+    for mask, plane in zip(manifest.masks, given.planes(), strict=True):
         assert np.array_equal(by_klayout(folder / mask.file, manifest.doe_cell, mask.layer, grid), plane)
         assert np.array_equal(by_klayout(folder / manifest.combined_oasis, manifest.doe_cell, mask.layer, grid), plane)
         assert np.array_equal(by_gdstk(folder / mask.file, manifest.doe_cell, mask.layer, grid), plane)

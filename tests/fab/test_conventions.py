@@ -14,6 +14,7 @@ from fab.layout.geometry import Chrome
 from fab.levels import Levels, height_of, quantise
 from fab.masks import planes
 from fab.order.write import write_order
+from tests.fab.maps import wide_map
 
 LEVELS = Levels(16, 75e-9)
 GRID = Grid((4, 4), 2e-6)
@@ -21,7 +22,7 @@ GRID = Grid((4, 4), 2e-6)
 
 def drawn(tmp_path, level_map):
     """Return the polygons of each layer in micrometres, as another library reads them."""
-    write_gds(tmp_path / "a.gds", mask_layout(level_map, LEVELS, GRID, 8e-6, "DOE", Chrome(overlap_m=1e-6)))
+    write_gds(tmp_path / "a.gds", mask_layout(wide_map(level_map, LEVELS, GRID), "DOE", Chrome(overlap_m=1e-6)))
     found = {}
     cells: list[Any] = gdstk.read_gds(str(tmp_path / "a.gds")).cells
     for polygon in cells[0].polygons:
@@ -78,7 +79,7 @@ def test_the_depths_of_all_open_masks_make_the_height():
 
 
 def test_oasis_draws_the_same_way_up(tmp_path):
-    write_order(tmp_path / "o", one_pixel(3, 1, 14), LEVELS, GRID, 8e-6, "up", {}, chrome=Chrome(overlap_m=1e-6))
+    write_order(tmp_path / "o", wide_map(one_pixel(3, 1, 14), LEVELS, GRID, "up"), chrome=Chrome(overlap_m=1e-6))
     layout = kdb.Layout()
     layout.read(str(tmp_path / "o" / "DOE_UP_ALL.oas"))
     box = layout.cell("DOE_UP_DOE").bbox(layout.find_layer(1, 0))

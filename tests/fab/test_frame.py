@@ -6,14 +6,17 @@ import pytest
 
 from fab.errors import InputError
 from fab.gds.writer import write_gds
+from fab.grid import Grid
 from fab.layout.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
 from fab.layout.geometry import Cell, Layer, Layout, Shapes
 from fab.layout.part import photomasks_of
 from fab.layout.split import splits_of
 from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
 from fab.levels import Levels
 
 LEVELS = Levels(16, 75e-9)
+MAP = LevelMap(np.zeros((2400, 2400), np.uint8), LEVELS, Grid((2400, 2400), 1.85e-6), 4.44e-3)
 DOE = Cell("A_DOE", {Layer(1): Shapes(np.array([[-1000, -1000, 1000, 1000]], np.int32))})
 
 
@@ -23,14 +26,11 @@ def framed(wafer=None, chrome_m=7.4e-3, order=(0, 1, 2, 3)):
     return draw_frame(
         wafer,
         plates,
-        LEVELS,
+        MAP,
         splits=splits_of(wafer, LEVELS, (0,) * LEVELS.bits, 1e-9),
         stem="A",
-        digest="ab" * 32,
-        pitch_m=1.85e-6,
         minimum_line_m=1e-6,
         chrome_m=chrome_m,
-        aperture_m=4.44e-3,
         dbu_m=1e-9,
     )
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -90,18 +92,18 @@ def test_names_that_mask_shops_refuse_are_refused(name):
 
 
 def test_a_layout_holds_each_plane_on_its_layer_and_the_chrome_last(level_map, levels, grid):
-    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+    layout = mask_layout(level_map, "DOE")
     assert [str(layer) for layer in layout.cells[0].shapes] == ["1/0", "2/0", "3/0", "4/0", "5/0"]
     assert layout.dbu_m == 1e-9
     inside = grid.inside_circle(grid.extent_m[1])
     for bit in range(4):
-        etched = ((15 - level_map) >> bit & 1).astype(bool) & inside
+        etched = ((15 - level_map.level) >> bit & 1).astype(bool) & inside
         # Twice the area of a pixel of 1850 units.
         assert layout.cells[0].shapes[Layer(bit + 1)].doubled_area == 2 * 1850**2 * np.count_nonzero(etched)
 
 
 def test_the_chrome_reaches_inside_the_aperture_and_past_the_corners(level_map, levels, grid):
-    layout = mask_layout(level_map, levels, grid, 25 * UM, "DOE", Chrome(overlap_m=2 * UM))
+    layout = mask_layout(replace(level_map, aperture_m=25 * UM), "DOE", Chrome(overlap_m=2 * UM))
     vertices = np.concatenate(layout.cells[0].shapes[Layer(5)].polygons).astype(float)
     radius_m = np.hypot(*vertices.T) * layout.dbu_m
     assert radius_m.min() == pytest.approx(10.5 * UM, abs=NM)
@@ -122,13 +124,13 @@ def test_the_chrome_reaches_inside_the_aperture_and_past_the_corners(level_map, 
 )
 def test_impossible_chrome_is_refused(level_map, levels, grid, chrome, rule):
     with pytest.raises(InputError, match=rule):
-        mask_layout(level_map, levels, grid, 25 * UM, "DOE", chrome)
+        mask_layout(replace(level_map, aperture_m=25 * UM), "DOE", chrome)
 
 
 def test_an_aperture_wider_than_the_raster_is_refused(level_map, levels, grid):
     for aperture_m in (0.0, 50 * UM):
         with pytest.raises(InputError, match="aperture"):
-            mask_layout(level_map, levels, grid, aperture_m, "DOE")
+            mask_layout(replace(level_map, aperture_m=aperture_m), "DOE")
 
 
 def test_area_and_box_of_shapes():

@@ -17,9 +17,10 @@ from fab.order.preview import preview_png
 from fab.order.write import write_order
 from fab.process import Process
 from fab.rules.check import Rules
-from fab.rules.repair import repaired
+from fab.rules.repair import repair
 from fab.runsheet.recipe import depths_m
 from fab.verification.verify import verify_order
+from tests.fab.maps import level_map_from, wide_map
 
 NM = 1e-9
 STEP_M = 300 * NM
@@ -164,7 +165,8 @@ def test_a_repair_weighs_light_by_heights_not_by_numbers_of_levels():
     for odd in (0, 1):
         level_map = np.full((24, 24), 2, np.uint8)
         level_map[12, 12] = odd
-        fixed, cost = repaired(level_map, levels, Grid((24, 24), 1e-6), 40e-6, Rules(2e-6, 2e-6), rate)
+        done = repair(level_map_from(level_map, levels), Rules(2e-6, 2e-6), rate)
+        fixed, cost = done.level_map.level, done.cost
         costs[odd] = cost
         assert cost.broken_after == 0
         moved_m = height_of(fixed, levels) - height_of(level_map, levels)
@@ -188,8 +190,8 @@ def order(tmp_path_factory):
     levels = Levels(8, 150e-9, (520.3e-9, 160.1e-9, 330e-9))
     folder = tmp_path_factory.mktemp("orders") / "uneven"
     grid = Grid((21, 16), 1.85e-6)
-    report = write_order(folder, level_map, levels, grid, grid.extent_m[1], "uneven", {"height_map": "a test"})
-    return folder, levels, report
+    written = write_order(folder, wide_map(level_map, levels, grid, "uneven"), source={"height_map": "a test"})
+    return folder, levels, written.report
 
 
 def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
@@ -212,9 +214,8 @@ def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
 
 def test_the_picture_of_an_order_takes_heights_from_the_levels():
     level_map = np.arange(64, dtype=np.uint8).reshape(8, 8) % 4
-    grid = Grid((8, 8), 1e-6)
     pictures = {
-        preview_png("x", planes(level_map, levels), level_map, levels, grid, 8e-6, (4e-6, 8e-6))
+        preview_png("x", level_map_from(level_map, levels, 1e-6, 8e-6), (4e-6, 8e-6))
         for levels in (UNEVEN, SWAPPED, Levels(4, STEP_M))
     }
     assert len(pictures) == 3

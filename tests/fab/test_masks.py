@@ -6,8 +6,9 @@ from hypothesis.extra import numpy as hnp
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels, height_of
-from fab.masks import level_map_from_planes, planes, unetched_outside
+from fab.masks import level_map_from_planes, planes
 from fab.units import NM
 
 COUNTS = st.sampled_from([2, 4, 8, 16, 32, 64])
@@ -42,10 +43,12 @@ def test_the_etches_add_up_to_what_is_missing_from_the_blank(level_map):
 
 def test_outside_the_aperture_the_glass_is_left_blank():
     levels, grid = Levels(16, 75 * NM), Grid((6, 8), 1e-6)
-    blank = unetched_outside(np.zeros((6, 8), dtype=np.uint8), levels, grid, 4e-6)
+    made = LevelMap(np.zeros((6, 8), dtype=np.uint8), levels, grid, 4e-6)
+    blank = made.level
     assert np.array_equal(blank == 0, grid.inside_circle(4e-6))
     assert set(np.unique(blank)) == {0, 15}
-    assert not planes(blank, levels)[:, ~grid.inside_circle(4e-6)].any()
+    assert np.array_equal(made.planes(), planes(blank, levels))
+    assert not made.planes()[:, ~grid.inside_circle(4e-6)].any()
 
 
 def test_mismatches_are_refused():
@@ -56,5 +59,3 @@ def test_mismatches_are_refused():
         level_map_from_planes(np.full((4, 2, 2), 2, dtype=np.uint8), levels)
     with pytest.raises(InputError, match="0 to 15"):
         planes(np.full((2, 2), 16), levels)
-    with pytest.raises(InputError, match="grid's shape"):
-        unetched_outside(np.zeros((2, 2), dtype=np.uint8), levels, Grid((2, 3), 1e-6), 2e-6)

@@ -16,6 +16,7 @@ from fab.solids.columns import Window, reduced_cells, whole, window_cells
 from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.meshfile import Unit, read_mesh, write_3mf, write_glb, write_stl
 from fab.units import NM, UM
+from tests.fab.maps import level_map_from
 
 SIXTEEN = Levels(16, 75 * NM)
 PITCH = 1.85 * UM
@@ -36,9 +37,8 @@ AWKWARD = {
 
 
 def cells_of(level_map, levels=SIXTEEN, pitch_m=PITCH):
-    level_map = np.asarray(level_map, dtype=np.uint8)
-    grid = Grid(level_map.shape, pitch_m)
-    return window_cells(level_map, levels, grid, whole(grid))
+    given = level_map_from(level_map, levels, pitch_m)
+    return window_cells(given, whole(given.grid))
 
 
 def random_map(shape, count=16):
@@ -89,13 +89,13 @@ def test_a_large_mesh_is_a_solid_to_manifold3d_and_to_trimesh(count):
 def test_the_mesh_stands_where_the_map_does():
     level_map = np.zeros((4, 6), dtype=np.uint8)
     level_map[3, 1] = 15  # high y, low x
-    grid = Grid(level_map.shape, PITCH)
-    mesh = relief_mesh(window_cells(level_map, SIXTEEN, grid, whole(grid)), UM)
+    level_map = level_map_from(level_map, SIXTEEN, PITCH)
+    mesh = relief_mesh(window_cells(level_map, whole(level_map.grid)), UM)
     top = mesh.vertices_m[mesh.vertices_m[:, 2] == 0]
     assert np.allclose(np.unique(top[:, 0]), [-2 * PITCH, -PITCH], rtol=1e-15)
     assert np.allclose(np.unique(top[:, 1]), [PITCH, 2 * PITCH], rtol=1e-15)
     assert mesh.vertices_m[:, 2].min() == pytest.approx(-1125 * NM - UM, rel=1e-15)
-    part = relief_mesh(window_cells(level_map, SIXTEEN, grid, Window(2, 0, 2, 3)), UM)
+    part = relief_mesh(window_cells(level_map, Window(2, 0, 2, 3)), UM)
     assert np.allclose(part.vertices_m.min(axis=0)[:2], [-3 * PITCH, 0], rtol=1e-15)
     assert part.vertices_m[:, 2].max() == 0
 
@@ -115,7 +115,7 @@ def test_exaggeration_stretches_the_relief_and_not_the_base():
 )
 def test_reduction_keeps_the_volume_and_the_outline(shape, most, block):
     level_map, grid = random_map(shape), Grid(shape, PITCH)
-    cells = reduced_cells(level_map, SIXTEEN, grid, most)
+    cells = reduced_cells(level_map_from(level_map, SIXTEEN, PITCH), most)
     assert cells.block == block
     assert max(cells.height_m.shape) <= most
     want = height_of(level_map, SIXTEEN).sum() * PITCH**2
@@ -129,20 +129,18 @@ def test_reduction_keeps_the_volume_and_the_outline(shape, most, block):
 
 def test_blocks_of_one_mean_make_one_plane_whatever_the_order_of_the_sum():
     # Three steps of 0.1 um add up differently from behind, by the last digit.
-    level_map = np.array([[1, 2, 3, 3, 2, 1]] * 3, dtype=np.uint8)
-    cells = reduced_cells(level_map, Levels(4, 0.1 * UM), Grid(level_map.shape, UM), most=2)
+    cells = reduced_cells(level_map_from([[1, 2, 3, 3, 2, 1]] * 3, Levels(4, 0.1 * UM)), most=2)
     assert cells.height_m[0, 0] == cells.height_m[0, 1]
 
 
 def test_meshes_too_large_for_any_viewer_are_refused():
-    level_map = np.zeros((2001, 2001), dtype=np.uint8)
-    grid = Grid(level_map.shape, UM)
+    level_map = level_map_from(np.zeros((2001, 2001)))
     with pytest.raises(InputError, match="at most 4000000 columns"):
-        window_cells(level_map, SIXTEEN, grid, whole(grid))
+        window_cells(level_map, whole(level_map.grid))
     with pytest.raises(InputError, match="1 to 2000"):
-        reduced_cells(level_map, SIXTEEN, grid, 2001)
+        reduced_cells(level_map, 2001)
     with pytest.raises(InputError, match="lie on"):
-        window_cells(level_map, SIXTEEN, grid, Window(2000, 0, 2, 1))
+        window_cells(level_map, Window(2000, 0, 2, 1))
 
 
 @pytest.mark.parametrize("defect", ["missing", "turned", "inside out", "moved"])

@@ -9,6 +9,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
@@ -18,6 +19,7 @@ from fab.solids.step import step_bodies
 from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
 from fab.verification.verify import verify_order
+from tests.fab.maps import level_map_from
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
 
@@ -34,7 +36,7 @@ def entries(folder):
 
 def test_a_radial_order_has_its_rings_as_exact_circles(tmp_path):
     level_map, profile = radial_map()
-    write_order(tmp_path / "o", level_map, LEVELS, GRID, 59 * UM, "rings", {})
+    write_order(tmp_path / "o", LevelMap(level_map, LEVELS, GRID, 59 * UM, "rings"))
     entry = entries(tmp_path / "o")["PLATE.step"]
     assert "relief of 15 rings as exact circles; the masks draw them in pixels" in entry.content
     manifest = read_manifest(tmp_path / "o")
@@ -77,8 +79,9 @@ def test_the_wafer_of_an_order(written_order):
 )
 def test_wafers_have_the_usual_flat_or_none(tmp_path, diameter_m, dies, words):
     wafer = Wafer(diameter_m, blank_m=diameter_m + 25 * MM)
-    relief = PlateModel(np.zeros((8, 8), np.uint8), LEVELS, Grid((8, 8), UM), 8 * UM, Chrome(UM), wafer, 5 * MM, dies)
-    found = {entry.file: entry for entry in write_models(tmp_path, "A", relief)}
+    level_map = level_map_from(np.zeros((8, 8)), LEVELS, UM, 8 * UM)
+    shown = PlateModel(level_map, Chrome(UM), wafer, 5 * MM, dies)
+    found = {entry.file: entry for entry in write_models(tmp_path, "A", shown)}
     assert words in found["A_WAFER.step"].content
 
 
@@ -86,8 +89,8 @@ def test_wafers_have_the_usual_flat_or_none(tmp_path, diameter_m, dies, words):
 def patched(tmp_path_factory):
     level_map = np.random.default_rng(3).integers(0, 16, (24, 31)).astype(np.uint8)
     folder = tmp_path_factory.mktemp("patched") / "o"
-    grid = Grid((24, 31), 1.85 * UM)
-    write_order(folder, level_map, LEVELS, grid, 44 * UM, "patch", {}, patch=Patch(-9 * UM, 7.4 * UM, 14.8 * UM))
+    level_map = level_map_from(level_map, LEVELS, 1.85 * UM, 44 * UM, "patch")
+    write_order(folder, level_map, patch=Patch(-9 * UM, 7.4 * UM, 14.8 * UM))
     return folder
 
 
@@ -111,28 +114,27 @@ def test_a_patch_of_another_place_is_told(patched):
     from fab.verification.models import model_problems
 
     manifest = read_manifest(patched)
-    level_map = np.load(patched / manifest.level_map_file)
+    level_map = manifest.level_map(np.load(patched / manifest.level_map_file))
     for name, entry in entries(patched).items():
         if not name.startswith("PATCH"):
             continue
-        assert model_problems(patched, entry, manifest, level_map) == []
+        assert model_problems(patched, entry, level_map) == []
         if name == "PATCH.step":
             centre = [value + 1e-6 for value in entry.centres_mm["PATCH"]]
             other, words = replace(entry, centres_mm={"PATCH": centre}), "its centre of mass lies 1 nm aside"
         else:
             other, words = replace(entry, window_px=[12, 8, 8, 8]), "columns have no top of the height"
-        assert any(words in problem for problem in model_problems(patched, other, manifest, level_map))
+        assert any(words in problem for problem in model_problems(patched, other, level_map))
 
 
 def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path):
-    level_map = (np.indices((60, 60)).sum(axis=0) % 2).astype(np.uint8)
-    grid, said = Grid((60, 60), UM), []
+    level_map, said = level_map_from(np.indices((60, 60)).sum(axis=0) % 2, LEVELS, UM, 60 * UM, "p"), []
     for width in (50 * UM, 61 * UM):
         patch = Patch(0.0, 0.0, width)
         with pytest.raises(InputError, match=r"boxes|must .*lie on the 60 x 60 pixels"):
-            write_order(tmp_path / "o", level_map, LEVELS, grid, 60 * UM, "p", {}, patch=patch, say=said.append)
+            write_order(tmp_path / "o", level_map, patch=patch, say=said.append)
     assert said == []
     assert not (tmp_path / "o").exists()
-    write_order(tmp_path / "o", level_map, LEVELS, grid, 60 * UM, "p", {}, patch=Patch(0.0, 0.0, 50 * UM, step=False))
+    write_order(tmp_path / "o", level_map, patch=Patch(0.0, 0.0, 50 * UM, step=False))
     names = {name for name in entries(tmp_path / "o") if name.startswith("PATCH")}
     assert names == {"PATCH.3mf", "PATCH.glb", "PATCH_MM.stl"}

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ from fab.files import sha256_file
 from fab.gds.reader import read_gds
 from fab.grid import Grid
 from fab.layout.geometry import Chrome, Layer, pixel_edges
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.manifest.records import map_digest, read_manifest
-from fab.masks import unetched_outside
+from fab.manifest.records import read_manifest
 from fab.order.order import order_id
 from fab.order.write import write_order
-from fab.verification.verify import read_level_map
+from fab.verification.verify import read_drawn_levels
+from tests.fab.maps import wide_map
 
 NAMES = [
     "DOE_SMALL_ALL.gds",
@@ -54,16 +56,15 @@ def test_every_mask_file_holds_its_own_layer_in_a_cell_of_its_own_name(written_o
 
 
 def test_the_level_map_is_stored_and_drawn(written_order, level_map, levels, grid):
-    blank = unetched_outside(level_map, levels, grid, grid.extent_m[1])
+    blank = level_map.level
     assert np.array_equal(np.load(written_order / "DOE_SMALL_LEVELS.npy"), blank)
-    drawn = read_level_map(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid), "DOE_SMALL_DOE")
+    drawn = read_drawn_levels(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid), "DOE_SMALL_DOE")
     assert np.array_equal(drawn, blank)
-    assert read_manifest(written_order).level_map_sha256 == map_digest(blank)
+    assert read_manifest(written_order).level_map_sha256 == level_map.digest
 
 
-def test_the_manifest_tells_what_each_mask_is(written_order, level_map, levels, grid):
+def test_the_manifest_tells_what_each_mask_is(written_order, level_map):
     manifest = read_manifest(written_order)
-    blank = unetched_outside(level_map, levels, grid, grid.extent_m[1])
     assert [(m.mask, m.bit, m.layer, m.datatype, m.depth_nm) for m in manifest.masks] == [
         (1, 0, 1, 0, 75.0),
         (2, 1, 2, 0, 150.0),
@@ -72,7 +73,7 @@ def test_the_manifest_tells_what_each_mask_is(written_order, level_map, levels, 
     ]
     assert all("etched here" in mask.polygon_means for mask in manifest.masks)
     for mask in manifest.masks:
-        pixels = np.count_nonzero((15 - blank) >> mask.bit & 1)
+        pixels = np.count_nonzero((15 - level_map.level) >> mask.bit & 1)
         # Areas are rounded to 1e-6 square micrometres.
         assert mask.area_um2 == pytest.approx(pixels * 1.85**2, abs=1e-6)
         assert mask.smallest_width_um == mask.smallest_space_um == 1.85
@@ -88,9 +89,9 @@ def test_the_manifest_tells_what_each_mask_is(written_order, level_map, levels, 
         assert entry.bytes == (written_order / entry.file).stat().st_size
 
 
-def test_the_same_inputs_give_the_same_bytes_in_every_file(written_order, tmp_path, level_map, levels, grid):
+def test_the_same_inputs_give_the_same_bytes_in_every_file(written_order, tmp_path, level_map):
     again = tmp_path / "elsewhere" / "again"
-    write_order(again, level_map, levels, grid, grid.extent_m[1], "small", {"height_map": "a test"})
+    write_order(again, level_map, source={"height_map": "a test"})
     for name in NAMES:
         assert (again / name).read_bytes() == (written_order / name).read_bytes(), name
 
@@ -109,10 +110,8 @@ def test_orders_of_every_kind_verify(tmp_path, count, step_nm, shape, fill):
     rng = np.random.default_rng(1)
     level_map = rng.integers(0, count, shape) if fill is None else np.full(shape, fill)
     said = []
-    report = write_order(
-        tmp_path / "o", level_map, levels, grid, min(grid.extent_m), "kind", {}, chrome=Chrome(1e-6), say=said.append
-    )
-    assert report.passed
+    given = wide_map(level_map, levels, grid, "kind")
+    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-6), say=said.append).report.passed
     assert said[0] == "drawing the masks"
     manifest = read_manifest(tmp_path / "o")
     assert len(manifest.masks) == levels.bits
@@ -122,14 +121,12 @@ def test_orders_of_every_kind_verify(tmp_path, count, step_nm, shape, fill):
 def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
     grid = Grid((5, 7), 1e-6 / 3)
     rng = np.random.default_rng(1)
-    report = write_order(
-        tmp_path / "o", rng.integers(0, 16, (5, 7)), levels, grid, 1.6e-6, "thirds", {}, chrome=Chrome(1e-7)
-    )
-    assert report.passed
+    given = LevelMap(rng.integers(0, 16, (5, 7), np.uint8), levels, grid, 1.6e-6, "thirds")
+    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-7)).report.passed
     assert read_manifest(tmp_path / "o").pixel_edges.startswith("each pixel edge is rounded to 1 nm")
 
 
-def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, level_map, levels, grid):
+def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, level_map):
     def crooked(bitmap, *edges):
         found = rectangles(bitmap, *edges)
         return found[:-1]
@@ -138,19 +135,19 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
 
     monkeypatch.setattr("fab.layout.compensation.rectangles", crooked)
     with pytest.raises(CheckFailed, match=r"ALL\.gds: own reader, every pixel: layer 1/0: \d+ pixel"):
-        write_order(tmp_path / "o", level_map, levels, grid, grid.extent_m[1], "bad", {})
+        write_order(tmp_path / "o", level_map)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_earlier_order_is_replaced(order_folder, level_map, levels, grid):
-    write_order(order_folder, level_map, levels, grid, grid.extent_m[1], "other", {})
+def test_an_earlier_order_is_replaced(order_folder, level_map):
+    write_order(order_folder, replace(level_map, name="other"))
     assert read_manifest(order_folder).name == "other"
     assert not (order_folder / "DOE_SMALL_ALL.gds").exists()
 
 
-def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_map, levels, grid):
+def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_map):
     def write(folder):
-        write_order(folder, level_map, levels, grid, grid.extent_m[1], "other", {})
+        write_order(folder, replace(level_map, name="other"))
 
     (order_folder / "notes.txt").write_text("from the lab")
     with pytest.raises(InputError, match=r"notes\.txt"):

@@ -16,7 +16,8 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from fab.verification.verify import read_level_map, verify_order
+from fab.verification.verify import read_drawn_levels, verify_order
+from tests.fab.maps import wide_map
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def compensated(tmp_path_factory):
     process = Process(levels, spreads=bias)
     folders = [tmp_path_factory.mktemp("moved") / name for name in ("moved", "plain")]
     for folder, wafer in zip(folders, (Wafer(compensate=True), Wafer()), strict=True):
-        write_order(folder, level_map, levels, grid, grid.extent_m[1], "small", {}, process=process, wafer=wafer)
+        write_order(folder, wide_map(level_map, levels, grid, "small"), process=process, wafer=wafer)
     return folders
 
 
@@ -37,7 +38,7 @@ def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
     manifest = read_manifest(moved)
     assert [mask.edge_move_nm for mask in manifest.masks] == [-100, -100, 200, -100]
     levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
-    drawn = read_level_map(moved / manifest.combined_gds, levels, edges, manifest.doe_cell, manifest.edge_moves())
+    drawn = read_drawn_levels(moved / manifest.combined_gds, levels, edges, manifest.doe_cell, manifest.edge_moves())
     assert np.array_equal(drawn, np.load(plain / "DOE_SMALL_LEVELS.npy"))
     # The process moves every edge by its bias: printed like that, by KLayout, the drawing is the plane again.
     for mask in manifest.masks:
@@ -70,7 +71,5 @@ def test_a_bias_wider_than_the_pixels_allow_is_refused(tmp_path):
     level_map = np.random.default_rng(0).integers(0, 4, (12, 12)).astype(np.uint8)
     process = Process(levels, spreads={"common_cd_bias_m": Normal(0.6e-6, 0.0)})
     with pytest.raises(ValueError, match="edges must move by less than half the narrowest line and space"):
-        write_order(
-            tmp_path / "o", level_map, levels, grid, 12e-6, "s", {}, process=process, wafer=Wafer(compensate=True)
-        )
+        write_order(tmp_path / "o", wide_map(level_map, levels, grid), process=process, wafer=Wafer(compensate=True))
     assert not (tmp_path / "o").exists()

@@ -9,6 +9,7 @@ from fab.solids.columns import Window
 from fab.solids.patch import Patch, patch_body, patch_step
 from fab.solids.step import step_bodies, step_volumes_m3
 from fab.units import NM, UM
+from tests.fab.maps import level_map_from
 
 SIXTEEN = Levels(16, 75 * NM)
 
@@ -23,12 +24,11 @@ PATCHES = {
 
 @pytest.mark.parametrize("level_map", PATCHES.values(), ids=PATCHES.keys())
 def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
-    level_map = np.array(level_map, dtype=np.uint8)
-    grid = Grid(level_map.shape, 1.85 * UM)
+    level_map = level_map_from(level_map, SIXTEEN, 1.85 * UM)
     window = Window(0, 0, *level_map.shape)
-    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window, UM)
-    want = (height_of(level_map, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
-    assert patch_body(level_map, SIXTEEN, grid, window, UM).volume_m3 == pytest.approx(want, rel=1e-14)
+    patch_step(tmp_path / "p.step", level_map, window, UM)
+    want = (height_of(level_map.level, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
+    assert patch_body(level_map, window, UM).volume_m3 == pytest.approx(want, rel=1e-14)
     # Edges of 1e-3 mm are written with 15 digits.
     assert step_volumes_m3(tmp_path / "p.step") == pytest.approx({"PATCH": want}, rel=1e-11)
 
@@ -36,28 +36,27 @@ def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
 def test_a_patch_lies_where_its_window_does(tmp_path):
     level_map = np.random.default_rng(2).integers(0, 16, (20, 30)).astype(np.uint8)
     level_map[5, 8] = 15
-    grid, window = Grid((20, 30), UM), Window(5, 8, 4, 6)
-    patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, window)
+    level_map, window = level_map_from(level_map), Window(5, 8, 4, 6)
+    patch_step(tmp_path / "p.step", level_map, window)
     (shape,) = [shape for shape, *_ in cadquery.Assembly.importStep(str(tmp_path / "p.step"))]
     bounds = shape.BoundingBox(1e-9)
     box = [bounds.xmin, bounds.xmax, bounds.ymin, bounds.ymax, bounds.zmin, bounds.zmax]
     # From the blank surface down to the deepest floor and 10 um more.
     assert box == pytest.approx([-7e-3, -1e-3, -5e-3, -1e-3, -11.125e-3, 0], abs=1e-6)
-    want, found = patch_body(level_map, SIXTEEN, grid, window), step_bodies(tmp_path / "p.step")["PATCH"]
+    want, found = patch_body(level_map, window), step_bodies(tmp_path / "p.step")["PATCH"]
     assert found.volume_m3 == pytest.approx(want.volume_m3, rel=1e-11)
     # A hundredth of a nanometre, as in the proof of an order.
     assert found.centre_m == pytest.approx(want.centre_m, abs=1e-11)
 
 
 def test_patches_too_large_for_step_are_refused_with_the_number_of_boxes(tmp_path):
-    level_map = (np.indices((50, 50)).sum(axis=0) % 2).astype(np.uint8)
-    grid = Grid((50, 50), UM)
+    level_map = level_map_from(np.indices((50, 50)).sum(axis=0) % 2)
     with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2500 in 50 x 50 pixels.*mesh"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 50, 50))
+        patch_step(tmp_path / "p.step", level_map, Window(0, 0, 50, 50))
     with pytest.raises(InputError, match="1 to 20000 boxes"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 0, 5, 5), most_boxes=20_001)
+        patch_step(tmp_path / "p.step", level_map, Window(0, 0, 5, 5), most_boxes=20_001)
     with pytest.raises(InputError, match="window"):
-        patch_step(tmp_path / "p.step", level_map, SIXTEEN, grid, Window(0, 46, 5, 5))
+        patch_step(tmp_path / "p.step", level_map, Window(0, 46, 5, 5))
     assert not list(tmp_path.iterdir())
 
 
@@ -89,11 +88,11 @@ def test_a_patch_is_the_pixels_nearest_to_what_was_asked_for(patch, window):
 
 
 def test_a_patch_knows_what_is_too_large_for_its_files():
-    level_map = (np.indices((60, 60)).sum(axis=0) % 2).astype(np.uint8)
-    Patch(0.0, 0.0, 44 * UM).require(level_map, SIXTEEN, Grid((60, 60), UM))
+    level_map = level_map_from(np.indices((60, 60)).sum(axis=0) % 2)
+    Patch(0.0, 0.0, 44 * UM).require(level_map)
     with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2025 in 45 x 45 pixels.*--mesh-patch"):
-        Patch(0.0, 0.0, 45 * UM).require(level_map, SIXTEEN, Grid((60, 60), UM))
-    Patch(0.0, 0.0, 60 * UM, step=False).require(level_map, SIXTEEN, Grid((60, 60), UM))
-    wide = np.zeros((1100, 1100), dtype=np.uint8)
+        Patch(0.0, 0.0, 45 * UM).require(level_map)
+    Patch(0.0, 0.0, 60 * UM, step=False).require(level_map)
+    wide = level_map_from(np.zeros((1100, 1100)))
     with pytest.raises(InputError, match=r"at most 1000 x 1000 pixels.*got 1001 x 1001.*at most 1 mm"):
-        Patch(0.0, 0.0, 1001 * UM).require(wide, SIXTEEN, Grid(wide.shape, UM))
+        Patch(0.0, 0.0, 1001 * UM).require(wide)

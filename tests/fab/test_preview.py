@@ -4,20 +4,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fab.grid import Grid
 from fab.levels import Levels
-from fab.masks import planes
 from fab.order.preview import _blocks, preview_png
 from fab.units import NM, UM
+from tests.fab.maps import level_map_from
 
 
 @pytest.mark.parametrize(("count", "shape"), [(2, (3, 5)), (64, (70, 64))])
 def test_the_picture_is_a_png_whose_bytes_depend_on_the_masks_alone(count, shape):
-    levels, grid = Levels(count, 75 * NM), Grid(shape, UM)
-    level_map = np.random.default_rng(1).integers(0, count, shape).astype(np.uint8)
+    level = np.random.default_rng(1).integers(0, count, shape)
+    level_map = level_map_from(level, Levels(count, 75 * NM), UM, 3 * UM)
 
     def draw():
-        return preview_png("DOE", planes(level_map, levels), level_map, levels, grid, 3 * UM, (UM, 600 * UM))
+        return preview_png("DOE", level_map, (UM, 600 * UM))
 
     picture = draw()
     assert picture == draw()

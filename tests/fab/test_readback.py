@@ -74,7 +74,7 @@ def test_overlaps_and_strays_are_seen(tmp_path):
 
 
 def test_layers_are_read_in_as_many_passes_as_memory_asks_for(tmp_path, monkeypatch, level_map, levels, grid):
-    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "TOP")
+    layout = mask_layout(level_map, "TOP")
     write_gds(tmp_path / "a.gds", layout)
     passes = []
     read = gdstk.read_gds

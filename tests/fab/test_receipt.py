@@ -18,7 +18,6 @@ from fab.gds.reader import read_gds
 from fab.gds.writer import write_gds
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.manifest.records import Manifest, read_manifest
-from fab.masks import planes
 from fab.verification.compare import Expected
 from fab.verification.shop_checks import drawing_problems
 from fab.verification.verify import verify_order
@@ -152,8 +151,8 @@ def test_the_check_of_shapes_does_not_hang_on_a_file_of_many_vertices(written_or
     many = Shapes(NOTHING, (np.array(circle(8000), dtype=np.int32),) * 50)
     (doe, *around), entry = layout.cells, next(e for e in manifest.files if e.file == M1)
     spoiled = replace(layout, cells=(doe, *(replace(c, shapes={Layer(1): many}) for c in around)))
-    stored = np.load(written_order / manifest.level_map_file)
-    expected = Expected(manifest, planes(stored, manifest.staircase()), pixel_edges(manifest.grid()))
+    level_map = manifest.level_map(np.load(written_order / manifest.level_map_file))
+    expected = Expected(manifest, level_map, level_map.planes(), pixel_edges(level_map.grid))
     assert any("more than 199 vertices" in problem for problem in drawing_problems(spoiled, entry, expected))
 
 

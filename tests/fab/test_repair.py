@@ -9,13 +9,13 @@ from hypothesis.extra import numpy as hnp
 from scipy.ndimage import gaussian_filter
 
 from fab.errors import InputError
-from fab.grid import Grid
 from fab.layout.polygons import smallest_runs
 from fab.levels import Levels
-from fab.masks import planes, unetched_outside
-from fab.rules import repair
+from fab.masks import planes
+from fab.rules import repair as repair_module
 from fab.rules.check import Rules, check
-from fab.rules.repair import repaired
+from fab.rules.repair import repair
+from tests.fab.maps import level_map_from
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)
@@ -37,16 +37,16 @@ def radial_map(waves=7.0):
 
 
 def repair_map(level_map, line=2, space=2, levels=SIXTEEN, aperture=None, rate=RATE):
-    grid = Grid(level_map.shape, UM)
     aperture_m = min(level_map.shape) * UM if aperture is None else aperture * UM
+    given = level_map_from(level_map, levels, UM, aperture_m)
     rules = Rules(line * UM, space * UM)
-    out, cost = repaired(level_map, levels, grid, aperture_m, rules, rate)
-    report = check(out, levels, grid, aperture_m, rules)
-    assert cost.broken_after == sum(plane.breaks for plane in report.planes)
-    blank = unetched_outside(level_map, levels, grid, aperture_m)
-    outside = ~grid.inside_circle(aperture_m)
-    assert np.array_equal(out[outside], blank[outside])
-    return out, cost, blank, ~outside
+    done = repair(given, rules, rate)
+    report = check(done.level_map, rules)
+    assert done.cost.broken_after == sum(plane.breaks for plane in report.planes)
+    assert done.rules.as_record() == report.as_record()
+    inside = given.grid.inside_circle(aperture_m)
+    assert np.array_equal(done.level_map.level[~inside], given.level[~inside])
+    return done.level_map.level, done.cost, given.level, inside
 
 
 @pytest.mark.parametrize(("line", "space"), [(2, 2), (3, 3), (2, 3), (4, 2)])
@@ -103,7 +103,7 @@ def test_a_repair_costs_less_light_than_coarser_pixels():
 def test_a_lone_pixel_takes_the_level_around_it_and_nothing_else_changes():
     level_map = np.full((20, 20), 9, np.uint8)
     level_map[9, 11] = 8
-    out, cost, blank, inside = repair_map(level_map, aperture=80)
+    out, cost, blank, inside = repair_map(level_map, aperture=math.inf)
     assert np.array_equal(out, np.full_like(level_map, 9))
     assert cost.changed_share == pytest.approx(1 / 400)
     assert cost.efficiency == pytest.approx(abs(1 - (1 - np.exp(2j * np.pi / 16)) / 400) ** 2)
@@ -116,17 +116,17 @@ def test_levels_are_near_by_phase_and_not_by_height():
     level_map = np.full((24, 24), 15, np.uint8)
     level_map[:, 12:] = 8
     level_map[:, 11] = 0
-    out, _, _, _ = repair_map(level_map, aperture=96)
+    out, _, _, _ = repair_map(level_map, aperture=math.inf)
     assert set(np.unique(out[:, 11])) == {15}
     assert np.array_equal(np.delete(out, 11, axis=1), np.delete(level_map, 11, axis=1))
 
 
 def test_a_map_that_breaks_nothing_stays_as_it_is():
     level_map = np.kron(random_map((6, 6)), np.ones((8, 8))).astype(np.uint8)
-    out, cost, blank, _ = repair_map(level_map, 1, 1, aperture=192)
+    out, cost, blank, _ = repair_map(level_map, 1, 1, aperture=math.inf)
     kissing = cost.broken_before
     assert (kissing > 0) == (not np.array_equal(out, blank))
-    flat, cost, blank, _ = repair_map(np.full((9, 9), 3, np.uint8), 0, 0, aperture=36)
+    flat, cost, blank, _ = repair_map(np.full((9, 9), 3, np.uint8), 0, 0, aperture=math.inf)
     assert np.array_equal(flat, blank)
     assert (cost.changed_share, cost.rms_height_m, cost.efficiency, cost.broken_before) == (0, 0, 1, 0)
 
@@ -145,7 +145,7 @@ def test_the_result_does_not_depend_on_who_works_on_it(monkeypatch):
     level_map = smooth_map((300, 40))
     first, again = repair_map(level_map)[0], repair_map(level_map)[0]
     assert np.array_equal(first, again)
-    monkeypatch.setattr(repair, "ThreadPoolExecutor", InTurn)
+    monkeypatch.setattr(repair_module, "ThreadPoolExecutor", InTurn)
     assert np.array_equal(first, repair_map(level_map)[0])
 
 

@@ -10,11 +10,13 @@ from hypothesis.extra import numpy as hnp
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles, smallest_runs
+from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.masks import planes, unetched_outside
+from fab.masks import planes
 from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.check import Rules, check
+from tests.fab.maps import level_map_from
 
 UM = 1e-6
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=14), elements=st.integers(0, 1))
@@ -24,9 +26,8 @@ SIXTEEN = Levels(16, 75e-9)
 
 def check_plane(plane, line=2, space=2, **more):
     """The report of a plane of pixels of 1 um, none of it outside the aperture."""
-    plane = np.asarray(plane, np.uint8)
-    grid = Grid(plane.shape, UM)
-    return check(1 - plane, TWO, grid, 4 * max(plane.shape) * UM, Rules(line * UM, space * UM, **more)).planes[0]
+    level_map = level_map_from(1 - np.asarray(plane, np.uint8), TWO)
+    return check(level_map, Rules(line * UM, space * UM, **more)).planes[0]
 
 
 def region(plane) -> kdb.Region:
@@ -129,10 +130,10 @@ def test_bars_at_the_limit_and_one_pixel_below(width, narrow):
 
 
 def test_a_minimum_between_two_pixels_counts_as_the_next_one():
-    grid, rules = Grid((90, 90), 1.85 * UM), Rules(2 * UM, 2 * UM)
-    found = check(1 - bar(1, 40), TWO, grid, 400 * UM, rules).planes[0]
+    rules = Rules(2 * UM, 2 * UM)
+    found = check(level_map_from(1 - bar(1, 40), TWO, 1.85 * UM), rules).planes[0]
     assert (found.line.narrow, found.line.smallest_m) == (1, 1.85e-6)
-    assert check(1 - bar(2, 40), TWO, grid, 400 * UM, rules).clean
+    assert check(level_map_from(1 - bar(2, 40), TWO, 1.85 * UM), rules).clean
 
 
 @pytest.mark.parametrize(("length", "slivers"), [(5, 0), (6, 1), (70, 1)])
@@ -164,7 +165,7 @@ def test_density_of_the_aperture_and_of_its_windows():
     plane = np.zeros(grid.shape, np.uint8)
     plane[40:50, 30:40] = 1  # one whole window of 10 pixels
     plane[0, 0] = 1  # outside the circle: not etched at all
-    found = check(1 - plane, TWO, grid, 80 * UM, Rules(window_m=10 * UM)).planes[0]
+    found = check(LevelMap(1 - plane, TWO, grid, 80 * UM), Rules(window_m=10 * UM)).planes[0]
     inside = np.count_nonzero(grid.inside_circle(80 * UM))
     assert found.density == pytest.approx(100 / inside)
     assert (found.emptiest, found.fullest) == (0.0, 1.0)
@@ -180,8 +181,8 @@ def test_a_plate_smaller_than_the_window_is_one_window():
 def test_outside_the_aperture_nothing_is_etched(shape, share):
     level_map = np.random.default_rng(2).integers(0, 16, shape).astype(np.uint8)
     grid, aperture = Grid(shape, UM), share * min(shape) * UM
-    report = check(level_map, SIXTEEN, grid, aperture, Rules(2 * UM, 3 * UM))
-    blank = unetched_outside(level_map, SIXTEEN, grid, aperture)
+    report = check(LevelMap(level_map, SIXTEEN, grid, aperture), Rules(2 * UM, 3 * UM))
+    blank = np.where(grid.inside_circle(aperture), level_map, np.uint8(15))
     for found, plane in zip(report.planes, planes(blank, SIXTEEN), strict=True):
         alone = check_plane(plane, 2, 3)
         assert (found.line, found.space, found.kissing, found.places) == (
@@ -201,19 +202,17 @@ def test_empty_and_full_planes_break_nothing(fill):
 
 
 def test_an_ideal_process_is_broken_by_nothing_but_still_measured():
-    report = check(
-        np.indices((6, 6)).sum(axis=0).astype(np.uint8) % 2, TWO, Grid((6, 6), UM), 30 * UM, Rules.of(Process(TWO))
-    )
+    report = check(level_map_from(np.indices((6, 6)).sum(axis=0) % 2, TWO), Rules.of(Process(TWO)))
     assert report.clean
     assert report.planes[0].kissing == 25
     assert report.planes[0].line.smallest_m == 1e-6
 
 
 def test_edges_off_the_address_grid_of_the_writer():
-    blank = np.ones((4, 5), np.uint8)
-    exact = check(blank, TWO, Grid((4, 5), 1.85 * UM), 5 * UM, Rules()).off_grid
+    blank = level_map_from(np.ones((4, 5)), TWO, 1.85 * UM)
+    exact = check(blank, Rules()).off_grid
     assert (exact.edges, exact.of, exact.worst_m) == (0, 11, 0.0)
-    coarse = check(blank, TWO, Grid((4, 5), 1.85 * UM), 5 * UM, Rules(address_m=50e-9)).off_grid
+    coarse = check(blank, Rules(address_m=50e-9)).off_grid
     # The six edges along x lie at odd multiples of 925 nm, those along y at multiples of 1850 nm.
     assert (coarse.edges, coarse.worst_m) == (6, 25e-9)
 
@@ -222,7 +221,7 @@ def test_the_headline_says_what_cannot_be_printed():
     level_map = np.full((40, 40), 15, np.uint8)
     level_map[10:30, 10] = 14
     process = Process(SIXTEEN, minimum_line_m=2 * UM, minimum_space_m=2 * UM)
-    report = check(level_map, SIXTEEN, Grid((40, 40), 1.85 * UM), 74 * UM, Rules.of(process))
+    report = check(level_map_from(level_map, SIXTEEN, 1.85 * UM, 74 * UM), Rules.of(process))
     assert report.headlines() == (
         "mask 1 (bit 0): 95 % of its lines are narrower than the 2 um that the process prints "
         "(down to 1.85 um, in 1 places, 1 of them slivers)",
@@ -232,7 +231,7 @@ def test_the_headline_says_what_cannot_be_printed():
 
 def test_the_record_is_json_and_the_same_every_time():
     level_map = np.random.default_rng(3).integers(0, 16, (40, 50)).astype(np.uint8)
-    reports = [check(level_map, SIXTEEN, Grid((40, 50), UM), 40 * UM, Rules(2 * UM, 2 * UM)) for _ in range(2)]
+    reports = [check(level_map_from(level_map, SIXTEEN, UM, 40 * UM), Rules(2 * UM, 2 * UM)) for _ in range(2)]
     texts = [json.dumps(report.as_record(), allow_nan=False) for report in reports]
     assert texts[0] == texts[1]
     record = json.loads(texts[0])
@@ -247,8 +246,3 @@ def test_the_record_is_json_and_the_same_every_time():
 def test_impossible_rules_are_refused(wrong):
     with pytest.raises(InputError, match=f"rules: {next(iter(wrong))}"):
         Rules(**wrong)
-
-
-def test_a_map_of_another_grid_is_refused():
-    with pytest.raises(InputError, match="must have the grid's shape"):
-        check(np.zeros((3, 3), np.uint8), TWO, Grid((3, 4), UM), 1 * UM, Rules())

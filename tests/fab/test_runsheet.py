@@ -67,7 +67,7 @@ def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, ze
             assert f"Target depth {plate.depth}" in page.text
     for depth in depths_m(levels):
         assert re.search(rf"\b{depth / NM:.10g}\b", page.text)
-    assert DIGEST in page.text
+    assert made.level_map.digest in page.text
     assert "None" not in page.text
     assert "right-reading chrome down" in page.text
 

@@ -19,6 +19,7 @@ from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.process import Normal, Process
 from fab.verification.verify import verify_order
+from tests.fab.maps import wide_map
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
 
@@ -30,8 +31,8 @@ def split(tmp_path_factory):
     process = Process(LEVELS, spreads={"common_cd_bias_m": Normal(0.1e-6, 0.0)})
     wafer = Wafer(compensate=True, line_splits_m=(-0.25e-6, 0.25e-6), order_control=True)
     folder = tmp_path_factory.mktemp("split") / "order"
-    report = write_order(folder, level_map, LEVELS, GRID, GRID.extent_m[1], "s", {}, process=process, wafer=wafer)
-    assert report.passed
+    written = write_order(folder, wide_map(level_map, LEVELS, GRID, "s"), process=process, wafer=wafer)
+    assert written.report.passed
     return folder
 
 
@@ -119,5 +120,5 @@ def test_a_split_that_closes_a_gap_is_refused(tmp_path):
     level_map = np.random.default_rng(1).integers(0, 16, GRID.shape).astype(np.uint8)
     wafer = Wafer(line_splits_m=(1e-6,))
     with pytest.raises(InputError, match="narrowest space"):
-        write_order(tmp_path / "o", level_map, LEVELS, GRID, GRID.extent_m[1], "s", {}, wafer=wafer)
+        write_order(tmp_path / "o", wide_map(level_map, LEVELS, GRID, "s"), wafer=wafer)
     assert not (tmp_path / "o").exists()

@@ -20,6 +20,7 @@ from fab.layout.geometry import Cell, Chrome, Layer, Layout, Shapes
 from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.units import NM, UM
+from tests.fab.maps import wide_map
 
 FAR = 2**31 - 1
 TRIANGLE = np.array([[0, 0], [1000, 0], [0, -1000]], dtype=np.int32)
@@ -126,7 +127,7 @@ def test_gdstk_sees_exactly_the_pixels(tmp_path_factory, plane):
 
 
 def test_oasis_keeps_names_repeats_and_polygons(tmp_path, level_map, levels, grid):
-    layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+    layout = mask_layout(level_map, "DOE")
     write_gds(tmp_path / "a.gds", layout)
     write_oasis(tmp_path / "a.oas", tmp_path / "a.gds", layout.cells[0].shapes)
     again = kdb.Layout()
@@ -143,7 +144,7 @@ def test_the_same_layout_gives_the_same_bytes(tmp_path, level_map, levels, grid)
     digests = []
     for name in ("one", "two"):
         gds, oasis = tmp_path / f"{name}.gds", tmp_path / f"{name}.oas"
-        layout = mask_layout(level_map, levels, grid, grid.extent_m[1], "DOE")
+        layout = mask_layout(level_map, "DOE")
         write_gds(gds, layout)
         write_oasis(oasis, gds, layout.cells[0].shapes)
         digests.append((sha256_file(gds), sha256_file(oasis)))
@@ -175,7 +176,7 @@ def test_oasis_back_to_gds_refuses_ruins_and_floods(tmp_path):
 def test_odd_grids_are_drawn_without_gap_or_overlap(tmp_path):
     # A third of a micrometre fits no unit: neighbours must share the rounded edge.
     levels, grid = Levels(2, 75 * NM), Grid((5, 7), UM / 3)
-    layout = mask_layout(np.zeros((5, 7), dtype=np.uint8), levels, grid, 5 * UM / 3, "DOE", Chrome(overlap_m=0))
+    layout = mask_layout(wide_map(np.zeros((5, 7), dtype=np.uint8), levels, grid), "DOE", Chrome(overlap_m=0))
     rects = layout.cells[0].shapes[Layer(1)].rectangles
     assert len(rects) > 1
     region = kdb.Region()

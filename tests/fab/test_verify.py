@@ -12,7 +12,7 @@ from fab.grid import Grid
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.verification.verify import read_level_map, verify_order
+from fab.verification.verify import read_drawn_levels, verify_order
 
 MASKS = [
     "DOE_SMALL_ALL.gds",
@@ -269,7 +269,7 @@ def test_a_level_map_is_rebuilt_only_from_separate_pixels(tmp_path):
     write_gds(
         tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects[:1]), Layer(2): Shapes(rects[1:])}),))
     )
-    assert read_level_map(tmp_path / "a.gds", levels, edges, "TOP").tolist() == [[0, 1], [3, 3]]
+    assert read_drawn_levels(tmp_path / "a.gds", levels, edges, "TOP").tolist() == [[0, 1], [3, 3]]
     write_gds(tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects)}),)))
     with pytest.raises(InputError, match=r"a\.gds: layer 1/0 .*1 pixels covered twice"):
-        read_level_map(tmp_path / "a.gds", levels, edges, "TOP")
+        read_drawn_levels(tmp_path / "a.gds", levels, edges, "TOP")

@@ -12,7 +12,7 @@ from doedesign.runs.level_maps import levels_of_run
 from fab.layout.geometry import pixel_edges
 from fab.levels import Levels, height_of
 from fab.manifest.records import read_manifest
-from fab.verification.verify import read_level_map
+from fab.verification.verify import read_drawn_levels
 from sim.store import read_bank, read_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
@@ -55,7 +55,7 @@ def test_the_order_is_made_of_the_depths_that_the_run_chose(chosen):
     assert manifest.staircase() == levels
     assert tuple(mask.depth_nm for mask in manifest.masks) == pytest.approx([d * 1e9 for d in levels.depths_m], 1e-9)
     # From the file alone: the planes and the depths of the manifest are the heights of the run, where light passes.
-    rebuilt = read_level_map(
+    rebuilt = read_drawn_levels(
         order / manifest.combined_gds, levels, pixel_edges(manifest.grid()), manifest.doe_cell, manifest.edge_moves()
     )
     stored = read_height(run / "height.exr")

@@ -8,6 +8,7 @@ import pytest
 from doedesign.runs.folder import open_run
 from doedesign.runs.level_maps import levels_of_run
 from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.process import Normal, Process
@@ -122,12 +123,7 @@ def test_masks_drawn_against_the_bias_of_the_process_give_the_design(copy_of_run
     order = tmp_path / "moved"
     write_order(
         order,
-        drawing.level,
-        drawing.levels,
-        drawing.grid,
-        drawing.aperture_m,
-        "tiny",
-        {},
+        LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m, "tiny"),
         process=Process(drawing.levels, spreads={"common_cd_bias_m": Normal(0.2e-6)}),
         wafer=Wafer(compensate=True),
     )

@@ -52,7 +52,7 @@ def test_on_request_it_mends_the_map_and_says_what_that_costs(coarse, cli, tmp_p
     assert 0 < cost["changed_share"] < 1
     assert 0 < cost["efficiency"] < 1
     level = np.load(tmp_path / "order" / manifest.level_map_file)
-    report = check(level, manifest.staircase(), manifest.grid(), manifest.aperture_mm * 1e-3, Rules(3e-6, 3e-6))
+    report = check(manifest.level_map(level), Rules(3e-6, 3e-6))
     assert report.printable
     # The light is predicted before and after: the far spot is not what it was.
     (far,) = (row for row in cost["psf"] if "far_spot" in row)

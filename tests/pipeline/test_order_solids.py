@@ -6,6 +6,7 @@ import pytest
 
 from doedesign.runs.folder import open_run
 from doedesign.runs.level_maps import levels_of_run
+from fab.level_map import LevelMap
 from fab.solids.rings import ring_levels
 
 
@@ -24,7 +25,7 @@ def test_a_radial_design_is_ordered_with_its_rings_as_circles(tiny, cli, tmp_pat
     assert "relief of 32 rings as exact circles" in models(tmp_path / "order")["PLATE.step"]["content"]
     # Rounded to other levels it is as radial.
     other = levels_of_run(open_run(tmp_path / "run"), 4)
-    rings = ring_levels(other.level, other.levels, other.grid, other.aperture_m)
+    rings = ring_levels(LevelMap(other.level, other.levels, other.grid, other.aperture_m))
     assert rings is not None
     assert len(rings) == 32
 
