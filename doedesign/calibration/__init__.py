@@ -8,13 +8,13 @@
 Reading order:
 
     measurement     the TOML file of a measurement and its images
-    unknowns        which errors are looked for, and what is believed of them
-    bench           the model: from errors to images, and gradients back
+    unknowns        which errors are looked for, and their prior
+    forward_model   the model: from errors to images, and gradients back
     target          one measured image beside its model
-    question        all of it as one objective, with slopes
+    objective       all of it as one least-squares objective, with derivatives
     fit             the search
-    uncertainty     what is known afterwards, and checks of it
-    family          explanations of two numbers
+    uncertainty     the posterior, and checks of it
+    explanations    errors that would explain two numbers
 
 The model is `sim.surface.as_fabricated` and the far-field path, the same that design, tolerance and prediction use.
 """
@@ -38,10 +38,10 @@ from doedesign.calibration.uncertainty import (
     LeftOut,
     Posterior,
     Reading,
+    cost_rises,
     left_out,
-    posterior,
+    posterior_of,
     readings,
-    rises,
 )
 from doedesign.calibration.unknowns import Unknowns, unknowns_of
 from doedesign.prediction import Drawn
@@ -76,19 +76,19 @@ class Calibration:
     """A finished calibration.
 
     Attributes:
-        question: images and bench.
+        objective: images and model.
         fit: where the search ended.
-        known: values of the errors and their uncertainty.
+        posterior: values of the errors and their uncertainty.
         process: the process with what is now known: means are the estimates, standard deviations their uncertainty.
         left_out: every image predicted from the others; empty for a single image.
         readings: what a lab reads off the images, measured and predicted.
-        rises: how much the objective rises where it should rise by one.
-        remarks: what a user must know before believing any of it, in sentences.
+        rises: how much the cost rises where it should rise by one.
+        remarks: what a user must know before relying on any of it, in sentences.
     """
 
-    question: FitObjective
+    objective: FitObjective
     fit: Fit
-    known: Posterior
+    posterior: Posterior
     process: Process
     left_out: list[LeftOut]
     readings: list[Reading]
@@ -98,13 +98,13 @@ class Calibration:
     @property
     def explained(self) -> bool:
         """Whether the model explains the images to their noise."""
-        return self.known.squares_per_pixel <= EXPLAINED
+        return self.posterior.chi2_per_pixel <= EXPLAINED
 
     @property
     def determined(self) -> dict[str, bool]:
-        """For every error whether the images, and not belief, say what it is."""
-        names = self.question.bench.unknowns.names
-        return dict(zip(names, (bool(ratio < DETERMINED) for ratio in self.known.ratio), strict=True))
+        """For every error whether the images, and not the prior, say what it is."""
+        names = self.objective.unknowns.names
+        return dict(zip(names, (bool(ratio < DETERMINED) for ratio in self.posterior.ratio), strict=True))
 
 
 def calibrate(
@@ -122,7 +122,7 @@ def calibrate(
 
     Args:
         drawn: the design as drawn.
-        process: the process, with what is believed of its errors.
+        process: the process, whose means and standard deviations are the prior.
         measurement: the images.
         errors: which errors to look for, see `unknowns_of`.
         evaluations: models that the global search may look at where it is needed.
@@ -137,25 +137,32 @@ def calibrate(
     fill = drawn.camera.fill if spec.fill_factor is None else spec.fill_factor
     camera = probe_camera(drawn.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
     unknowns = unknowns_of(process, errors, camera.grid.pitch_m)
-    bench = ForwardModel(drawn.level, camera, process, unknowns, tuple(shot.depth_m for shot in measurement.shots))
-    believed = bench.plate(unknowns.start)
-    expected = [believed.image(i, np.zeros(3)) for i in range(len(measurement.shots))]
+    model = ForwardModel(drawn.level, camera, process, unknowns, tuple(shot.depth_m for shot in measurement.shots))
+    nominal = model.plate(unknowns.start)
+    expected = [nominal.image(i, np.zeros(3)) for i in range(len(measurement.shots))]
     each = zip(measurement.shots, expected, strict=True)
-    question = FitObjective(bench, tuple(target_of(shot, measurement.window, image) for shot, image in each))
-    fit = search(question, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model)
-    known = posterior(question, fit)
-    others = left_out(question, fit, known) if len(question.targets) > 1 else []
-    rising = rises(question, fit, known)
+    objective = FitObjective(model, tuple(target_of(shot, measurement.window, image) for shot, image in each))
+    fit = search(objective, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model)
+    posterior = posterior_of(objective, fit)
+    others = left_out(objective, fit, posterior) if len(objective.targets) > 1 else []
+    rising = cost_rises(objective, fit, posterior)
     result = Calibration(
-        question, fit, known, _estimate(process, unknowns, known), others, readings(question, fit, known), rising, []
+        objective,
+        fit,
+        posterior,
+        _estimate(process, unknowns, posterior),
+        others,
+        readings(objective, fit, posterior),
+        rising,
+        [],
     )
     return replace(result, remarks=_remarks(result, expected))
 
 
-def _estimate(process: Process, unknowns: Unknowns, known: Posterior) -> Process:
+def _estimate(process: Process, unknowns: Unknowns, posterior: Posterior) -> Process:
     found = {
         name: Normal(float(value), float(sigma))
-        for name, value, sigma in zip(unknowns.names, known.values, known.sigma, strict=True)
+        for name, value, sigma in zip(unknowns.names, posterior.values, posterior.sigma, strict=True)
     }
     # The others' places are relative to mask 0.
     references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if unknowns.relative(name)}
@@ -165,19 +172,19 @@ def _estimate(process: Process, unknowns: Unknowns, known: Posterior) -> Process
 
 
 def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> list[str]:
-    known, unknowns = result.known, result.question.bench.unknowns
+    posterior, unknowns = result.posterior, result.objective.unknowns
     out = []
     if not result.explained:
         out.append(
-            f"The model does not explain the images: {known.squares_per_pixel:.3g} squares per pixel where noise alone "
-            f"gives 1. Standard deviations are {known.inflation:.2g} times as wide for it, which covers what is random "
-            "in the misfit and nothing else."
+            f"The model does not explain the images: chi2 per pixel is {posterior.chi2_per_pixel:.3g} where noise "
+            f"alone gives 1. Standard deviations are {posterior.inflation:.2g} times as wide for it, which covers what "
+            "is random in the misfit and nothing else."
         )
         out += _turned_remarks(result, expected)
-    elif known.squares_per_pixel < 1 / EXPLAINED:
+    elif posterior.chi2_per_pixel < 1 / EXPLAINED:
         out.append(
-            f"The images are less noisy than stated: {known.squares_per_pixel:.3g} squares per pixel where noise alone "
-            "gives 1. Check gain and read noise."
+            f"The images are less noisy than stated: chi2 per pixel is {posterior.chi2_per_pixel:.3g} where noise "
+            "alone gives 1. Check gain and read noise."
         )
     open_ones = [name for name, determined in result.determined.items() if not determined]
     if open_ones:
@@ -185,13 +192,13 @@ def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) 
     if unknowns.assumed:
         out.append(f"The process says nothing of {', '.join(unknowns.assumed)}; wide ranges were assumed.")
     slack = 1e-3 * unknowns.sigma
-    at_end = (known.values <= unknowns.low + slack) | (known.values >= unknowns.high - slack)
+    at_end = (posterior.values <= unknowns.low + slack) | (posterior.values >= unknowns.high - slack)
     if at_end.any():
         names = [name for name, ends in zip(unknowns.names, at_end, strict=True) if ends]
         out.append(f"At the end of the range that was looked at: {', '.join(names)}.")
     if result.rises and not all(0.5 < rise < 2 for rise in result.rises):
         text = ", ".join(f"{rise:.2g}" for rise in result.rises)
-        out.append(f"The posterior is not normal where it is widest: the objective rises by {text} instead of 1.")
+        out.append(f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1.")
     if len({name.partition("[")[0] for name in unknowns.names if unknowns.relative(name)}):
         out.append("Places of masks are relative to mask 0; a common shift cannot be seen.")
     return out
@@ -199,7 +206,7 @@ def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) 
 
 def _turned_remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> list[str]:
     """Whether the images look more like the model when they are turned or mirrored."""
-    target, model = result.question.targets[0], expected[0]
+    target, model = result.objective.targets[0], expected[0]
     ways = {
         (turns, mirrored): likeness(target, model, turns, mirrored) for mirrored in (False, True) for turns in range(4)
     }

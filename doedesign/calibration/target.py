@@ -58,6 +58,11 @@ class Target(NamedTuple):
     gain: tuple[float, float] | None
     defocus_sigma: float
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that count."""
+        return int(self.psf.valid.sum())
+
 
 class Match(NamedTuple):
     """A model beside a measured image.
@@ -66,13 +71,13 @@ class Match(NamedTuple):
         gain: what one unit of the model's energy is in the image.
         background: level of the image.
         residual: `[y, x]` image - gain * model - background.
-        squares: weighted sum of squares, with the gain's own term.
+        chi2: weighted sum of squares, with the gain's own term.
     """
 
     gain: float
     background: float
     residual: Float[np.ndarray, "y x"]
-    squares: float
+    chi2: float
 
 
 def target_of(shot: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
@@ -185,18 +190,24 @@ def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.nda
     gain = max(against / (float((centred * (model - mean_model)).sum()) + trust), np.finfo(float).tiny)
     background = mean_rate - gain * mean_model
     residual = np.where(weights > 0, rate - gain * model - background, 0.0)
-    squares = float((weights * residual**2).sum()) + trust * (gain - wanted) ** 2
-    return Match(gain, background, residual, squares)
+    chi2 = float((weights * residual**2).sum()) + trust * (gain - wanted) ** 2
+    return Match(gain, background, residual, chi2)
 
 
-def projected(
+def residuals(target: Target, weights: Float[np.ndarray, "y x"], found: Match) -> Float[np.ndarray, " n"]:
+    """Residuals in standard deviations, last that of a gain that is known; their squares add up to `Match.chi2`."""
+    pixels = (np.sqrt(weights) * found.residual).ravel()
+    return np.append(pixels, (found.gain - target.gain[0]) / target.gain[1]) if target.gain else pixels
+
+
+def residual_jacobian(
     target: Target,
     weights: Float[np.ndarray, "y x"],
     model: Float[np.ndarray, "y x"],
     found: Match,
     columns: Float[np.ndarray, "p y x"],
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Half the Hessian (Gauss-Newton) and half the negative gradient of the squares, gain and background solved for.
+) -> Float[np.ndarray, "p n"]:
+    """Derivatives of `residuals`, gain and background solved for (Kaufman, BIT 15, 49, 1975).
 
     Args:
         target: the image.
@@ -205,12 +216,12 @@ def projected(
         found: their match.
         columns: derivatives of the model's image.
     """
-    flat = found.gain * columns.reshape(len(columns), -1)
-    weight = weights.ravel()
-    solved = np.stack([model.ravel(), np.ones(weight.size)])
-    known = (solved * weight) @ solved.T
+    root = np.sqrt(weights).ravel()
+    flat = found.gain * columns.reshape(len(columns), -1) * root
+    basis = np.stack([model.ravel(), np.ones(root.size)]) * root
+    normal = basis @ basis.T
     if target.gain:
-        known[0, 0] += target.gain[1] ** -2
-    cross = (solved * weight) @ flat.T
-    hessian = (flat * weight) @ flat.T - cross.T @ np.linalg.solve(known, cross)
-    return hessian, (flat * weight) @ found.residual.ravel()
+        normal[0, 0] += target.gain[1] ** -2
+    shares = np.linalg.solve(normal, basis @ flat.T)
+    pixels = shares.T @ basis - flat
+    return np.column_stack([pixels, -shares[0] / target.gain[1]]) if target.gain else pixels

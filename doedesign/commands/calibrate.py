@@ -167,7 +167,7 @@ def _write(folder: Path, run: Run, spec: ProcessSpec, measured: Measurement, res
     (folder / "calibration.json").write_bytes(canonical_json(record))
     comments = estimate_comments(result, measured)
     (folder / ESTIMATE).write_text(process_to_toml(process_spec_of(result.process, spec), comments), encoding="utf-8")
-    plate = result.question.bench.unknowns.variation(result.known.values)
+    plate = result.objective.unknowns.variation(result.posterior.values)
     (folder / "plate.toml").write_text(variation_to_toml(plate, comments), encoding="utf-8")
     draw_fitted_psfs(folder / "psfs.png", result)
     draw_estimates(folder / "errors.png", result)
@@ -179,7 +179,7 @@ def estimate_comments(result: Calibration, measured: Measurement) -> list[str]:
     return [
         "Estimated from measured PSFs by doedesign calibrate.",
         "Means of the errors below are the estimates for one plate, sigmas how well they are known.",
-        f"{result.known.squares_per_pixel:.4g} squares per pixel (noise alone gives 1)",
+        f"{result.posterior.chi2_per_pixel:.4g} chi2 per pixel (noise alone gives 1)",
         *result.remarks,
         *(f"{name}: sha256 {digest}" for name, digest in measured.digests.items()),
     ]
@@ -187,15 +187,15 @@ def estimate_comments(result: Calibration, measured: Measurement) -> list[str]:
 
 def calibration_record(result: Calibration) -> dict[str, Any]:
     """A calibration as plain values, SI units."""
-    unknowns, known, at = result.question.bench.unknowns, result.known, result.fit.lens.look
+    unknowns, posterior, at = result.objective.unknowns, result.posterior, result.fit.at
     others = {one.name: one for one in result.left_out}
     images = []
-    for i, target in enumerate(result.question.targets):
-        motion, found = result.question.motion(at.scores, i), at.matches[i]
+    for i, target in enumerate(result.objective.targets):
+        motion, found = result.objective.motion(at.scores, i), at.matches[i]
         row = {
             "name": target.name,
             "depth_m": None if math.isinf(target.depth_m) else target.depth_m,
-            "squares_per_pixel": found.squares / max(int(target.psf.valid.sum()), 1),
+            "chi2_per_pixel": found.chi2 / max(int(target.psf.valid.sum()), 1),
             "pixels": int(target.psf.valid.sum()),
             "rate_per_unit_energy": found.gain * target.scale,
             "background": found.background * target.scale,
@@ -203,24 +203,24 @@ def calibration_record(result: Calibration) -> dict[str, Any]:
             "defocus_per_m": float(motion[2]),
         }
         if target.name in others:
-            row["squares_per_pixel_from_the_others"] = others[target.name].predicted
+            row["chi2_per_pixel_from_the_others"] = others[target.name].predicted
         images.append(row)
     return {
         "errors": [
             {
                 "name": name,
-                "value": float(known.values[i]),
-                "sigma": float(known.sigma[i]),
-                "believed_mean": float(unknowns.mean[i]),
-                "believed_sigma": float(unknowns.sigma[i]),
+                "value": float(posterior.values[i]),
+                "sigma": float(posterior.sigma[i]),
+                "prior_mean": float(unknowns.mean[i]),
+                "prior_sigma": float(unknowns.sigma[i]),
                 "assumed": name in unknowns.assumed,
                 "determined": result.determined[name],
             }
             for i, name in enumerate(unknowns.names)
         ],
-        "correlation": np.round(known.correlation, 6).tolist(),
-        "squares_per_pixel": known.squares_per_pixel,
-        "inflation": known.inflation,
+        "correlation": np.round(posterior.correlation, 6).tolist(),
+        "chi2_per_pixel": posterior.chi2_per_pixel,
+        "inflation": posterior.inflation,
         "explained": result.explained,
         "images": images,
         "readings": [
@@ -240,12 +240,12 @@ def calibration_record(result: Calibration) -> dict[str, Any]:
 
 def summary(result: Calibration) -> str:
     """What was found, for a person."""
-    unknowns, known = result.question.bench.unknowns, result.known
+    unknowns, posterior = result.objective.unknowns, result.posterior
     wide = max(len(error_label(name)) for name in unknowns.names)
-    lines = [f"{known.squares_per_pixel:.4g} squares per pixel after {result.fit.models} plates"]
+    lines = [f"{posterior.chi2_per_pixel:.4g} chi2 per pixel after {result.fit.models} plates"]
     for i, name in enumerate(unknowns.names):
         note = "" if result.determined[name] else "  (not determined)"
-        text = value_text(name, known.values[i], known.sigma[i])
+        text = value_text(name, posterior.values[i], posterior.sigma[i])
         lines.append(f"{error_label(name):<{wide}}  {text}{note}")
     order = next(r for r in result.readings if r.quantity == "zeroth_order").predicted
     lines.append(f"zeroth order {100 * order[0]:.3g} ± {100 * order[1]:.2g} %")

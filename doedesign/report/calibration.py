@@ -79,7 +79,7 @@ def draw_fitted_psfs(path: str | Path, result: "Calibration") -> None:
     Raises:
         InputError: the system refuses the path.
     """
-    targets = result.question.targets
+    targets = result.objective.targets
     across = _LEFT + 3 * (_SIDE + _GAP) + 2 * _BAR + 0.1
     words = (
         "measured and model: logarithmic, background taken off, in units of the model's light in the window; "
@@ -99,8 +99,8 @@ def _draw_image(figure: "Figure", bottom: float, result: "Calibration", index: i
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm, Normalize
 
-    question, at = result.question, result.fit.lens.look
-    target, found, weights = question.targets[index], at.matches[index], result.fit.weights[index]
+    objective, at = result.objective, result.fit.at
+    target, found, weights = objective.targets[index], at.matches[index], result.fit.weights[index]
     total = at.images[index].sum()
     model = at.images[index] / total
     measured = (target.psf.rate - found.background) / (found.gain * total)
@@ -112,11 +112,11 @@ def _draw_image(figure: "Figure", bottom: float, result: "Calibration", index: i
     pull_norm = Normalize(-_MOST_SIGMA, _MOST_SIGMA)
     palette = colormaps[LIGHT].with_extremes(bad=FAINT)
     differences = colormaps["RdBu_r"].with_extremes(bad=FAINT)
-    half = model.shape[0] * question.bench.camera.pixel_m / UM / 2
+    half = model.shape[0] * objective.model.camera.pixel_m / UM / 2
     panels = [
         (f"{target.name}, {length_text(target.depth_m)}: measured", measured, palette, norm),
         ("model", model, palette, norm),
-        (f"difference, {found.squares / max(valid.sum(), 1):.3g} squares per pixel", pulls, differences, pull_norm),
+        (f"difference, {found.chi2 / max(valid.sum(), 1):.3g} chi2 per pixel", pulls, differences, pull_norm),
     ]
     left = _LEFT
     for column, (title, values, colours, scale) in enumerate(panels):
@@ -135,8 +135,8 @@ def _draw_image(figure: "Figure", bottom: float, result: "Calibration", index: i
             bar.minorticks_off()
             left += _BAR
     # Words under the middle panel: what was solved for.
-    shift = question.motion(at.scores, index)
-    pixel = question.bench.camera.pixel_m
+    shift = objective.motion(at.scores, index)
+    pixel = objective.model.camera.pixel_m
     text = f"centre {shift[1] * pixel / UM:+.2f}, {shift[0] * pixel / UM:+.2f} µm (x, y)"
     note(figure, _LEFT + _SIDE + _GAP, bottom - 0.2, text)
 
@@ -158,7 +158,7 @@ def draw_estimates(path: str | Path, result: "Calibration") -> None:
     Raises:
         InputError: the system refuses the path.
     """
-    unknowns, known = result.question.bench.unknowns, result.known
+    unknowns, posterior = result.objective.unknowns, result.posterior
     count = len(unknowns.names)
     high = max(_ROW * count, 1.4)
     words = (
@@ -171,8 +171,8 @@ def draw_estimates(path: str | Path, result: "Calibration") -> None:
     with picture(path, size) as figure:
         axes = place(figure, 1.9, foot, 3.6, high)
         rows = np.arange(count)[::-1]
-        centre = (known.values - unknowns.mean) / unknowns.sigma
-        spread = known.sigma / unknowns.sigma
+        centre = (posterior.values - unknowns.mean) / unknowns.sigma
+        spread = posterior.sigma / unknowns.sigma
         axes.barh(rows, 2, 0.75, left=-1, color=FAINT, alpha=0.35, lw=0)
         axes.axvline(0, color=FAINT, lw=0.8)
         for row, value, bar, name in zip(rows, centre, spread, unknowns.names, strict=True):
@@ -182,7 +182,7 @@ def draw_estimates(path: str | Path, result: "Calibration") -> None:
             axes.errorbar(value, row, xerr=bar, fmt="o", mfc=fill, mec=LINE, **look)
             i = unknowns.names.index(name)
             axes.annotate(
-                value_text(name, known.values[i], known.sigma[i]),
+                value_text(name, posterior.values[i], posterior.sigma[i]),
                 (1.02, row),
                 xycoords=("axes fraction", "data"),
                 va="center",
@@ -194,7 +194,7 @@ def draw_estimates(path: str | Path, result: "Calibration") -> None:
         axes.set_xlim(-reach, reach)
         axes.set_xlabel("distance from what was believed, in its standard deviations", labelpad=2)
         axes.tick_params(length=2.5)
-        axes.set_title(f"errors of the plate, {known.squares_per_pixel:.3g} squares per pixel")
+        axes.set_title(f"errors of the plate, {posterior.chi2_per_pixel:.3g} chi2 per pixel")
         _draw_correlation(figure, (5.9 + 1.3, foot, high), result)
         note(figure, 0.15, 0.1, text)
 
@@ -206,8 +206,8 @@ def _draw_correlation(figure: "Figure", box_in: tuple[float, float, float], resu
     left, bottom, side = box_in
     axes = place(figure, left, bottom, side, side)
     norm = Normalize(-1, 1)
-    axes.imshow(result.known.correlation, cmap="RdBu_r", norm=norm)
-    names = result.question.bench.unknowns.names
+    axes.imshow(result.posterior.correlation, cmap="RdBu_r", norm=norm)
+    names = result.objective.unknowns.names
     axes.set_xticks([])
     axes.set_yticks(range(len(names)), [""] * len(names))
     axes.tick_params(length=2.5)
@@ -226,11 +226,11 @@ def draw_check(path: str | Path, result: "Calibration") -> None:
     Raises:
         InputError: the system refuses the path.
     """
-    targets = result.question.targets
+    targets = result.objective.targets
     measured = [reading for reading in result.readings if reading.measured]
     words = (
         "left: residuals of all pixels in standard deviations, against the normal distribution (dashed); middle: "
-        "squares per pixel of every image in the fit and as predicted from the other images; right: numbers read off "
+        "chi2 per pixel of every image in the fit and as predicted from the other images; right: numbers read off "
         "the images against the model's (zero), bar: noise, shade: uncertainty of the model"
     )
     text = wrapped(words, 9.4)
@@ -239,7 +239,7 @@ def draw_check(path: str | Path, result: "Calibration") -> None:
         axes = place(figure, 0.65, foot, 2.4, 2.2)
         bins = np.linspace(-6, 6, 61)
         for i, target in enumerate(targets):
-            pulls = result.fit.lens.look.matches[i].residual * np.sqrt(result.fit.weights[i])
+            pulls = result.fit.at.matches[i].residual * np.sqrt(result.fit.weights[i])
             values = np.clip(pulls[result.fit.weights[i] > 0], -5.999, 5.999)
             axes.hist(
                 values, bins.tolist(), density=True, histtype="step", color=SERIES[i % len(SERIES)], label=target.name
@@ -258,17 +258,17 @@ def draw_check(path: str | Path, result: "Calibration") -> None:
 
 def _draw_left_out(axes: "Axes", result: "Calibration") -> None:
     fitted = [
-        found.squares / max(int(target.psf.valid.sum()), 1)
-        for target, found in zip(result.question.targets, result.fit.lens.look.matches, strict=True)
+        found.chi2 / max(int(target.psf.valid.sum()), 1)
+        for target, found in zip(result.objective.targets, result.fit.at.matches, strict=True)
     ]
     rows = np.arange(len(fitted))[::-1]
     axes.barh(rows + 0.17, fitted, 0.3, color=LINE, label="fit of all")
     if result.left_out:
         axes.barh(rows - 0.17, [one.predicted for one in result.left_out], 0.3, color=MARK, label="from the others")
     axes.axvline(1, color=INK, ls="--", lw=1)
-    axes.set_yticks(rows, [target.name for target in result.question.targets])
+    axes.set_yticks(rows, [target.name for target in result.objective.targets])
     axes.set_ylim(-0.6, len(fitted) - 0.4)
-    axes.set_xlabel("squares per pixel", labelpad=2)
+    axes.set_xlabel("chi2 per pixel", labelpad=2)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=2, handlelength=1, columnspacing=1)
 
 

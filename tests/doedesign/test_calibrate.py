@@ -10,9 +10,15 @@ import pytest
 from doedesign.calibration import Calibration, calibrate, load_shots, unknowns_of
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import ForwardModel
-from doedesign.calibration.objective import FitObjective, linearised, look, look_and_gradient, slopes_at
+from doedesign.calibration.objective import (
+    FitObjective,
+    difference_jacobian,
+    evaluate,
+    evaluate_with_gradient,
+    linearised,
+)
 from doedesign.calibration.target import measured_weights
-from doedesign.calibration.uncertainty import posterior
+from doedesign.calibration.uncertainty import posterior_of
 from doedesign.prediction import Drawn
 from fab.errors import InputError
 from fab.process import Normal, Process
@@ -60,15 +66,15 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def question(tmp_path_factory: pytest.TempPathFactory) -> FitObjective:
+def objective(tmp_path_factory: pytest.TempPathFactory) -> FitObjective:
     """A small measurement of four errors, before the search."""
     drawn, process = small()
-    return measured(tmp_path_factory.mktemp("small"), drawn, process, FEW).question
+    return measured(tmp_path_factory.mktemp("small"), drawn, process, FEW).objective
 
 
 def found(result: Calibration) -> dict[str, tuple[float, float]]:
-    names = result.question.bench.unknowns.names
-    return dict(zip(names, zip(result.known.values, result.known.sigma, strict=True), strict=True))
+    names = result.objective.unknowns.names
+    return dict(zip(names, zip(result.posterior.values, result.posterior.sigma, strict=True), strict=True))
 
 
 @pytest.mark.slow
@@ -88,7 +94,7 @@ def test_hidden_errors_are_recovered(loop: Calibration):
 
 @pytest.mark.slow
 def test_the_posterior_check_finds_nothing_wrong(loop: Calibration):
-    assert 0.6 < loop.known.squares_per_pixel < 1.2
+    assert 0.6 < loop.posterior.chi2_per_pixel < 1.2
     # An error of 1 is expected for each; central differences and curvature leave a little.
     assert loop.rises == pytest.approx([1.0] * len(loop.rises), abs=0.4)
     for one in loop.left_out:
@@ -106,12 +112,12 @@ def test_the_posterior_check_finds_nothing_wrong(loop: Calibration):
 @pytest.mark.slow
 def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
     """The process that comes out, used as any process is, makes the images that were fitted."""
-    bench, at = loop.question.bench, loop.fit.lens.look
+    model, at = loop.objective.model, loop.fit.at
     nothing = unknowns_of(replace(loop.process, spreads=loop.process.spreads), ["etch_lag"])
     assert dict(nothing.fixed) == {name: spread.mean for name, spread in loop.process.spreads.items()}
-    again = ForwardModel(bench.level, bench.camera, loop.process, nothing, bench.depths_m).plate(np.zeros(1))
+    again = ForwardModel(model.level, model.camera, loop.process, nothing, model.depths_m).plate(np.zeros(1))
     for i, image in enumerate(at.images):
-        predicted = again.image(i, loop.question.motion(at.scores, i))
+        predicted = again.image(i, loop.objective.motion(at.scores, i))
         np.testing.assert_allclose(predicted, image, rtol=0, atol=1e-5 * image.max())  # single precision
     assert loop.process.spreads["overlay_x_m[0]"] == Normal(0.0, 0.0)  # the reference
     assert loop.process.spreads["common_depth_scale"].sigma < 0.001
@@ -121,7 +127,7 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
 def test_without_relief_nothing_is_claimed(tmp_path: Path):
     """A flat plate has no etched edge: what is known afterwards is what was believed before."""
     result = measured(tmp_path, *small(relief=0.0), {})
-    np.testing.assert_allclose(result.known.ratio, 1.0, atol=1e-3)
+    np.testing.assert_allclose(result.posterior.ratio, 1.0, atol=1e-3)
     assert result.explained
     assert not any(result.determined.values())
     assert any("Not determined by the images" in remark for remark in result.remarks)
@@ -136,7 +142,7 @@ def test_what_only_adds_up_is_known_only_as_a_sum(tmp_path: Path):
     assert (1 + common) * (1 + own) == pytest.approx(1.03, abs=5e-3)
     # Two beliefs of 3 % and 2 % and one exact sum leave 0.03 * 0.02 / hypot(0.03, 0.02) = 1.66 % for each.
     assert (common_sigma, own_sigma) == pytest.approx((0.0166, 0.0166), rel=0.05)
-    assert result.known.correlation[0, 1] < -0.95
+    assert result.posterior.correlation[0, 1] < -0.95
     assert not any(result.determined.values())
 
 
@@ -150,7 +156,7 @@ def test_fewer_electrons_are_less_certain_and_still_right(tmp_path: Path):
         result = measured(folder, drawn, process, FEW, electrons=electrons, margin=4)
         for name, (value, sigma) in found(result).items():
             assert abs(value - FEW[name]) < 4 * sigma, name
-        sigmas[electrons] = result.known.sigma
+        sigmas[electrons] = result.posterior.sigma
     # A tenth of the light: sqrt(10) in the shot noise, and more where the read noise matters.
     assert (sigmas[3e5] > 2.0 * sigmas[3e6]).all()
 
@@ -170,7 +176,7 @@ def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
     for name, (value, sigma) in found(half).items():
         assert abs(value - FEW[name]) < 5 * sigma, name
     # Half the light is sqrt(2) less certain; the scatter between blocks knows that to a fifth or so.
-    assert 1.1 < np.median(half.known.sigma / both.known.sigma) < 1.8
+    assert 1.1 < np.median(half.posterior.sigma / both.posterior.sigma) < 1.8
     assert half.explained
 
 
@@ -194,7 +200,7 @@ def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
     wrong = measured(tmp_path, drawn, process, {**FEW, "corner_radius_m": 0.8e-6})
     assert not wrong.explained
     assert "does not explain the images" in wrong.remarks[0]
-    assert wrong.known.inflation > 1.2
+    assert wrong.posterior.inflation > 1.2
 
 
 @pytest.mark.slow
@@ -216,52 +222,52 @@ def test_an_error_beyond_its_range_ends_at_the_end(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_the_global_search_helps_where_steps_end_astray(question: FitObjective):
+def test_the_global_search_helps_where_steps_end_astray(objective: FitObjective):
     """From a start two standard deviations off in everything, and the same for the same seed."""
-    far = replace(question.bench.unknowns, start=question.bench.unknowns.high * 0.9)
-    astray = FitObjective(replace(question.bench, unknowns=far), question.targets)
+    far = replace(objective.unknowns, start=objective.unknowns.high * 0.9)
+    astray = FitObjective(replace(objective.model, unknowns=far), objective.targets)
     alone = search(astray)
     helped = [search(astray, evaluations=80, seed=3) for _ in range(2)]
-    assert helped[0].lens.look.objective <= alone.lens.look.objective
-    np.testing.assert_array_equal(helped[0].lens.look.scores, helped[1].lens.look.scores)
-    values = astray.values(helped[0].lens.look.scores)
+    assert helped[0].at.cost <= alone.at.cost
+    np.testing.assert_array_equal(helped[0].at.scores, helped[1].at.scores)
+    values = astray.values(helped[0].at.scores)
     for name, value in zip(far.names, values, strict=True):
         assert value == pytest.approx(FEW[name], abs=0.05 * far.sigma[far.names.index(name)]), name
 
 
-def scores_near_the_truth(question: FitObjective) -> np.ndarray:
-    unknowns = question.bench.unknowns
+def scores_near_the_truth(objective: FitObjective) -> np.ndarray:
+    unknowns = objective.unknowns
     values = np.array([FEW[name] for name in unknowns.names])
-    return np.concatenate([unknowns.scores(values) + 0.05, np.full(len(question.motions), 0.02)])
+    return np.concatenate([unknowns.scores(values) + 0.05, np.full(len(objective.motions), 0.02)])
 
 
-def test_slopes_of_the_objective(question: FitObjective):
+def test_slopes_of_the_objective(objective: FitObjective):
     """Gauss-Newton's half gradient is that of the objective."""
-    weights = tuple(measured_weights(target, 0.01) for target in question.targets)
-    scores = scores_near_the_truth(question)
-    at = look(question, weights, scores)
-    lens = linearised(question, weights, at, slopes_at(question, at, np.full(len(scores), 0.01)))
-    gradient = 2 * (scores - sum(lens.descents))
+    weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
+    scores = scores_near_the_truth(objective)
+    at = evaluate(objective, weights, scores)
+    linear = linearised(objective, weights, at, difference_jacobian(objective, at, np.full(len(scores), 0.01)))
+    gradient = 2 * (scores - sum(linear.descents))
     for k in range(len(scores)):
         step = 0.005 * np.eye(len(scores))[k]
-        high, low = (look(question, weights, scores + sign * step).objective for sign in (1, -1))
+        high, low = (evaluate(objective, weights, scores + sign * step).cost for sign in (1, -1))
         # Differences of the objective, whose third derivative is felt at this step.
         assert gradient[k] == pytest.approx((high - low) / 0.01, rel=0.02, abs=0.02 * np.abs(gradient).max())
 
 
 @pytest.mark.slow
-def test_the_exact_gradient_agrees_and_polishes_nothing_away(question: FitObjective):
+def test_the_exact_gradient_agrees_and_polishes_nothing_away(objective: FitObjective):
     """Backwards through light and plate: the same slope as central differences, and the same place to end."""
-    weights = tuple(measured_weights(target, 0.01) for target in question.targets)
-    scores = scores_near_the_truth(question)
-    at, gradient = look_and_gradient(question, weights, scores)
-    lens = linearised(question, weights, at, slopes_at(question, at, np.full(len(scores), 0.005)))
-    expected = 2 * (scores - sum(lens.descents))
+    weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
+    scores = scores_near_the_truth(objective)
+    at, gradient = evaluate_with_gradient(objective, weights, scores)
+    linear = linearised(objective, weights, at, difference_jacobian(objective, at, np.full(len(scores), 0.005)))
+    expected = 2 * (scores - sum(linear.descents))
     np.testing.assert_allclose(gradient, expected, rtol=0.01, atol=0.01 * np.abs(expected).max())
-    plain, polished = search(question), search(question, polish=4)
-    assert polished.lens.look.objective <= plain.lens.look.objective
-    moved = question.values(polished.lens.look.scores) - question.values(plain.lens.look.scores)
-    assert (np.abs(moved) < posterior(question, plain).sigma).all()
+    plain, polished = search(objective), search(objective, polish=4)
+    assert polished.at.cost <= plain.at.cost
+    moved = objective.values(polished.at.scores) - objective.values(plain.at.scores)
+    assert (np.abs(moved) < posterior_of(objective, plain).sigma).all()
 
 
 def test_errors_are_named_as_users_name_them():

@@ -60,13 +60,14 @@ def test_every_picture_is_whole_and_repeatable(result: Calibration, tmp_path: Pa
 
 def test_a_difference_is_seen(result: Calibration, tmp_path: Path):
     """A bright pixel that the model lacks makes a red dot."""
-    at, fit = result.fit.lens.look, result.fit
+    at, fit = result.fit.at, result.fit
     spoilt = at.matches[0].residual.copy()
     y, x = np.argwhere(fit.weights[0] > 0)[100]
     spoilt[y, x] = 1e3 / np.sqrt(fit.weights[0][y, x])
-    look = at._replace(matches=(at.matches[0]._replace(residual=spoilt), *at.matches[1:]))
+    changed = at._replace(matches=(at.matches[0]._replace(residual=spoilt), *at.matches[1:]))
+    linear = fit.linearization._replace(at=changed)
     draw_fitted_psfs(tmp_path / "plain.png", result)
-    draw_fitted_psfs(tmp_path / "spoilt.png", replace(result, fit=fit._replace(lens=fit.lens._replace(look=look))))
+    draw_fitted_psfs(tmp_path / "spoilt.png", replace(result, fit=fit._replace(linearization=linear)))
     plain, dotted = (imread(tmp_path / name)[..., :3] for name in ("plain.png", "spoilt.png"))
     changed = np.abs(plain - dotted).sum(axis=2) > 0.05
     rows, columns = np.nonzero(changed)
