@@ -17,7 +17,8 @@ import numpy as np
 
 from bench.reference import wrapped_map
 from doedesign.build import camera_from_spec, process_from_spec
-from doedesign.prediction import Drawn, predict
+from doedesign.design.design import Design
+from doedesign.prediction import predict
 from doedesign.spec import load_spec
 from doedesign.tolerancing.pool import Work, evaluate_here, predicted_rows
 from fab.level_map import LevelMap
@@ -30,7 +31,7 @@ SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
 TARGET_RATIO, TARGET_PEAK_GB, TARGET_SPEEDUP = 6.0, 4.0, 1.7
 
 
-def make_task(cells: int) -> tuple[Drawn, Process]:
+def make_task(cells: int) -> tuple[Design, Process]:
     """The automotive camera with a plate of so many cells, and the contact aligner."""
     aperture = f"doe.aperture={cells * 1.85} um"
     spec = load_spec(SPEC, (f"doe.samples={cells}", aperture, "process.stock=contact_aligner"))
@@ -38,28 +39,28 @@ def make_task(cells: int) -> tuple[Drawn, Process]:
     full = levels.count * levels.step_m
     height = np.mod(wrapped_map(cells, smooth_cells=4.0), full)
     level = quantise(height, levels)
-    level = LevelMap(level, levels, camera.grid, spec.doe.aperture_m).level
-    drawn = Drawn("bench", level, levels, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
-    return drawn, process_from_spec(spec.process)
+    level_map = LevelMap(level, levels, camera.grid, spec.doe.aperture_m, "bench")
+    design = Design(level_map, camera, spec.scene.near_m[:1], spec.scene.far_m[:1])
+    return design, process_from_spec(spec.process)
 
 
-def time_draws(drawn: Drawn, process: Process, rounds: int) -> None:
+def time_draws(design: Design, process: Process, rounds: int) -> None:
     """Print draw against nominal bank."""
-    height = height_of(drawn.level, drawn.levels).astype(np.float32)
-    side = max(drawn.camera.grid.extent_m)
+    height = height_of(design.level_map.level, design.levels).astype(np.float32)
+    side = max(design.camera.grid.extent_m)
     draw_s, bank_s, ratios = [], [], []
     for index in range(rounds + 1):
         start = time.perf_counter()
-        predict(drawn, process, normal_draw(process, 0, index, side))
+        predict(design, process, normal_draw(process, 0, index, side))
         middle = time.perf_counter()
-        psf_bank(drawn.camera, height, drawn.depths_m)
+        psf_bank(design.camera, height, design.depths_m)
         end = time.perf_counter()
         if index:  # the first round compiles
             draw_s.append(middle - start)
             bank_s.append(end - middle)
             ratios.append(draw_s[-1] / bank_s[-1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-    ratio, cells = float(np.median(ratios)), drawn.camera.grid.shape[0]
+    ratio, cells = float(np.median(ratios)), design.camera.grid.shape[0]
     print(f"Plate as fabricated, N = {cells}, 16 levels, 3 colours, 2 depths, every error of a contact aligner")
     print(f"  draw {np.median(draw_s):6.2f} s    PSFs of the plate as drawn {np.median(bank_s):6.2f} s")
     verdict = "ok" if ratio <= TARGET_RATIO else "missed"
@@ -67,23 +68,23 @@ def time_draws(drawn: Drawn, process: Process, rounds: int) -> None:
     print(f"  peak {peak:6.2f} GB  (target < {TARGET_PEAK_GB:g}: {'ok' if peak < TARGET_PEAK_GB else 'missed'})")
 
 
-def seconds_of(drawn: Drawn, process: Process, count: int, workers: int) -> float:
+def seconds_of(design: Design, process: Process, count: int, workers: int) -> float:
     """Seconds that `count` draws take after each worker has compiled its first ones."""
-    side = max(drawn.camera.grid.extent_m)
+    side = max(design.camera.grid.extent_m)
     plates = {f"normal/{i}": normal_draw(process, 0, i, side) for i in range(count + 2 * workers)}
     begun = 0.0
-    for done, _ in enumerate(evaluate_here(Work(predicted_rows, drawn, process), plates, workers), 1):
+    for done, _ in enumerate(evaluate_here(Work(predicted_rows, design, process), plates, workers), 1):
         if done == 2 * workers:
             begun = time.perf_counter()
     return time.perf_counter() - begun
 
 
-def time_workers(drawn: Drawn, process: Process) -> None:
+def time_workers(design: Design, process: Process) -> None:
     """Print the rates of one worker and of two, and of 12 and of 24 draws."""
-    one, two = (seconds_of(drawn, process, 24, workers) for workers in (1, 2))
-    half = seconds_of(drawn, process, 12, 1)
+    one, two = (seconds_of(design, process, 24, workers) for workers in (1, 2))
+    half = seconds_of(design, process, 12, 1)
     speedup, growth = one / two, one / half
-    print(f"  24 draws, N = {drawn.camera.grid.shape[0]}: one worker {one:.1f} s, two workers {two:.1f} s")
+    print(f"  24 draws, N = {design.camera.grid.shape[0]}: one worker {one:.1f} s, two workers {two:.1f} s")
     verdict = "ok" if speedup >= TARGET_SPEEDUP else "missed"
     print(f"  two workers / one {speedup:5.2f}  (target >= {TARGET_SPEEDUP:g}: {verdict})")
     print(f"  24 draws / 12 draws {growth:5.2f}  (linear: 2)")

@@ -92,7 +92,7 @@ def stepping(spec: Spec) -> Call:
 # --- the floor -------------------------------------------------------------------------------------------------------
 
 
-def drawn(*shape: int) -> jax.Array:
+def design(*shape: int) -> jax.Array:
     """Numbers for a bare computation."""
     return jnp.asarray(np.random.default_rng(0).random(shape, np.float32))
 
@@ -100,9 +100,9 @@ def drawn(*shape: int) -> jax.Array:
 def transforms(count: int, length: int, forth: bool = True) -> Call:
     """So many real transforms of `length`², forth or back."""
     if forth:
-        images, run = drawn(count, length, length), jax.jit(jnp.fft.rfft2)
+        images, run = design(count, length, length), jax.jit(jnp.fft.rfft2)
         return lambda: run(images).block_until_ready()
-    spectra, back = jnp.fft.rfft2(drawn(count, length, length)), jax.jit(lambda s: jnp.fft.irfft2(s, (length, length)))
+    spectra, back = jnp.fft.rfft2(design(count, length, length)), jax.jit(lambda s: jnp.fft.irfft2(s, (length, length)))
     return lambda: back(spectra).block_until_ready()
 
 
@@ -163,13 +163,13 @@ def network_floor(network: Network, size: int, window: int) -> tuple[list[Call],
 
 def bare_convolution(shape: tuple[int, ...], kernel: tuple[int, ...], stride: int) -> list[Call]:
     """A convolution, its gradient by the image and by the weights, in the fastest forms known."""
-    image, weights, margin = drawn(*shape), drawn(*kernel), kernel[0] // 2
+    image, weights, margin = design(*shape), design(*kernel), kernel[0] // 2
     sides = [(margin, margin)] * 2
 
     def plain(image: jax.Array, weights: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(image, weights, (stride, stride), sides, dimension_numbers=_DIMENSIONS)
 
-    slope = drawn(*jax.eval_shape(plain, image, weights).shape)
+    slope = design(*jax.eval_shape(plain, image, weights).shape)
     by_image = [jax.jit(lambda s: jax.linear_transpose(lambda i: plain(i, weights), image)(s)[0])]
     if stride == 1:
         turned = weights[::-1, ::-1].transpose(0, 1, 3, 2)
@@ -189,7 +189,7 @@ def bare_convolution(shape: tuple[int, ...], kernel: tuple[int, ...], stride: in
 def bare_doubled(shape: tuple[int, ...], kernel: tuple[int, ...]) -> list[Call]:
     """A transposed convolution of size and stride 2 is one matrix product, and so are its gradients."""
     pixels, inputs, outputs = shape[1] * shape[2], kernel[0], 4 * kernel[3]
-    image, weights, slope = drawn(pixels, inputs), drawn(inputs, outputs), drawn(pixels, outputs)
+    image, weights, slope = design(pixels, inputs), design(inputs, outputs), design(pixels, outputs)
     product = jax.jit(jnp.dot)
     pairs = ((image, weights), (slope, weights.T), (image.T, slope))
     return [lambda pair=pair: product(*pair).block_until_ready() for pair in pairs]

@@ -1,6 +1,7 @@
 """From a spec to the values the physics works on. The only file that knows both."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
+from fab.stock import STOCK
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -89,18 +91,33 @@ def wafer_from_spec(spec: WaferSpec) -> Wafer:
     return Wafer(**spec.model_dump())
 
 
-def process_for(levels: Levels, spec: ProcessSpec, file: Path | None = None) -> Process:
-    """The process of a design: that of a file where one is given, else that of its spec.
+def resolve_process(
+    given: "Process | ProcessSpec | str | Path | None", levels: Levels, default: ProcessSpec | None = None
+) -> Process:
+    """Return a process for a staircase, however it was named.
+
+    Args:
+        given: a process or its spec; the name of a stock process; a TOML file; None for the default.
+        levels: the staircase it must make.
+        default: the process of the design's spec, from which a stock process takes levels and step; an ideal process
+            if there is none.
 
     Raises:
-        InputError: the file cannot be read, or is for another staircase.
+        InputError: the file cannot be read, or the process makes another staircase.
     """
-    made = process_from_spec(spec if file is None else load_process(file), levels)
-    return matching(levels, made, str(file or "process"))
+    if isinstance(given, Process):
+        return require_levels_of(given, levels, "process")
+    if isinstance(given, str) and given in STOCK:
+        stock = process_from_json({"levels": levels.count, "level_step_m": levels.step_m, "stock": given}, given)
+        return process_from_spec(stock.model_copy(update={"etch_depths_m": "optimize"}), levels)
+    if isinstance(given, str | Path):
+        return require_levels_of(process_from_spec(load_process(given), levels), levels, str(given))
+    spec = default if given is None else given
+    return Process(levels) if spec is None else require_levels_of(process_from_spec(spec, levels), levels, "process")
 
 
-def matching(levels: Levels, process: Process, where: str) -> Process:
-    """A process as it is, if it makes the staircase of a design.
+def require_levels_of(process: Process, levels: Levels, where: str) -> Process:
+    """Return a process that makes a staircase.
 
     Raises:
         InputError: it makes another one.
@@ -108,6 +125,21 @@ def matching(levels: Levels, process: Process, where: str) -> Process:
     if process.levels != levels:
         raise InputError(where, f"must be for {levels.told}", process.levels.told, "Give a process for this design.")
     return process
+
+
+def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
+    """Return the process as a design sees it through masks whose edges were moved: with another line-width bias.
+
+    Args:
+        process: the process.
+        edge_moves_m: how far every edge of each mask was moved outward, mask 0 first, metres; empty for none.
+    """
+    if not any(edge_moves_m):
+        return process
+    names = [f"cd_bias_m[{mask}]" for mask in range(process.masks)]
+    old = [process.spreads.get(name, Normal()) for name in names]
+    moved = {name: Normal(one.mean + move, one.sigma) for name, one, move in zip(names, old, edge_moves_m, strict=True)}
+    return replace(process, spreads={**process.spreads, **moved})
 
 
 def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Normal]]:

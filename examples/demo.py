@@ -19,7 +19,8 @@ from doedesign.cli import exit_code
 from doedesign.commands.masks import verify, write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
-from doedesign.runs.level_maps import level_map_from
+from doedesign.design.design import Design
+from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length
@@ -43,29 +44,29 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
         print(f"  {text}", file=sys.stderr, flush=True)
 
     say(f"1/3 optimising {spec_path}")
-    run = optimize(spec_path, runs / load_spec(spec_path).name, (), say)
+    folder = runs / load_spec(spec_path).name
+    design = optimize(spec_path, folder)
 
-    order = masks / run.spec.name
-    say(f"2/3 drawing {run.spec.process.levels} levels into {order}")
-    if run_is_drawn(run.folder, order):
+    order = masks / design.name
+    say(f"2/3 drawing {design.levels.count} levels into {order}")
+    if is_drawn(design, order):
         report = verify(order)
         report.require()
     else:
-        order, report = write_masks(run.folder, level_map_from(run.folder, run.spec.process.levels), order, say=say)
+        order, report = write_masks(drawing_from(folder, design.levels.count), order, say=say)
 
-    light = run.path("psf")
+    light = folder / "psf"
     say(f"3/3 PSFs of the continuous, the quantised and the drawn design into {light}")
     if not (light / "from_masks.exr").is_file():
-        psf(run.folder, order, say=say)
-    return summary(run.folder, order, light, len(report.checks))
+        psf(folder, order, say=say)
+    return summary(folder, order, light, len(report.checks))
 
 
-def run_is_drawn(run_folder: Path, order: Path) -> bool:
-    """Whether a mask order of exactly this run's height map lies there already."""
+def is_drawn(design: Design, order: Path) -> bool:
+    """Whether a mask order of exactly this level map lies there already."""
     if not (order / MANIFEST_NAME).is_file():
         return False
-    drawn = read_json(order / MANIFEST_NAME).get("source", {}).get("height_sha256")
-    return drawn == read_json(run_folder / MANIFEST_NAME).get("results_sha256", {}).get("height.exr")
+    return read_json(order / MANIFEST_NAME).get("level_map_sha256") == design.level_map.digest
 
 
 def summary(run_folder: Path, order: Path, light: Path, checks: int) -> str:

@@ -48,13 +48,12 @@ from explain_plates import (
     Seen,
     bench_of,
     explain,
-    say,
 )
 
 from doedesign.cli import exit_code
 from doedesign.commands.optimize import optimize
 from doedesign.report.canvas import length_text
-from doedesign.runs.folder import Run
+from doedesign.runs.folder import Run, open_run
 from fab.files import canonical_json, write_atomic
 from fab.units import UM
 
@@ -91,7 +90,8 @@ def design(scale: int = 4, changes: Sequence[str] = RING, runs: Path = Path("run
         f'scene.near=["{120 / scale:.12g} mm"]',
         'scene.far=["inf"]',
     )
-    return optimize(HERE / "automotive.toml", runs / name, (*geometry, *changes), say)
+    optimize(HERE / "automotive.toml", runs / name, overrides=(*geometry, *changes))
+    return open_run(runs / name)
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------

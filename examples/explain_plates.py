@@ -11,11 +11,10 @@ import numpy as np
 
 from doedesign.build import camera_from_spec
 from doedesign.calibration import Family, Targets, explanations
-from doedesign.prediction import Drawn, Prediction, predict
+from doedesign.design.design import Design
+from doedesign.prediction import Prediction, predict
 from doedesign.runs.folder import Run
-from doedesign.runs.level_maps import LevelMap as RunMap
-from doedesign.runs.level_maps import levels_of_run
-from fab.level_map import LevelMap
+from doedesign.runs.level_maps import level_map_of_run
 from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour
@@ -71,16 +70,16 @@ class Bench:
 def bench_of(run: Run) -> Bench:
     """The bench of a finished run."""
     camera = replace(camera_from_spec(run.spec), colours=LINES)
-    return Bench(levels_of_run(run), camera, run.spec.scene.near_m[0])
+    return Bench(level_map_of_run(run), camera, run.spec.scene.near_m[0])
 
 
 @lru_cache(maxsize=32)
-def lifted(bench: Bench, lift: int) -> Drawn:
+def lifted(bench: Bench, lift: int) -> Design:
     """The design raised by some steps, modulo one wave. Kept, since predictions know a design by its level map."""
     drawing = bench.drawing
     raised = (drawing.level + lift) % drawing.levels.count
-    level = LevelMap(raised, drawing.levels, drawing.grid, drawing.aperture_m).level
-    return Drawn(f"lift {lift}", level, drawing.levels, bench.camera, (bench.near_m,), ())
+    level_map = replace(drawing, level=raised, name=f"lift {lift}")
+    return Design(level_map, bench.camera, (bench.near_m,), ())
 
 
 @dataclass(frozen=True)

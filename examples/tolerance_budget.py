@@ -36,12 +36,9 @@ PROCESS = {
 def design(spec: Path = HERE / "quick.toml", runs: Path = Path("runs"), overrides: tuple[str, ...] = ()) -> Path:
     """A small design to study; a finished one is taken as it is."""
     changes = ("optimize.steps=20", 'optics.wavelengths=["550 nm"]', 'scene.near=["10 mm"]', 'scene.far=["1.2 m"]')
-    return optimize(spec, runs / "tolerance-example", (*changes, *overrides), say).folder
-
-
-def say(text: str) -> None:
-    """Talk goes to stderr."""
-    print(f"  {text}", file=sys.stderr, flush=True)
+    folder = runs / "tolerance-example"
+    optimize(spec, folder, overrides=(*changes, *overrides))
+    return folder
 
 
 def budgets(

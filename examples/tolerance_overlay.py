@@ -26,12 +26,9 @@ HERE = Path(__file__).parent
 def design(spec: Path = HERE / "quick.toml", runs: Path = Path("runs"), overrides: tuple[str, ...] = ()) -> Path:
     """A small design to study; a finished one is taken as it is."""
     changes = ("optimize.steps=20", 'optics.wavelengths=["550 nm"]', 'scene.near=["10 mm"]', 'scene.far=["1.2 m"]')
-    return optimize(spec, runs / "tolerance-example", (*changes, *overrides), say).folder
-
-
-def say(text: str) -> None:
-    """Talk goes to stderr."""
-    print(f"  {text}", file=sys.stderr, flush=True)
+    folder = runs / "tolerance-example"
+    optimize(spec, folder, overrides=(*changes, *overrides))
+    return folder
 
 
 def overlay(run: Path, draws: int = 40, sigma: str = "0.25 um", workers: int | None = None) -> str:
@@ -73,7 +70,7 @@ def strehl_by_mask(changes: list[Change]) -> list[tuple[float, float]]:
 def draw(folder: Path, asked: Study, plates: Plates, drawn: Plates, changes: list[Change]) -> list[Path]:
     """Histograms of the plates, and what every mask does alone."""
     files = [folder / "histograms.png", folder / "masks.png"]
-    draw_histograms(files[0], asked.drawn.camera, plates.table, drawn.table, asked.limits)
+    draw_histograms(files[0], asked.design.camera, plates.table, drawn.table, asked.limits)
     draw_changes(files[1], changes)
     return files
 

@@ -258,7 +258,8 @@ def written(found: dict[str, Any]) -> str:
 
 def run(plan: Plan) -> dict[str, Any]:
     """Train everything and write the table."""
-    design = optimize(plan.spec, plan.out / "design", (), say).folder
+    design = plan.out / "design"
+    optimize(plan.spec, design)
     found = {}
     for model in plan.models:
         judged = {camera: [trained(plan, design, model, camera, seed) for seed in plan.seeds] for camera in CAMERAS}

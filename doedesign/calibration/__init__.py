@@ -44,7 +44,7 @@ from doedesign.calibration.uncertainty import (
     readings,
 )
 from doedesign.calibration.unknowns import Unknowns, unknowns_of
-from doedesign.prediction import Drawn
+from doedesign.design.design import Design
 from fab.process import Normal, Process
 
 __all__ = [
@@ -108,7 +108,7 @@ class Calibration:
 
 
 def calibrate(
-    drawn: Drawn,
+    design: Design,
     process: Process,
     measurement: Measurement,
     errors: Sequence[str] = (),
@@ -121,7 +121,7 @@ def calibrate(
     """Find the process errors that explain measured PSFs.
 
     Args:
-        drawn: the design as drawn.
+        design: the design as drawn.
         process: the process, whose means and standard deviations are the prior.
         measurement: the images.
         errors: which errors to look for, see `unknowns_of`.
@@ -134,10 +134,11 @@ def calibrate(
         InputError: an unknown error, or an image that does not fit.
     """
     spec = measurement.spec
-    fill = drawn.camera.fill if spec.fill_factor is None else spec.fill_factor
-    camera = probe_camera(drawn.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
+    fill = design.camera.fill if spec.fill_factor is None else spec.fill_factor
+    camera = probe_camera(design.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
     unknowns = unknowns_of(process, errors, camera.grid.pitch_m)
-    model = ForwardModel(drawn.level, camera, process, unknowns, tuple(shot.depth_m for shot in measurement.shots))
+    depths_m = tuple(shot.depth_m for shot in measurement.shots)
+    model = ForwardModel(design.level_map.level, camera, process, unknowns, depths_m)
     nominal = model.plate(unknowns.start)
     expected = [nominal.image(i, np.zeros(3)) for i in range(len(measurement.shots))]
     each = zip(measurement.shots, expected, strict=True)

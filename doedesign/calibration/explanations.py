@@ -22,7 +22,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from doedesign.calibration.unknowns import ASSUMED, chosen_names, definite_means
-from doedesign.prediction import Drawn, predict
+from doedesign.design.design import Design
+from doedesign.prediction import predict
 from fab.errors import InputError
 from fab.process import DEVIATIONS, Process, variation_of
 from sim.camera import Colour
@@ -127,7 +128,7 @@ class Family(NamedTuple):
 class _Walk:
     """The model as a function of scores, remembered."""
 
-    drawn: Drawn
+    design: Design
     process: Process
     sigma: Mapping[str, float]
     targets: Targets
@@ -153,7 +154,7 @@ class _Walk:
             return None
         means = definite_means(self.process)
         try:
-            rows = predict(self.drawn, self.process, variation_of(self.process.masks, {**means, **values})).rows
+            rows = predict(self.design, self.process, variation_of(self.process.masks, {**means, **values})).rows
         except InputError:
             if not scores:
                 raise
@@ -190,7 +191,7 @@ class _Walk:
 
 
 def explanations(
-    drawn: Drawn,
+    design: Design,
     process: Process,
     targets: Targets,
     errors: Sequence[str] = (),
@@ -202,7 +203,7 @@ def explanations(
     """Find what would explain a measured ring:disc ratio.
 
     Args:
-        drawn: the design as drawn.
+        design: the design as drawn.
         process: the process, whose means and standard deviations say what is plausible.
         targets: what was measured.
         errors: errors to consider, as in `unknowns_of`; by default every kind that a plate has in a definite way.
@@ -217,18 +218,18 @@ def explanations(
         InputError: an unknown error, a ratio that is not positive, or a depth at which there is no disc.
     """
     probe = Colour("probe", (targets.wavelength_m,), (1.0,))
-    drawn = replace(drawn, camera=replace(drawn.camera, colours=(probe,)), near_m=(targets.depth_m,), far_m=())
+    design = replace(design, camera=replace(design.camera, colours=(probe,)), near_m=(targets.depth_m,), far_m=())
     if not 0 < targets.ring_to_disc < np.inf:
         raise InputError(
             "--ring-to-disc", "must be positive", targets.ring_to_disc, "Give ring energy over disc energy."
         )
-    if drawn.camera.defocus_radius_m(targets.depth_m) < drawn.camera.pixel_m:
+    if design.camera.defocus_radius_m(targets.depth_m) < design.camera.pixel_m:
         rule = "the source must be near enough to be blurred by more than a pixel"
         raise InputError("--depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
     names = chosen_names(process.masks, errors or _DEFAULT)
     stated = {name: process.spreads[name].sigma for name in names if name in process.spreads}
     assumed = {name: ASSUMED[name.partition("[")[0]] for name in names if not stated.get(name)}
-    walk = _Walk(drawn, process, {**stated, **assumed}, targets, reach, on_model)
+    walk = _Walk(design, process, {**stated, **assumed}, targets, reach, on_model)
     nominal = walk.row({})
     assert nominal is not None  # otherwise the model has refused it
     singles, none = [], []

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key
 
 from doedesign.capture.from_spec import channels_from_rgb
 from doedesign.capture.scenes import SceneItem
-from doedesign.prediction import Drawn
+from doedesign.design.design import Design
 from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.imaging.convolve import Border
@@ -113,13 +113,13 @@ def _within(image: np.ndarray, margin_px: int) -> np.ndarray:
     return image[..., first : first + y, first : first + x]
 
 
-def plate_psfs(drawn: Drawn, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
+def plate_psfs(design: Design, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
     """PSFs of the plate by depth; exactly at the depth asked for, and kept while a simulation lasts."""
-    made_by, variation = (process or Process(drawn.levels)), (errors or Variation())
+    made_by, variation = (process or Process(design.levels)), (errors or Variation())
 
     @lru_cache(maxsize=1)
     def surface() -> Any:
-        return as_fabricated(drawn.level, camera, made_by, variation)
+        return as_fabricated(design.level_map.level, camera, made_by, variation)
 
     @lru_cache(maxsize=8)
     def at(depth_m: float) -> Float[np.ndarray, "c y x"]:

@@ -17,12 +17,11 @@ def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_
         out: Run folder; runs/NAME by default.
     """
     from doedesign.commands.optimize import optimize as work
-    from doedesign.spec import load_spec, spec_warnings
+    from doedesign.spec import load_spec
 
-    for warning in spec_warnings(load_spec(spec, set_)):
-        say(f"warning: {warning}")
-    run = work(spec, out, set_, say)
-    print_paths([run.folder], json_, metrics=str(run.path("metrics.json")))
+    folder = out or Path("runs") / load_spec(spec, set_).name
+    work(spec, folder, overrides=set_)
+    print_paths([folder], json_, metrics=str(folder / "metrics.json"))
 
 
 def masks(
@@ -79,9 +78,9 @@ def masks(
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
     from doedesign.commands.masks import write_masks
     from doedesign.lab.predictions import PROBE_M
-    from doedesign.runs.level_maps import level_map_from
+    from doedesign.runs.level_maps import drawing_from
 
-    drawing = level_map_from(
+    drawing = drawing_from(
         source,
         levels,
         step_m=length_of("--step", step),
@@ -93,7 +92,6 @@ def masks(
     probe_m = PROBE_M if probe is None else length_of("--probe", probe) or PROBE_M
     window = _patch(patch, mesh_patch)
     folder, report = write_masks(
-        source,
         drawing,
         out,
         on_violation=on_violation,

@@ -1,9 +1,11 @@
 """What commands print, and how they end. stdout is data (paths, or JSON with --json), stderr is talk."""
 
+import contextlib
 import json
+import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,29 @@ from fab.errors import CheckFailed, InputError
 def say(text: str) -> None:
     """Tell what is going on."""
     print(text, file=sys.stderr, flush=True)
+
+
+class _Stderr(logging.Handler):
+    """Shows what the library logs: plain lines, warnings as such."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(f"warning: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
+
+
+@contextlib.contextmanager
+def shown_log() -> Iterator[None]:
+    """Show on stderr what the library logs meanwhile."""
+    log, handler = logging.getLogger("doedesign"), _Stderr()
+    before, propagate = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
+        log.propagate = propagate
 
 
 def print_text(text: str) -> None:
@@ -42,7 +67,8 @@ def exit_code(work: Callable[[], Any]) -> int:
         0 done, 1 a check failed, 2 bad input, 130 interrupted.
     """
     try:
-        work()
+        with shown_log():
+            work()
     except InputError as error:
         say(f"doedesign: {error}")
         return 2

@@ -4,16 +4,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from doedesign.build import process_for
+from doedesign.build import resolve_process
 from doedesign.commands.psf import Say, require_own
+from doedesign.design.design import Design
 from doedesign.lab.as_built import AsBuiltDoe, compared, gratings_compared, plate_of
-from doedesign.prediction import Drawn, drawn_of, predict
+from doedesign.prediction import predict
 from doedesign.report.pictures import draw_psfs
 from doedesign.runs.folder import alone_in, open_run
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
-from fab.level_map import LevelMap
 from fab.process import DEVIATIONS, Process
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.store import write_bank
@@ -55,16 +56,15 @@ def as_built(
             model.
     """
     run = open_run(run_folder)
-    drawn = drawn_of(run, masks)
-    made_by = process_for(drawn.levels, run.spec.process, process)
-    level_map = LevelMap(drawn.level, drawn.levels, drawn.camera.grid, drawn.camera.aperture_m, drawn.name)
-    measured = read_as_built(file, level_map)
+    design = open_design(run, masks)
+    made_by = resolve_process(process, design.levels, run.spec.process)
+    measured = read_as_built(file, design.level_map)
     plate = plate_of(measured, made_by)
     say(_told(plate))
     folder = run.path("as-built")
     require_own(folder)
     with alone_in(run.folder), atomic_folder(folder) as fresh:
-        rows = _write(fresh, drawn, made_by, measured, plate, file)
+        rows = _write(fresh, design, made_by, measured, plate, file)
     for line in _lines(rows):
         say(line)
     return folder
@@ -79,34 +79,34 @@ def _told(plate: AsBuiltDoe) -> str:
 
 
 def _write(
-    folder: Path, drawn: Drawn, process: Process, measured: AsBuilt, plate: AsBuiltDoe, file: Path
+    folder: Path, design: Design, process: Process, measured: AsBuilt, plate: AsBuiltDoe, file: Path
 ) -> list[dict[str, Any]]:
     try:
-        prediction = predict(drawn, process, plate.variation)
+        prediction = predict(design, process, plate.variation)
     except InputError as error:
         raise InputError(f"{file}: {error.where}", error.rule, error.got, error.cure) from error
     rows = compared(prediction.rows, measured.predicted)
     found = {
         "format": FORMAT,
-        "design": drawn.name,
-        "level_map_sha256": drawn.digest(),
+        "design": design.name,
+        "level_map_sha256": design.level_map.digest,
         "units": "SI; a depth of null is infinity; null in a comparison is what the sheet does not say",
         "notes": dict(measured.notes),
         "errors": [{**one._asdict(), "unit": DEVIATIONS[one.error.partition("[")[0]].unit} for one in plate.taken],
         "etch_lag_per_nm": plate.lag_per_nm,
         "comparison": rows,
-        "gratings": gratings_compared(measured, process, plate.variation, drawn.camera.material),
+        "gratings": gratings_compared(measured, process, plate.variation, design.camera.material),
     }
-    write_bank(folder / "as-built.exr", prediction.bank, {"design": drawn.name, "plate": "as built"})
-    draw_psfs(folder / "as-built_psf.png", drawn.camera, prediction.bank, drawn.near_m, drawn.far_m)
+    write_bank(folder / "as-built.exr", prediction.bank, {"design": design.name, "plate": "as built"})
+    draw_psfs(folder / "as-built_psf.png", design.camera, prediction.bank, design.near_m, design.far_m)
     (folder / "as-built.json").write_bytes(canonical_json(found))
-    head = [f"plate of {drawn.name} as it was measured"]
+    head = [f"plate of {design.name} as it was measured"]
     (folder / "variation.toml").write_text(variation_to_toml(plate.variation, head), encoding="utf-8")
     digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
     manifest = {
         "format": FORMAT,
-        "run": drawn.name,
-        "level_map_sha256": drawn.digest(),
+        "run": design.name,
+        "level_map_sha256": design.level_map.digest,
         "measured_sha256": sha256_file(file),
         "results_sha256": digests,
     }

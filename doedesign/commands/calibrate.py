@@ -10,16 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.build import process_for, process_spec_of
+from doedesign.build import process_spec_of, with_edge_moves
 from doedesign.calibration import Calibration, Explanation, Family, Measurement, Targets, explanations, load_shots
 from doedesign.calibration import calibrate as fitted
 from doedesign.calibration.unknowns import unknowns_of
 from doedesign.commands.psf import require_own
-from doedesign.prediction import Drawn, drawn_of, process_with_moves
+from doedesign.design.design import Design
 from doedesign.report.calibration import value_text
 from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
 from doedesign.report.tolerance import error_label
 from doedesign.runs.folder import Run, alone_in, open_run
+from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import ProcessSpec, load_process, process_to_toml, variation_to_toml
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
@@ -63,10 +64,10 @@ def calibrate(
     Raises:
         InputError: something that cannot be used.
     """
-    run, folder, drawn, believed = _begun(run_folder, out, "calibration", masks, process)
+    run, folder, design, believed = _begun(run_folder, out, "calibration", masks, process)
     spec = _process_spec(run, process)
-    unknowns = unknowns_of(believed, errors, drawn.camera.grid.pitch_m)  # mistakes are told before files are read
-    measured = load_shots(measurement, drawn.camera, lambda name: say(f"reading {name}"))
+    unknowns = unknowns_of(believed, errors, design.camera.grid.pitch_m)  # mistakes are told before files are read
+    measured = load_shots(measurement, design.camera, lambda name: say(f"reading {name}"))
     for name, pixels in measured.full.items():
         if pixels and measured.spec.channel is None:
             say(f"{name}: {pixels} pixels are full in every exposure and left out")
@@ -74,10 +75,10 @@ def calibrate(
         # Usually seven rounds of slopes and a step.
         with _models("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
             settings = {"evaluations": evaluations, "polish": polish, "seed": seed, "on_model": on_model}
-            result = fitted(drawn, believed, measured, errors, **settings)
+            result = fitted(design, believed, measured, errors, **settings)
             # What was found is relative to the design; what the process does, to the masks.
-            back = [-move for move in drawn.edge_moves_m]
-            result = replace(result, process=process_with_moves(result.process, back))
+            back = [-move for move in design.edge_moves_m]
+            result = replace(result, process=with_edge_moves(result.process, back))
         _write(fresh, run, spec, measured, result)
     say(summary(result))
     return folder, result
@@ -114,11 +115,11 @@ def explain(
     Raises:
         InputError: something that cannot be used.
     """
-    run, folder, drawn, believed = _begun(run_folder, out, "explanations", masks, process)
+    run, folder, design, believed = _begun(run_folder, out, "explanations", masks, process)
     with _written(run, folder) as fresh:
         # About ten plates for every error and six for a pair.
         with _models("explanations", 200) as on_model:
-            family = explanations(drawn, believed, targets, errors, pairs=pairs, reach=reach, on_model=on_model)
+            family = explanations(design, believed, targets, errors, pairs=pairs, reach=reach, on_model=on_model)
         text = family_text(family)
         (fresh / "explanations.json").write_bytes(canonical_json({"run": run.spec.name, **_family_record(family)}))
         (fresh / "explanations.txt").write_text(text + "\n", encoding="utf-8")
@@ -129,14 +130,13 @@ def explain(
 
 def _begun(
     run_folder: Path, out: Path | None, name: str, masks: Path | None, process: Path | None
-) -> tuple[Run, Path, Drawn, Process]:
+) -> tuple[Run, Path, Design, Process]:
     """A run, the folder for what is found, what its masks draw, and the process as the design sees it through them."""
     run = open_run(run_folder)
     folder = out or run.path(name)
     require_own(folder)
-    drawn = drawn_of(run, masks)
-    made = process_for(drawn.levels, run.spec.process, process)
-    return run, folder, drawn, process_with_moves(made, drawn.edge_moves_m)
+    design = open_design(run, masks)
+    return run, folder, design, design.process(process)
 
 
 def _process_spec(run: Run, process: Path | None) -> ProcessSpec:

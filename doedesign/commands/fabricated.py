@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.build import process_for
 from doedesign.commands.psf import Say, require_own
-from doedesign.prediction import Drawn, drawn_of, plate_rows, process_with_moves
+from doedesign.design.design import Design
+from doedesign.prediction import plate_rows
 from doedesign.report.pictures import draw_psfs, draw_split
 from doedesign.runs.folder import alone_in, open_run
+from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_variation, variation_to_toml
 from fab.draws import EXPECTED, variation_at
@@ -54,24 +55,24 @@ def fabricated(
         CheckFailed: leaked and diffracted light do not make up the plate's.
     """
     run = open_run(run_folder)
-    drawn = drawn_of(run, masks)
-    made_by = process_with_moves(process_for(drawn.levels, run.spec.process, process), drawn.edge_moves_m)
-    plate, source = errors_of_plate(drawn, made_by, variation, seed, draw)
+    design = open_design(run, masks)
+    made_by = design.process(process)
+    plate, source = errors_of_plate(design, made_by, variation, seed, draw)
     say(f"plate: {source}")
     folder = run.path("fabricated")
     require_own(folder)
     with alone_in(run.folder), atomic_folder(folder) as fresh:
-        _write(fresh, drawn, made_by, plate, source, say)
+        _write(fresh, design, made_by, plate, source, say)
     return folder
 
 
 def errors_of_plate(
-    drawn: Drawn, process: Process, file: Path | None, seed: int | None, draw: str
+    design: Design, process: Process, file: Path | None, seed: int | None, draw: str
 ) -> tuple[Variation, str]:
     """Errors of one plate, and a few words on where they come from.
 
     Args:
-        drawn: the design.
+        design: the design.
         process: what makes it.
         file: TOML file with the errors.
         seed: take them from this seed of the process instead.
@@ -88,37 +89,37 @@ def errors_of_plate(
     if file is not None:
         return load_variation(file), f"errors of {file.name}"
     key = EXPECTED if seed is None else draw
-    errors = variation_at(process, seed or 0, max(drawn.camera.grid.extent_m), key)
+    errors = variation_at(process, seed or 0, max(design.camera.grid.extent_m), key)
     if seed is not None:
         return errors, f"draw {key} of seed {seed} of the process {process.name}"
     return errors, f"every error of the process {process.name} at its mean"
 
 
-def _write(folder: Path, drawn: Drawn, process: Process, plate: Variation, source: str, say: Say) -> None:
-    camera = drawn.camera
-    surface = as_fabricated(drawn.level, camera, process, plate)
-    total = len(drawn.depths_m) * len(camera.colours)
+def _write(folder: Path, design: Design, process: Process, plate: Variation, source: str, say: Say) -> None:
+    camera = design.camera
+    surface = as_fabricated(design.level_map.level, camera, process, plate)
+    total = len(design.depths_m) * len(camera.colours)
     splits: dict[tuple[int, int], SplitPsf] = {}
     with meter("PSFs", total) as progress:
-        for d, depth in enumerate(drawn.depths_m):
+        for d, depth in enumerate(design.depths_m):
             for c, colour in enumerate(camera.colours):
                 splits[c, d] = split_psf(camera, surface, colour, depth)
                 progress.advance(len(splits))
     excess = max(split.excess() for split in splits.values())
     if excess > _MOST_EXCESS:
         raise CheckFailed([f"leaked and diffracted light miss the plate's by {excess:.1e} of its brightest pixel"])
-    meant = as_fabricated(drawn.level, camera, process, Variation())
-    nominal = surface_bank(camera, meant, drawn.depths_m)
-    bank = _bank(drawn, splits)
+    meant = as_fabricated(design.level_map.level, camera, process, Variation())
+    nominal = surface_bank(camera, meant, design.depths_m)
+    bank = _bank(design, splits)
     say("writing bank and pictures")
-    rows = {"nominal": plate_rows(drawn, meant, nominal), "fabricated": plate_rows(drawn, surface, bank)}
+    rows = {"nominal": plate_rows(design, meant, nominal), "fabricated": plate_rows(design, surface, bank)}
     for row in rows["fabricated"]:
         d = bank.depths_m.index(float("inf") if row["depth_m"] is None else row["depth_m"])
         row["split"] = _sums(splits[bank.colours.index(row["colour"]), d])
-    write_bank(folder / "fabricated.exr", bank, {"design": drawn.name, "plate": source})
+    write_bank(folder / "fabricated.exr", bank, {"design": design.name, "plate": source})
     (folder / "variation.toml").write_text(variation_to_toml(plate, [source]), encoding="utf-8")
     (folder / "metrics.json").write_bytes(canonical_json(rows))
-    draw_psfs(folder / "fabricated_psf.png", camera, bank, drawn.near_m, drawn.far_m)
+    draw_psfs(folder / "fabricated_psf.png", camera, bank, design.near_m, design.far_m)
     orders = [
         tuple(
             next(r["zeroth_order"] for r in rows[name] if r["colour"] == colour) for name in ("nominal", "fabricated")
@@ -129,20 +130,20 @@ def _write(folder: Path, drawn: Drawn, process: Process, plate: Variation, sourc
     digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
     manifest = {
         "format": "doedesign fabricated 1",
-        "run": drawn.name,
-        "level_map_sha256": drawn.digest(),
+        "run": design.name,
+        "level_map_sha256": design.level_map.digest,
         "plate": source,
         "results_sha256": digests,
     }
     (folder / MANIFEST_NAME).write_bytes(canonical_json(manifest))
 
 
-def _bank(drawn: Drawn, splits: dict[tuple[int, int], SplitPsf]) -> PsfBank:
-    camera = drawn.camera
+def _bank(design: Design, splits: dict[tuple[int, int], SplitPsf]) -> PsfBank:
+    camera = design.camera
     energy = np.stack(
-        [np.stack([splits[c, d].total for d in range(len(drawn.depths_m))]) for c in range(len(camera.colours))]
+        [np.stack([splits[c, d].total for d in range(len(design.depths_m))]) for c in range(len(camera.colours))]
     )
-    return PsfBank(energy, tuple(c.name for c in camera.colours), drawn.depths_m, camera.pixel_m)
+    return PsfBank(energy, tuple(c.name for c in camera.colours), design.depths_m, camera.pixel_m)
 
 
 def _sums(split: SplitPsf) -> dict[str, Any]:

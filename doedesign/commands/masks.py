@@ -1,17 +1,20 @@
 """`doedesign masks` and `doedesign verify`: a height map becomes a mask order, and an order is proved."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.build import camera_from_spec, matching, process_from_spec, wafer_from_spec
+import numpy as np
+from numpy.typing import NDArray
+
+from doedesign.build import camera_from_spec, process_from_spec, require_levels_of, wafer_from_spec
+from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
 from doedesign.report.marks import draw_part
 from doedesign.report.rules import draw_rules
 from doedesign.report.wafer import draw_wafer
-from doedesign.runs.folder import open_run
-from doedesign.runs.level_maps import LevelMap as RunMap
+from doedesign.runs.level_maps import Drawing
 from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.files import sha256_file
@@ -32,9 +35,8 @@ Say = Callable[[str], None]
 
 
 def write_masks(
-    source: Path,
-    drawing: RunMap,
-    out: Path | None,
+    drawing: Drawing,
+    out: Path | None = None,
     *,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
     probe_m: float = PROBE_M,
@@ -46,8 +48,7 @@ def write_masks(
     """Write and prove the mask order of a level map.
 
     Args:
-        source: the run folder or height map it came from, for the manifest.
-        drawing: what to draw.
+        drawing: the level map, and where it comes from.
         out: order folder; `masks/NAME` by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
         probe_m: wavelength of the laser that the lab tests the plate with.
@@ -64,17 +65,12 @@ def write_masks(
             cannot be written.
         CheckFailed: what was read back differs from what was asked for; nothing is left behind.
     """
-    folder = out or Path("masks") / drawing.name
-    spec = open_run(source).spec if source.is_dir() else None
+    level_map, design = drawing.level_map, drawing.design
+    folder = out or Path("masks") / level_map.name
+    spec = None if design is None else design.spec
     chrome = Chrome() if spec is None else Chrome(overlap_m=spec.process.chrome_overlap_m)
-    process = _process(spec, drawing.levels, process_file)
+    process = _process(spec, level_map.levels, process_file)
     filled = (spec.wafer if spec else WaferSpec()) if wafer_file is None else load_wafer(wafer_file)
-    origin: dict[str, Any] = {
-        "kind": "height map" if spec is None else "run",
-        "name": drawing.file.name if spec is None else spec.name,
-        "height_sha256": sha256_file(drawing.file),
-    }
-    level_map = LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m, drawing.name)
     try:
         order = plan_order(
             level_map,
@@ -82,16 +78,16 @@ def write_masks(
             wafer=wafer_from_spec(filled),
             chrome=chrome,
             patch=patch,
-            source=origin,
+            source=drawing.origin,
             on_violation=on_violation,
-            waves_per_metre=_waves_per_metre(spec),
+            waves_per_metre=None if spec is None else _waves_per_metre(spec),
             say=say,
         )
     except InputError as error:
         cure = error.cure.replace("have the level map repaired", "take --on-violation fix")
         raise InputError(error.where, error.rule, error.got, cure) from error
-    if order.repair is not None and spec is not None:
-        repair = {**order.source["repair"], "psf": _psf_cost(spec, level_map, order.level_map, say)}
+    if order.repair is not None and design is not None:
+        repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map, say)}
         order = replace(order, source={**order.source, "repair": repair})
 
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
@@ -101,7 +97,7 @@ def write_masks(
         site = alignment_site(order.plates, dbu_m)
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
         say("writing the run sheet")
-        sheets = write_run_sheet(fresh, *_run_sheet(spec, fresh, order, frame, probe_m, say))
+        sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m, say))
         found = order.rules
         if found.clean:
             return [plate, marks, *sheets]
@@ -113,16 +109,16 @@ def write_masks(
     return folder, written.report
 
 
-def _waves_per_metre(spec: Spec | None) -> float | None:
-    return None if spec is None else camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m)
+def _waves_per_metre(spec: Spec) -> float:
+    return camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m)
 
 
 def _run_sheet(
-    spec: Spec | None, folder: Path, order: Order, frame: Frame, probe_m: float, say: Say
+    design: Design | None, folder: Path, order: Order, frame: Frame, probe_m: float, say: Say
 ) -> tuple[RunSheet, bytes | None]:
     """The run sheet of an order in the making, and the picture of what the lab should see."""
     moves_m = [move * order.dbu_m for move in order.edge_moves()]
-    told = None if spec is None else _foretold(spec, order, moves_m, probe_m, say)
+    told = None if design is None else _foretold(design, order, moves_m, probe_m, say)
     files = {
         plate.name: PhotomaskFile(
             file=f"{order.plate_stem(plate)}.gds",
@@ -150,13 +146,11 @@ def _run_sheet(
     return sheet, None if told is None else told.picture
 
 
-def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, say: Say) -> SheetPrediction | None:
-    from doedesign.prediction import Drawn
-
-    camera, scene = camera_from_spec(spec), spec.scene
-    drawn = Drawn(spec.name, order.level_map.level, order.level_map.levels, camera, scene.near_m, scene.far_m)
+def _foretold(design: Design, order: Order, moves_m: list[float], probe_m: float, say: Say) -> SheetPrediction | None:
+    assert design.spec is not None  # a run has one
+    drawn = replace(design, level_map=order.level_map)
     try:
-        return predict_sheet(drawn, order.process, spec.optics.design_wavelength_m, probe_m, moves_m)
+        return predict_sheet(drawn, order.process, design.spec.optics.design_wavelength_m, probe_m, moves_m)
     except InputError as error:
         say(f"warning: the run sheet says nothing of the light: {error}")
         return None
@@ -165,7 +159,7 @@ def _foretold(spec: Spec, order: Order, moves_m: list[float], probe_m: float, sa
 def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     """The process of a file or a spec; for other levels than a spec's (`--levels`) what it says of the lithography."""
     if file is not None:
-        return matching(levels, process_from_spec(load_process(file), levels), str(file))
+        return require_levels_of(process_from_spec(load_process(file), levels), levels, str(file))
     if spec is None:
         return Process(levels)
     made = process_from_spec(spec.process)
@@ -175,17 +169,32 @@ def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     return Process(levels, name=made.name, **said)
 
 
-def _psf_cost(spec: Spec, before: LevelMap, after: LevelMap, say: Say) -> list[dict[str, Any]]:
-    """Compare what light does with a map before and after a repair, colour by colour and depth by depth."""
-    from doedesign.prediction import Drawn, predict
+def _fixed(
+    design: Design | None, drawing: LevelMap, rules: Rules, say: Say
+) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """Change a level map until the process prints it; say what that costs."""
+    waves_per_metre = 1 / drawing.levels.period_m
+    if design is not None and design.spec is not None:
+        waves_per_metre = design.camera.waves_per_metre(design.spec.optics.design_wavelength_m)
+    say("repairing the level map")
+    fixed, cost = repaired(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m, rules, waves_per_metre)
+    left = f", {cost.broken_after} of {cost.broken_before} broken places are left" if cost.broken_after else ""
+    say(
+        f"repaired: {100 * cost.changed_share:.3g} % of the pixels changed, {100 * (1 - cost.efficiency):.2g} % of the "
+        f"light goes astray{left}"
+    )
+    record: dict[str, Any] = asdict(cost)
+    if design is not None:
+        record["psf"] = _psf_cost(design, fixed, say)
+    return fixed, record
 
-    camera, scene = camera_from_spec(spec), spec.scene
-    rows = [
-        predict(
-            Drawn(spec.name, one.level, one.levels, camera, scene.near_m, scene.far_m), Process(one.levels), Variation()
-        ).rows
-        for one in (before, after)
-    ]
+
+def _psf_cost(design: Design, repaired: LevelMap, say: Say) -> list[dict[str, Any]]:
+    """Compare what light does with a map before and after a repair, colour by colour and depth by depth."""
+    from doedesign.prediction import predict
+
+    after = replace(design, level_map=repaired)
+    rows = [predict(each, Process(design.levels), Variation()).rows for each in (design, after)]
     told = []
     for old, new in zip(*rows, strict=True):
         numbers = {key: [old[key], new[key]] for key in ("ring_to_disc", "far_spot", "zeroth_order") if key in old}

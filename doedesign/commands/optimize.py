@@ -1,16 +1,17 @@
-"""`doedesign optimize`: a spec becomes a run folder."""
+"""`doedesign optimize`: a spec becomes a design, in memory or in a run folder."""
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from doedesign.design.design import Design
 from doedesign.design.etch_depths import heights_of, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
 from doedesign.design.optimize import (
-    Design,
     OptimizationState,
     finished_design,
     initial_state,
@@ -31,63 +32,78 @@ from doedesign.runs.folder import (
     save_checkpoint,
     write_history,
 )
+from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.runtime.progress import meter
-from doedesign.spec import Spec, input_files, load_spec
+from doedesign.spec import Spec, input_files, load_spec, spec_warnings
 from fab.files import canonical_json, write_atomic
 from fab.levels import Levels
 from fab.units import NM
 from sim.aperture import circle_coverage
+from sim.propagation.hankel import ring_count
 from sim.psf_bank import PsfBank, psf_bank
-from sim.store import write_height
 from sim.transfer import transfer_bank
 
-Say = Callable[[str], None]
+log = logging.getLogger("doedesign")
+Save = Callable[[OptimizationState, Sequence[Mapping[str, Any]]], None]
 
 
-def optimize(spec_path: Path, out: Path | None, overrides: Sequence[str] = (), say: Say = lambda _: None) -> Run:
-    """Optimise a spec, or go on where an earlier call was stopped.
+def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, overrides: Sequence[str] = ()) -> Design:
+    """Optimise the design of a spec.
 
     Args:
-        spec_path: TOML spec.
-        out: run folder; `runs/NAME` by default.
+        spec: the spec, or its TOML file.
+        out: run folder, in which a stopped optimisation goes on where it was stopped and to which results and pictures
+            are written; without one everything stays in memory.
         overrides: changes to the spec, "table.key=value".
-        say: told what is going on.
 
     Returns:
-        the finished run.
+        the design: its level map, the heights before rounding (metres), and the history of its loss.
 
     Raises:
         InputError: a mistake in the spec or its inputs, or a folder that belongs to something else.
     """
-    spec = load_spec(spec_path, overrides)
-    files = input_files(spec, spec_path)
+    if not isinstance(spec, Spec) or overrides:
+        spec = load_spec(spec.file or "" if isinstance(spec, Spec) else spec, overrides)
+    for warning in spec_warnings(spec):
+        log.warning(warning)
+    files = input_files(spec)
+    if out is not None:
+        return _optimize_in(Path(out), spec, files, overrides)
+    problem, sources = problem_of(spec, files)
+    state = initial_state(spec, problem, sources, files, _reader(spec))
+    state, history = _iterate(problem, sources, spec, state, [])
+    return finished_design(spec, problem, state, history)
+
+
+def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Sequence[str]) -> Design:
     inputs = input_digests(files)
-    with claim_run(out or Path("runs") / spec.name, spec, inputs) as run:
+    with claim_run(folder, spec, inputs) as run:
         if run.done:
-            say(f"{run.folder} already holds the finished run of this spec")
-            return open_run(run.folder)
-        say("preparing sources and propagation")
-        problem, scene = problem_of(spec, files)
-        state, history = _resume(run, problem, scene, files, say)
+            log.info(f"{folder} already holds the finished run of this spec")
+            return open_design(open_run(folder), levels=spec.process.levels)
+        log.info("preparing sources and propagation")
+        problem, sources = problem_of(spec, files)
+        state, history = _resume(run, problem, sources, files)
         begin_run(run, inputs, overrides)
-        state, history = _iterate(run, problem, scene, state, history)
-        say("evaluating the design")
-        design = finished_design(spec, problem, state)
+        state, history = _iterate(problem, sources, spec, state, history, _saving(run))
+        log.info("evaluating the design")
+        design = finished_design(spec, problem, state, history)
         if spec.process.chooses_depths:
-            say(f"chosen: {design.levels.told}")
-        results = _write_results(run, problem, design, history)
+            log.info(f"chosen: {design.levels.told}")
+        results = _write_results(run, problem, design)
         finish_run(run, inputs, overrides, results, design.levels.depths_m)
-    return open_run(run.folder)
+    return open_design(open_run(folder), levels=spec.process.levels)
+
+
+def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:
+    return lambda path: np.asarray(read_any_height(path, pitch_m=spec.doe.pitch_m).height_m)
 
 
 def _resume(
-    run: Run, problem: Problem, scene: SourceSet, files: dict[str, Path], say: Say
+    run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    from doedesign.runs.level_maps import read_any_height
-
     optimiser = optimiser_of(run.spec)
-    size = len(problem.camera.grid.axis_m("x"))
-    shape = (ring_shape(problem),) if problem.radial else (size, size)
+    shape = (ring_count(problem.camera),) if problem.radial else problem.camera.grid.shape
     # Depths that are learnt stand between the parameters and the moments.
     shapes = [shape, (run.spec.process.masks,)] if learns_depths(run.spec) else [shape]
     free = [np.zeros(each, np.float32) for each in shapes]
@@ -95,35 +111,40 @@ def _resume(
     leaves, tree = jax.tree.flatten(template)
     stored = load_checkpoint(run, [*shapes, *(leaf.shape for leaf in leaves)])
     if stored is None:
-        say(f'starting from "{run.spec.optimize.start}"')
-        start = lambda path: np.asarray(read_any_height(path, pitch_m=run.spec.doe.pitch_m).height_m)  # noqa: E731
-        return initial_state(run.spec, problem, scene, files, start), []
+        log.info(f'starting from "{run.spec.optimize.start}"')
+        return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []
     arrays, step, history = stored
-    say(f"resuming after step {step}")
-    radians, *stretch = (jax.numpy.asarray(a) for a in arrays[: len(shapes)])
+    log.info(f"resuming after step {step}")
+    radians, *depths = (jax.numpy.asarray(a) for a in arrays[: len(shapes)])
     adam = jax.tree.unflatten(tree, [jax.numpy.asarray(a) for a in arrays[len(shapes) :]])
-    return OptimizationState(radians, adam, step, *stretch), history
+    return OptimizationState(radians, adam, step, *depths), history
 
 
-def ring_shape(problem: Problem) -> int:
-    """Number of parameters of a radial problem."""
-    from sim.propagation.hankel import ring_count
+def _saving(run: Run) -> Save:
+    """Keep a checkpoint every so many steps, and after the last one."""
 
-    return ring_count(problem.camera)
+    def save(state: OptimizationState, history: Sequence[Mapping[str, Any]]) -> None:
+        if state.step % run.spec.optimize.checkpoint_every == 0 or state.step == run.spec.optimize.steps:
+            arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.free, state.adam))]
+            save_checkpoint(run, arrays, state.step, history)
+
+    return save
 
 
 def _iterate(
-    run: Run, problem: Problem, scene: SourceSet, state: OptimizationState, history: list[dict[str, Any]]
+    problem: Problem,
+    sources: SourceSet,
+    spec: Spec,
+    state: OptimizationState,
+    history: list[dict[str, Any]],
+    save: Save = lambda *_: None,
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    total, every = run.spec.optimize.steps, run.spec.optimize.checkpoint_every
     names = [term.name for term in problem.terms]
-    with meter("optimising", total, state.step) as progress:
-        for state, record in steps(run.spec, problem, scene, state):  # noqa: B020 - the last state is the result
+    with meter("optimising", spec.optimize.steps, state.step) as progress:
+        for state, record in steps(spec, problem, sources, state):  # noqa: B020 - the last state is the result
             history.append({"step": record.step, "loss": record.loss, "terms": list(record.terms), "names": names})
             progress.advance(state.step, f"loss {record.loss:.4f}")
-            if state.step % every == 0 or state.step == total:
-                arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.free, state.adam))]
-                save_checkpoint(run, arrays, state.step, history)
+            save(state, history)
     return state, history
 
 
@@ -137,7 +158,7 @@ def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
     """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
     camera, binary = problem.camera, Levels(design.levels.count, design.levels.step_m)
     area = circle_coverage(camera.grid, camera.aperture_m)
-    heights = heights_of(design.continuous_m, area, binary.period_m, camera)
+    heights = heights_of(np.asarray(design.continuous_m), area, binary.period_m, camera)
     return {
         "depths_nm": [round(depth / NM, 1) for depth in design.levels.depths_m],
         "light_cost": light_cost(heights, design.levels),
@@ -145,32 +166,30 @@ def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
     }
 
 
-def _write_results(run: Run, problem: Problem, design: Design, history: list[dict[str, Any]]) -> list[str]:
-    spec, camera = run.spec, problem.camera
+def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
+    spec, camera, height = run.spec, problem.camera, design.nominal_height_m
     levels = None if spec.optimize.quantisation == "none" else design.levels
-    write_height(run.path("height.exr"), design.drawn_m, camera.grid.pitch_m, spec.doe.aperture_m)
-    write_height(run.path("height_continuous.exr"), design.continuous_m, camera.grid.pitch_m, spec.doe.aperture_m)
-    write_history(run, history)
+    names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
+    write_history(run, design.history)
     near, far = spec.scene.near_m, spec.scene.far_m
-    bank = design_bank(spec, problem, design.drawn_m)
-    flat = np.zeros_like(design.drawn_m)
+    bank = design_bank(spec, problem, height)
+    flat = np.zeros_like(height)
     lens = design_bank(spec, problem, flat)
-    metrics: dict[str, Any] = {"psf": design_metrics(camera, design.drawn_m, bank, near, lens)}
+    metrics: dict[str, Any] = {"psf": design_metrics(camera, height, bank, near, lens)}
     patterns = pattern_metrics(spec, camera, bank, problem.terms)
     if patterns:
         metrics["patterns"] = patterns
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(problem, design)
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
-    draw_height(run.path("height.png"), design.drawn_m, levels, camera, spec.name)
+    draw_height(run.path("height.png"), height, levels, camera, spec.name)
     draw_psfs(run.path("psf.png"), camera, bank, near, far)
-    transfers = [transfer_bank(camera, height, (*near, *far)) for height in (design.drawn_m, flat)]
+    transfers = [transfer_bank(camera, each, (*near, *far)) for each in (height, flat)]
     draw_mtf(run.path("mtf.png"), camera, transfers[0], near, far, transfers[1])
     draw_encircled(run.path("encircled.png"), camera, bank, near, far, lens)
-    names = ["height.exr", "height_continuous.exr", "history.jsonl", "metrics.json", "spec.toml"]
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]
-    if history:
-        draw_history(run.path("history.png"), history)
+    if design.history:
+        draw_history(run.path("history.png"), list(design.history))
         names.append("history.png")
     targets = [t for t, o in zip(problem.terms, spec.objectives, strict=True) if o.name == "target_pattern"]
     if targets:

@@ -11,14 +11,12 @@ import numpy as np
 from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
 from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
-from doedesign.runs.folder import Run, alone_in, open_run
-from doedesign.runs.level_maps import drawn_in_masks, levels_of_run, read_any_height
+from doedesign.runs.folder import CONTINUOUS, Run, alone_in, open_run
+from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
-from fab.level_map import LevelMap
-from fab.levels import height_of
 from sim.camera import Camera
 from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
@@ -37,23 +35,19 @@ def designs_of(run: Run, masks: Path | None, say: Say = lambda _: None) -> dict[
         InputError: a file that cannot be read.
         CheckFailed: the masks draw something else than the run's quantised map.
     """
-    drawing = levels_of_run(run)
-    level_map = LevelMap(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m)
-    designs = {
-        "continuous": read_any_height(run.path("height_continuous.exr")).height_m,
-        "quantised": level_map.height_m,
-    }
+    level_map = level_map_of_run(run)
+    designs = {"continuous": read_any_height(run.path(CONTINUOUS)).height_m, "quantised": level_map.height_m}
     folder = masks or Path("masks") / run.spec.name
     if masks is None and not (folder / MANIFEST_NAME).is_file():
         say(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
         return designs
-    rebuilt = drawn_in_masks(folder, drawing)
-    different = rebuilt != level_map.level
+    rebuilt = level_map.with_level(drawn_in_masks(folder, level_map))
+    different = rebuilt.level != level_map.level
     if different.any():
         y, x = (int(i) for i in np.argwhere(different)[0])
         where = f"{int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"
         raise CheckFailed([f"{folder}: {where}"])
-    return designs | {"from_masks": height_of(rebuilt, drawing.levels).astype(np.float32)}
+    return designs | {"from_masks": rebuilt.height_m}
 
 
 def psf(

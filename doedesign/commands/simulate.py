@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from doedesign.build import process_for
 from doedesign.capture.from_spec import (
     obstruction_from_spec,
     occlusion_from_spec,
@@ -39,10 +38,11 @@ from doedesign.capture.scenes import SceneData, SceneItem
 from doedesign.capture.simulate import CameraPair, SimulatedCapture, captured, flat_psfs, plate_psfs, shadow_window
 from doedesign.commands.fabricated import errors_of_plate
 from doedesign.commands.psf import Say
-from doedesign.prediction import Drawn, drawn_of, process_with_moves
+from doedesign.design.design import Design
 from doedesign.report.contact import ContactRow
 from doedesign.report.pictures import draw_contact
 from doedesign.runs.folder import Run, alone_in, open_run, spec_with
+from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_digest, variation_to_toml
 from fab.errors import InputError
@@ -144,8 +144,8 @@ def simulate(
     spec = spec_with(run, request.overrides, _FREE)
     model = occlusion_from_spec(spec, source, request.occlusion)
     kind = obstruction_from_spec(spec, source, request.obstruction)
-    drawn = drawn_of(run, masks)
-    camera = replace(drawn.camera, window=drawn.camera.window | 1)  # odd: the capture lies on the scene
+    design = open_design(run, masks)
+    camera = replace(design.camera, window=design.camera.window | 1)  # odd: the capture lies on the scene
     view = _view(spec, camera, request.size)
     pictures = Pictures(picture_files(request.images), most_px=2 * max(view.shape), say=say)
     count = min(_USUAL_COUNT, len(pictures)) if request.count is None else request.count
@@ -153,11 +153,11 @@ def simulate(
         raise InputError("--count", "must be at least 1", count, "Leave it out for one item per picture, at most six.")
     far = spec.scene.far_m
     data = SceneData(pictures, kind, view, (min(far), max(far)), request.seed, mirrored=False)
-    made_by, errors, plate = _plate(drawn, run.spec, fabrication)
-    plate_at, flat_at = plate_psfs(drawn, camera, made_by, errors), flat_psfs(camera)
+    made_by, errors, plate = _plate(design, fabrication)
+    plate_at, flat_at = plate_psfs(design, camera, made_by, errors), flat_psfs(camera)
     window = shadow_window(kind, camera)
     bench = CameraPair(camera, plate_at, flat_at, model, outside_from_kind(kind), sensor_from_spec(spec), window)
-    settings = _settings(run, spec, request, drawn, plate, kind, bench, pictures, view)
+    settings = _settings(run, spec, request, design, plate, kind, bench, pictures, view)
     if errors is not None:
         settings["variation"] = variation_to_toml(errors)
     folder = out or run.path("simulated")
@@ -178,13 +178,12 @@ def _view(spec: Spec, camera: Camera, size: int | None) -> CameraView:
     return CameraView((side, side), camera.pixel_m, camera.sensor_distance_m)
 
 
-def _plate(drawn: Drawn, spec: Spec, fabrication: Fabrication | None) -> tuple[Process | None, Variation | None, str]:
+def _plate(design: Design, fabrication: Fabrication | None) -> tuple[Process | None, Variation | None, str]:
     """What makes the plate, its errors, and a few words on it; no process for the plate as drawn."""
     if fabrication is None:
         return None, None, "plate as drawn"
-    made_by = process_for(drawn.levels, spec.process, fabrication.process)
-    made_by = process_with_moves(made_by, drawn.edge_moves_m)
-    errors, said = errors_of_plate(drawn, made_by, fabrication.variation, fabrication.seed, fabrication.draw)
+    made_by = design.process(fabrication.process)
+    errors, said = errors_of_plate(design, made_by, fabrication.variation, fabrication.seed, fabrication.draw)
     return made_by, errors, f"plate with {said}"
 
 
@@ -192,7 +191,7 @@ def _settings(
     run: Run,
     spec: Spec,
     request: SimulationSettings,
-    drawn: Drawn,
+    design: Design,
     plate: str,
     kind: ObstructionKind,
     bench: CameraPair,
@@ -204,7 +203,7 @@ def _settings(
         "format": FORMAT,
         "run": run.spec.name,
         "spec_sha256": spec_digest(spec),
-        "level_map_sha256": drawn.digest(),
+        "level_map_sha256": design.level_map.digest,
         "plate": plate,
         "obstruction": getattr(kind, "name", type(kind).__name__),
         "parameters": plain_parameters(kind),

@@ -148,7 +148,7 @@ def one_draw(run_folder: Path, key: str, as_json: bool, **settings: Any) -> str:
     rows = [] if isinstance(kept, OutOfModel) else kept
     if as_json:
         return json.dumps({"key": key, "variation": vars(variation), "rows": rows}, sort_keys=True)
-    lines = [f"draw {key} of {asked.drawn.name}, seed {asked.seed}"]
+    lines = [f"draw {key} of {asked.design.name}, seed {asked.seed}"]
     for row in rows:
         found = {name: math.inf if row[name] is None else row[name] for name in QUANTITIES if name in row}
         place = "infinity" if row["depth_m"] is None else format_length(row["depth_m"])
@@ -170,7 +170,7 @@ def _results(asked: Study, plan: StudyPlan, found: StudyFindings) -> dict[str, A
     """Everything that was found, as JSON."""
     out: dict[str, Any] = {
         "format": FORMAT,
-        "design": asked.drawn.name,
+        "design": asked.design.name,
         "seed": asked.seed,
         "plan": plan._asdict(),
         "units": "SI; a depth of null is infinity; a colour of null is the worst colour and depth of each plate",
@@ -228,30 +228,30 @@ def _write(folder: Path, asked: Study, plan: StudyPlan, found: StudyFindings, re
     write_atomic(folder / "results.json", canonical_json(results))
     pictures = _draw(folder, asked, found)
     digests = {name: sha256_file(folder / name) for name in ("draws.csv", "errors.csv", "results.json", *pictures)}
-    manifest = {"format": FORMAT, "run": asked.drawn.name, "results_sha256": digests}
+    manifest = {"format": FORMAT, "run": asked.design.name, "results_sha256": digests}
     write_atomic(folder / MANIFEST_NAME, canonical_json(manifest))
 
 
 def _draw(folder: Path, asked: Study, found: StudyFindings) -> list[str]:
     """Draw what was found; returns the names of the pictures."""
-    drawn, plates = asked.drawn, found.plates
-    draw_histograms(folder / "histograms.png", drawn.camera, plates.table, found.nominal.table, asked.limits)
+    design, plates = asked.design, found.plates
+    draw_histograms(folder / "histograms.png", design.camera, plates.table, found.nominal.table, asked.limits)
     draw_yield(folder / "yield.png", plates.table, asked.limits)
     names = ["histograms.png", "yield.png"]
     if found.changes is not None:
         draw_changes(folder / "one_at_a_time.png", found.changes)
         names.append("one_at_a_time.png")
     if found.shares is not None:
-        draw_shares(folder / "sobol.png", drawn.camera, found.shares)
+        draw_shares(folder / "sobol.png", design.camera, found.shares)
         names.append("sobol.png")
     if found.budget is not None:
         draw_budget(folder / "budget.png", found.budget)
         names.append("budget.png")
     shown = {NOMINAL: "nominal_psf.png", plates.worst: "worst_psf.png"}
     # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
-    work = Work(predicted_bank, drawn, asked.process)
+    work = Work(predicted_bank, design, asked.process)
     for key, bank in evaluate_here(work, {key: asked.variation(key) for key in shown}, 1):
-        draw_psfs(folder / shown[key], drawn.camera, bank, drawn.near_m, drawn.far_m)
+        draw_psfs(folder / shown[key], design.camera, bank, design.near_m, design.far_m)
         names.append(shown[key])
     return names
 

@@ -9,7 +9,7 @@ Where the depths of the etches are to be chosen, they are further parameters of 
 and how high that level stands has a true gradient.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from doedesign.design.design import Design
 from doedesign.design.etch_depths import choose_depths, heights_of, held
 from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
@@ -27,7 +28,8 @@ from doedesign.design.starts import start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import START_NAMES, Spec
 from fab.errors import InputError
-from fab.levels import Levels, height_of
+from fab.level_map import LevelMap
+from fab.levels import Levels
 from sim.aperture import circle_coverage
 from sim.propagation.hankel import radial_profile, revolve, ring_count
 
@@ -44,19 +46,19 @@ class OptimizationState(NamedTuple):
         radians: parameters in radians.
         adam: Adam's moments of all that is free.
         step: number of steps done.
-        stretch: `[mask]` logarithm of every etch's depth over its first one, in units of
+        log_depth_ratio: `[mask]` logarithm of every etch's depth over its first one, in units of
             `doedesign.design.parametrize.DEPTH_SCALE`; None where the depths are given.
     """
 
     radians: Array
     adam: optax.OptState
     step: int
-    stretch: Array | None = None
+    log_depth_ratio: Array | None = None
 
     @property
     def free(self) -> Free:
         """What Adam moves: the parameters, and the depths if they are free."""
-        return self.radians if self.stretch is None else (self.radians, self.stretch)
+        return self.radians if self.log_depth_ratio is None else (self.radians, self.log_depth_ratio)
 
 
 class StepRecord(NamedTuple):
@@ -65,20 +67,6 @@ class StepRecord(NamedTuple):
     step: int
     loss: float
     terms: tuple[float, ...]
-
-
-class Design(NamedTuple):
-    """A finished design on the DOE grid, metres, float32 `[y, x]`.
-
-    Attributes:
-        drawn_m: what will be made: quantised, unless the spec says `quantisation = "none"`.
-        continuous_m: the same parameters before rounding.
-        levels: the staircase that is drawn.
-    """
-
-    drawn_m: Float[np.ndarray, "y x"]
-    continuous_m: Float[np.ndarray, "y x"]
-    levels: Levels
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
@@ -130,10 +118,10 @@ def initial_state(
                     'Use parametrization = "freeform", or another start.',
                 )
             heights = profile[: ring_count(camera)]
-    radians = jnp.asarray(problem.staircase.radians_of(heights))
-    stretch = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
-    free = radians if stretch is None else (radians, stretch)
-    return OptimizationState(radians, optimiser_of(spec).init(free), 0, stretch)
+    radians = jnp.asarray(problem.parametrization.radians_of(heights))
+    log_depth_ratio = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
+    free = radians if log_depth_ratio is None else (radians, log_depth_ratio)
+    return OptimizationState(radians, optimiser_of(spec).init(free), 0, log_depth_ratio)
 
 
 def learns_depths(spec: Spec) -> bool:
@@ -142,12 +130,12 @@ def learns_depths(spec: Spec) -> bool:
 
 
 def _loss(free: Free, problem: Problem, look: StepSources, softness: Array) -> tuple[Array, Array]:
-    staircase = problem.staircase
+    parametrization = problem.parametrization
     if isinstance(free, tuple):
-        radians, stretch = free
-        height = staircase.height_m(radians, softness, staircase.depths_m(stretch))
+        radians, log_depth_ratio = free
+        height = parametrization.height_m(radians, softness, parametrization.depths_m(log_depth_ratio))
     else:
-        height = staircase.height_m(free, softness)
+        height = parametrization.height_m(free, softness)
     return losses(problem, view_of(problem, height, look))
 
 
@@ -192,8 +180,8 @@ def steps(
     for step in range(state.step, spec.optimize.steps):
         constants = constants_at(spec, problem, scene, step)
         (free, adam), loss, terms = update(constants, (state.free, state.adam))
-        radians, stretch = free if isinstance(free, tuple) else (free, None)
-        state = OptimizationState(radians, adam, step + 1, stretch)
+        radians, log_depth_ratio = free if isinstance(free, tuple) else (free, None)
+        state = OptimizationState(radians, adam, step + 1, log_depth_ratio)
         record = StepRecord(step, float(loss), tuple(float(t) for t in terms))
         if not np.isfinite(record.loss):
             raise InputError(
@@ -202,30 +190,31 @@ def steps(
         yield state, record
 
 
-def finished_design(spec: Spec, problem: Problem, state: OptimizationState) -> Design:
-    """Height maps of the parameters."""
-    staircase, grid = problem.staircase, problem.camera.grid
-    continuous = np.asarray(staircase.continuous_m(state.radians))
+def finished_design(
+    spec: Spec, problem: Problem, state: OptimizationState, history: Sequence[Mapping[str, Any]] = ()
+) -> Design:
+    """Return the design of the parameters: every cell at its nearest level, and the heights before rounding."""
+    parametrization, camera = problem.parametrization, problem.camera
+    continuous = np.asarray(parametrization.continuous_m(state.radians))
     if problem.radial:
-        continuous = revolve(continuous, grid)
-    levels = _levels_of(spec, problem, state, continuous) if spec.process.chooses_depths else staircase.levels
-    if spec.optimize.quantisation == "none":
-        drawn = continuous
-    else:
-        # By way of whole levels, so that the heights are the ones a mask file gives back, to the last bit.
-        level = np.asarray(replace(staircase, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
-        drawn = height_of(level, levels).astype(np.float32)
-    return Design(drawn, continuous, levels)
+        continuous = revolve(continuous, camera.grid)
+    levels = _chosen_levels(spec, problem, state, continuous) if spec.process.chooses_depths else parametrization.levels
+    level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
+    level_map = LevelMap(level, levels, camera.grid, spec.doe.aperture_m, spec.name)
+    near_m, far_m = spec.scene.near_m, spec.scene.far_m
+    return Design(level_map, camera, near_m, far_m, continuous_m=continuous, spec=spec, history=tuple(history))
 
 
-def _levels_of(
+def _chosen_levels(
     spec: Spec, problem: Problem, state: OptimizationState, continuous_m: Float[np.ndarray, "y x"]
 ) -> Levels:
     """The staircase that was chosen, as a recipe holds it: the one learnt, or that which suits the heights best."""
-    start = problem.staircase.levels
-    if state.stretch is not None:
+    start = problem.parametrization.levels
+    if state.log_depth_ratio is not None:
         try:
-            return Levels(start.count, start.step_m, held(np.asarray(problem.staircase.depths_m(state.stretch))))
+            return Levels(
+                start.count, start.step_m, held(np.asarray(problem.parametrization.depths_m(state.log_depth_ratio)))
+            )
         except InputError:
             pass  # two levels met
     camera = problem.camera

@@ -95,9 +95,9 @@ class LevelParametrization(eqx.Module):
         cell = jnp.where(height_m >= edge, 0, jnp.where(height_m < edge - period, count - 1, cell))
         return order[cell]
 
-    def depths_m(self, stretch: Float[Array, " k"]) -> Float[Array, " k"]:
+    def depths_m(self, log_depth_ratio: Float[Array, " k"]) -> Float[Array, " k"]:
         """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""
-        return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(DEPTH_SCALE * stretch)
+        return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(DEPTH_SCALE * log_depth_ratio)
 
     def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Parameters that make a given height, float32."""

@@ -61,14 +61,14 @@ class Problem(eqx.Module):
 
     Attributes:
         camera: optics and sensor.
-        staircase: parameters to heights.
+        parametrization: parameters to heights.
         terms: weighted objectives.
         lines: one entry per wavelength.
         coverage: open share of every cell; None for a radial problem, whose rings end at the aperture.
     """
 
     camera: Camera = eqx.field(static=True)
-    staircase: LevelParametrization = eqx.field(static=True)
+    parametrization: LevelParametrization = eqx.field(static=True)
     terms: tuple[Term, ...] = eqx.field(static=True)
     lines: tuple[WavelengthPlan, ...]
     coverage: Float[Array, "y x"] | None
@@ -170,7 +170,7 @@ def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
             lines.append(WavelengthPlan(plan, rate, weight * camera.transmission(wavelength), index))
     return Problem(
         camera=camera,
-        staircase=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
+        parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=terms,
         lines=tuple(lines),
         coverage=None if radial else jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)),

@@ -18,7 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from doedesign.prediction import Drawn, Prediction, plate_rows, predict, process_with_moves
+from doedesign.build import with_edge_moves
+from doedesign.design.design import Design
+from doedesign.prediction import Prediction, plate_rows, predict
 from doedesign.report.pictures import draw_psfs
 from doedesign.tolerancing.analysis import table_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
@@ -30,6 +32,7 @@ from fab.process import DEVIATIONS, Normal, Process, Variation
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
 from fab.sampling import varying
 from sim.aperture import circle_coverage
+from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.material import full_wave_wavelength_m, refractive_index
 from sim.psf_bank import surface_bank
@@ -84,19 +87,19 @@ def grating_orders(
     return float(orders[np.argmax(depths_m)]), float(np.prod(orders))
 
 
-def _patch(drawn: Drawn, process: Process) -> tuple[Drawn, Process]:
+def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera, Process]:
     """Cut the middle of the right half out of a design, with the place on the wafer where it lies."""
-    ny, nx = drawn.level.shape
+    ny, nx = design.level_map.level.shape
     side = min(_PATCH, ny, nx // 2)
     y0, x0 = (ny - side) // 2, min(nx - side, 3 * nx // 4 - side // 2)
-    camera, pitch_m = drawn.camera, drawn.camera.grid.pitch_m
+    camera, pitch_m = design.camera, design.camera.grid.pitch_m
     off = ((y0 + (side - ny) / 2) * pitch_m, (x0 + (side - nx) / 2) * pitch_m)
     die_m = (process.die_m[0] + off[0], process.die_m[1] + off[1])
     # An opening beyond the corners, so that every cell counts alike.
     small = replace(camera, grid=Grid((side, side), pitch_m), aperture_m=2 * side * pitch_m)
-    level = np.ascontiguousarray(drawn.level[y0 : y0 + side, x0 : x0 + side])
+    level = np.ascontiguousarray(design.level_map.level[y0 : y0 + side, x0 : x0 + side])
     on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))
-    return replace(drawn, level=level, camera=small), replace(process, die_m=die_m, wafer_radius_m=on_wafer)
+    return level, small, replace(process, die_m=die_m, wafer_radius_m=on_wafer)
 
 
 def _row(surface: FabricatedDoe, nominal: FabricatedDoe) -> dict[str, Any]:
@@ -105,11 +108,11 @@ def _row(surface: FabricatedDoe, nominal: FabricatedDoe) -> dict[str, Any]:
     return {"colour": "", "depth_m": None, **found}
 
 
-def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
+def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
     """Rank the numbers that a lab measures by how much of the plates' differences they explain.
 
     Args:
-        drawn: the design.
+        design: the design.
         process: how far it strays.
         wavelength_m: where Strehl ratio and 0th order are looked at.
 
@@ -124,10 +127,10 @@ def matters_of(drawn: Drawn, process: Process, wavelength_m: float) -> tuple[Imp
     kept = replace(process, spreads={n: s if n in known else Normal(s.mean) for n, s in process.spreads.items()})
     if not known:
         return ()
-    small, there = _patch(drawn, kept)
-    side_m = max(small.camera.grid.extent_m)
+    level, small, there = _patch(design, kept)
+    side_m = max(small.grid.extent_m)
     keys = [EXPECTED, *one_at_a_time_keys(kept)]
-    made = partial(as_fabricated, small.level, small.camera, wavelengths_m=(wavelength_m,))
+    made = partial(as_fabricated, level, small, wavelengths_m=(wavelength_m,))
     nominal = made(Process(kept.levels), Variation())
     plates = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
     variances: dict[str, dict[str, float]] = {"strehl": {}, "zeroth_order": {}}
@@ -175,19 +178,19 @@ def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float)
     return FabricatedDoe(field, field, coverage, plate.grid, nominal.wavelengths_m)
 
 
-def _predictions(drawn: Drawn, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
+def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
     """Predict the plate as drawn (its rows) and the one with mean errors."""
     plate = process.expected()
-    expected = predict(drawn, process, plate)
+    expected = predict(design, process, plate)
     if plate.nominal:
         return expected.rows, expected
-    nominal = as_fabricated(drawn.level, drawn.camera, process, Variation())
-    alike = _on_grid_of(expected.surface, nominal, drawn.camera.aperture_m)
-    return plate_rows(drawn, alike, surface_bank(drawn.camera, alike, drawn.depths_m)), expected
+    nominal = as_fabricated(design.level_map.level, design.camera, process, Variation())
+    alike = _on_grid_of(expected.surface, nominal, design.camera.aperture_m)
+    return plate_rows(design, alike, surface_bank(design.camera, alike, design.depths_m)), expected
 
 
 def predict_sheet(
-    drawn: Drawn,
+    design: Design,
     process: Process,
     design_m: float,
     probe_m: float = PROBE_M,
@@ -196,7 +199,7 @@ def predict_sheet(
     """Foretell what a lab should see, for one depth: the middle one of the near depths, or else the farthest.
 
     Args:
-        drawn: the design.
+        design: the design.
         process: what the lab does.
         design_m: design wavelength.
         probe_m: wavelength of the lab's test laser.
@@ -205,16 +208,16 @@ def predict_sheet(
     Raises:
         InputError: a probe wavelength at which the glass is not known, or errors beyond what the model describes.
     """
-    levels, material = drawn.levels, drawn.camera.material
+    levels, material = design.levels, design.camera.material
     waves_per_m = (refractive_index(material, probe_m) - 1) / probe_m
-    seen = process_with_moves(process, edge_moves_m)
-    middle = len(drawn.near_m) // 2
+    seen = with_edge_moves(process, edge_moves_m)
+    middle = len(design.near_m) // 2
     # All depths would take most of the time of a whole order, and say the same.
-    near_m = drawn.near_m[middle : middle + 1]
-    drawn = replace(drawn, near_m=near_m, far_m=() if near_m else drawn.far_m[-1:])
+    near_m = design.near_m[middle : middle + 1]
+    design = replace(design, near_m=near_m, far_m=() if near_m else design.far_m[-1:])
     with ThreadPoolExecutor(1) as pool:
-        ranking = pool.submit(matters_of, drawn, seen, design_m)
-        as_drawn, expected = _predictions(drawn, seen)
+        ranking = pool.submit(matters_of, design, seen, design_m)
+        as_drawn, expected = _predictions(design, seen)
         matters = ranking.result()
     depths = np.array([levels.etch_depth_m(bit) for bit in range(levels.bits)])
     outlook = Predictions(
@@ -231,5 +234,5 @@ def predict_sheet(
     )
     with TemporaryDirectory() as folder:
         path = Path(folder) / "psf.png"
-        draw_psfs(path, drawn.camera, expected.bank, drawn.near_m, drawn.far_m)
+        draw_psfs(path, design.camera, expected.bank, design.near_m, design.far_m)
         return SheetPrediction(outlook, path.read_bytes())

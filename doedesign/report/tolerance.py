@@ -130,13 +130,13 @@ def draw_histograms(
         for axes, quantity in zip(panels, table.values, strict=True):
             scale = _scale(quantity)
             series = {c: scale * _finite(table.worst(quantity, c)) for c in table.colours}
-            drawn = {c: scale * float(nominal.worst(quantity, c)[0]) for c in table.colours}
-            bins = _bins(np.concatenate([*series.values(), _finite(np.array(list(drawn.values())))]), len(table.keys))
+            design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in table.colours}
+            bins = _bins(np.concatenate([*series.values(), _finite(np.array(list(design.values())))]), len(table.keys))
             for colour, values in series.items():
                 axes.hist(values, bins, histtype="stepfilled", color=hues[colour], alpha=0.15)
                 axes.hist(values, bins, histtype="step", color=hues[colour], lw=1.2)
-                if math.isfinite(drawn[colour]):
-                    axes.axvline(drawn[colour], color=hues[colour], ls=":", lw=1.2)
+                if math.isfinite(design[colour]):
+                    axes.axvline(design[colour], color=hues[colour], ls=":", lw=1.2)
             axes.set_xlim(bins[0], bins[-1])
             _shade(axes, [one for one in limits if one.quantity == quantity], scale)
             axes.set_ylabel("plates", labelpad=2)

@@ -5,8 +5,10 @@
                                 depths of the etches if the run was to choose them
         spec.toml               the spec with every default and override filled in
         checkpoint.npz          parameters, Adam's moments and history; only while the run is unfinished
-        height.exr              what is drawn, metres
-        height_continuous.exr   the same before rounding to levels
+        level_map.npz           the design: level of every cell, staircase, grid and aperture (`fab.level_map`)
+        height.exr              the heights that follow from it, metres (the heights before rounding where the run is
+                                not quantised), for other programs
+        height_continuous.exr   the heights before rounding to levels
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.design.metrics`
         *.png                   pictures
@@ -39,6 +41,7 @@ from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json
 FORMAT = "doedesign run 1"
 TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a plate of its own
 CHECKPOINT = "checkpoint.npz"
+LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
 _DEPTHS = "etch_depths_m"
 # Of the sensor, what a plate is designed for.
 _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
@@ -224,11 +227,11 @@ def open_run(folder: Path) -> Run:
         raise InputError(
             str(folder), "the run must be finished", "an unfinished run", "Resume it with the same command."
         )
-    if manifest["format"] == TRAINING and "height.exr" not in manifest["results_sha256"]:  # behind a plain lens
+    if manifest["format"] == TRAINING and LEVEL_MAP not in manifest["results_sha256"]:  # trained behind a plain lens
         cure = "Give the run, or a training behind its plate."
-        raise InputError(str(folder), "must hold a plate, height.exr", "none", cure)
+        raise InputError(str(folder), f"must hold a plate, {LEVEL_MAP}", "none", cure)
     for name, digest in manifest["results_sha256"].items():
-        if name.endswith(".exr") and sha256_file(folder / name) != digest:
+        if name.endswith((".exr", LEVEL_MAP)) and sha256_file(folder / name) != digest:
             raise InputError(
                 str(folder / name),
                 "must be the file this run wrote",

@@ -1,44 +1,39 @@
-"""What is to be drawn, from wherever it comes: a run, its mask files, an EXR file, or a map the user brings."""
+"""Level maps and designs from wherever they come: a run, its mask files, or a height map that the user brings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isclose
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from doedesign.build import levels_from_spec
-from doedesign.runs.folder import Run, open_run
+from doedesign.build import camera_from_spec, levels_from_spec
+from doedesign.design.design import Design
+from doedesign.runs.folder import CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run
 from doedesign.spec import HEIGHT_FILES
 from fab.errors import InputError
+from fab.files import MANIFEST_NAME, sha256_file
 from fab.grid import Grid
 from fab.height import HeightMap, read_height
 from fab.layout.geometry import pixel_edges
-from fab.levels import Levels, height_of, quantise, quantise_wrapped
+from fab.level_map import LevelMap, read_level_map, write_level_map
+from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.units import format_length
+from fab.units import NM, format_length
 
 
-@dataclass(frozen=True)
-class LevelMap:
-    """A map that can be drawn.
+class Drawing(NamedTuple):
+    """A level map to order masks for, and where it comes from.
 
     Attributes:
-        level: level numbers `[y, x]`.
-        levels: the staircase.
-        grid: the raster.
-        aperture_m: diameter of the relief, metres.
-        name: what it is called, letters A-Z and digits at least in part.
-        file: where its heights were read.
+        level_map: the level map.
+        origin: what the manifest of an order says of its source.
+        design: the design of the run it belongs to, if it is one's.
     """
 
-    level: NDArray[np.uint8]
-    levels: Levels
-    grid: Grid
-    aperture_m: float
-    name: str
-    file: Path
+    level_map: LevelMap
+    origin: dict[str, Any]
+    design: Design | None
 
 
 def read_any_height(
@@ -48,9 +43,9 @@ def read_any_height(
 
     Args:
         path: the file.
-        pitch_m: pixel pitch; needed unless the file holds it (EXR of our own).
+        pitch_m: pixel pitch, metres; needed unless the file holds it (EXR of our own).
         scale_m: metres per count, for integers.
-        aperture_m: diameter of the relief; by default what the file says, or its shorter side.
+        aperture_m: diameter of the relief, metres; by default what the file says, or its shorter side.
 
     Raises:
         InputError: the file cannot be read or something needed is missing.
@@ -72,36 +67,71 @@ def read_any_height(
     return HeightMap(stored.height_m, grid, aperture_m)
 
 
-def levels_of_run(run: Run, count: int | None = None) -> LevelMap:
-    """What a run draws, or its continuous design rounded to another number of levels over the same full height."""
-    drawn = levels_from_spec(run.spec.process)
-    aperture, name = run.spec.doe.aperture_m, run.spec.name
-    if count in (None, drawn.count) and run.spec.optimize.quantisation != "none":
-        file = run.path("height.exr")
-        height = read_any_height(file)
-        level = quantise(height.height_m, drawn)
-        _require_on(level, height.height_m, drawn, file)
-        return LevelMap(level, drawn, height.grid, aperture, name, file)
-    levels = drawn if count in (None, drawn.count) else Levels(count, drawn.period_m / max(count, 1))
-    file = run.path("height_continuous.exr")
-    height = read_any_height(file)
+def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
+    """The level map of a run, or its continuous design rounded to another number of levels over the same full height.
+
+    Raises:
+        InputError: a file of the run cannot be read, or is not for the staircase that the run chose.
+    """
+    own = levels_from_spec(run.spec.process)
+    if count in (None, own.count):
+        file = run.path(LEVEL_MAP)
+        level_map = read_level_map(file)
+        if level_map.levels != own:
+            cure = "Restore the manifest of the run, or optimise again."
+            raise InputError(str(file), f"must be for {own.told}", level_map.levels.told, cure)
+        return level_map
+    levels = Levels(count, own.period_m / max(count, 1))
     # The design repeats with the full height, so the top half step rounds to the lowest level.
-    return LevelMap(quantise_wrapped(height.height_m, levels), levels, height.grid, aperture, name, file)
+    height = read_any_height(run.path(CONTINUOUS), aperture_m=run.spec.doe.aperture_m)
+    return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
-def _require_on(level: NDArray[np.uint8], height_m: NDArray[np.floating], levels: Levels, file: Path) -> None:
-    """Refuse heights that are not those of levels; equal steps, which the spec's digest vouches for, go unlooked at."""
-    if levels.is_binary:
-        return
-    off_m = float(np.abs(height_m - height_of(level, levels)).max())
-    # As much as any two levels are apart, and far above what single precision loses.
-    if off_m > 1e-3 * levels.step_m:
-        got = f"one that is {format_length(float(f'{off_m:.3g}'))} off"
-        cure = "Restore the manifest of the run, or optimise again."
-        raise InputError(str(file), f"every height must be one of the {levels.told}", got, cure)
+def open_design(source: "Path | Run", masks: Path | None = None, *, levels: int | None = None) -> Design:
+    """The design of a finished run, as its masks draw it.
+
+    Args:
+        source: the run, or its folder.
+        masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map.
+        levels: another number of levels, which no mask order is looked for.
+
+    Raises:
+        InputError: a run or order that cannot be read, or an order of another run.
+    """
+    run = source if isinstance(source, Run) else open_run(source)
+    level_map = level_map_of_run(run, levels)
+    folder = masks or Path("masks") / run.spec.name
+    moves_m: tuple[float, ...] = ()
+    if levels is None and (masks is not None or (folder / MANIFEST_NAME).is_file()):
+        level_map = level_map.with_level(drawn_in_masks(folder, level_map))
+        moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
+    continuous = run.path(CONTINUOUS)
+    return Design(
+        level_map,
+        camera_from_spec(run.spec),
+        run.spec.scene.near_m,
+        run.spec.scene.far_m,
+        edge_moves_m=moves_m if any(moves_m) else (),
+        continuous_m=read_any_height(continuous).height_m if continuous.is_file() else None,
+        spec=run.spec,
+        folder=run.folder,
+    )
 
 
-def level_map_from(
+def write_design(folder: Path, design: Design) -> list[str]:
+    """Write the level map of a design and the heights that follow from it, metres; return the names of the files."""
+    from sim.store import write_height
+
+    grid, aperture_m = design.level_map.grid, design.level_map.aperture_m
+    write_level_map(folder / LEVEL_MAP, design.level_map)
+    heights = {HEIGHT: design.nominal_height_m, CONTINUOUS: design.continuous_m}
+    names = [name for name, height in heights.items() if height is not None]
+    for name in names:
+        write_height(folder / name, heights[name], grid.pitch_m, aperture_m)
+    return [LEVEL_MAP, *names]
+
+
+def drawing_from(
     source: Path,
     count: int | None,
     *,
@@ -110,17 +140,17 @@ def level_map_from(
     pitch_m: float | None = None,
     scale_m: float | None = None,
     aperture_m: float | None = None,
-) -> LevelMap:
+) -> Drawing:
     """The level map of a run folder or of a height map.
 
     Args:
         source: the run folder or height map.
         count: number of levels.
-        step_m: height of one level; for a bare height map, like the rest.
-        depths_m: depth of every mask where it is not 2^k steps, mask 0 first.
-        pitch_m: pixel pitch.
+        step_m: height of one level, metres; for a bare height map, like the rest.
+        depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
+        pitch_m: pixel pitch, metres.
         scale_m: metres per count, for integers.
-        aperture_m: diameter of the relief.
+        aperture_m: diameter of the relief, metres.
 
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
@@ -134,50 +164,51 @@ def level_map_from(
             if value is not None:
                 cure = "Leave the option out, or give a height map."
                 raise InputError(option, "a run brings its own geometry", "a value", cure)
-        return levels_of_run(open_run(source), count)
+        run = open_run(source)
+        design = open_design(run, levels=run.spec.process.levels if count is None else count)
+        origin = {"kind": "run", "name": run.spec.name, "level_map_sha256": level_map_of_run(run).digest}
+        return Drawing(design.level_map, origin, design)
     if count is None or step_m is None:
         missing, example = ("--levels", "--levels 16") if count is None else ("--step", '--step "75 nm"')
         raise InputError(str(source), f"a bare height map needs {missing}", "none", f"Add {example}.")
     levels = Levels(count, step_m, tuple(depths_m))
     height = read_any_height(source, pitch_m, scale_m, aperture_m)
-    try:
-        level = quantise(height.height_m, levels)
-    except InputError as error:
-        raise InputError(str(source), error.rule, error.got, error.cure) from error
     # What a mask shop takes in a name; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
-    return LevelMap(level, levels, height.grid, height.aperture_m, name, source)
+    try:
+        level_map = LevelMap.from_height(height, levels, name)
+    except InputError as error:
+        what = "" if error.where == "level map" or error.where == "height map" else f": {error.where}"
+        raise InputError(f"{source}{what}", error.rule, error.got, error.cure) from error
+    origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
+    return Drawing(level_map, origin, None)
 
 
-def drawn_in_masks(folder: Path, drawing: LevelMap) -> np.ndarray:
-    """Level map that the combined GDS file of a mask order draws, `[y, x]`.
+def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
+    """Level numbers ``[y, x]`` that the combined GDS file of a mask order draws.
 
     Args:
         folder: the mask order.
-        drawing: what it should draw.
+        level_map: what it should draw.
 
     Raises:
         InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
     """
-    from fab.verification.verify import read_drawn_levels  # it needs what only those who draw have: training goes without
+    from fab.verification.verify import read_drawn_levels  # slow to import
 
     manifest = read_manifest(folder)
     levels, grid = manifest.staircase(), manifest.grid()
-    alike = grid.shape == drawing.grid.shape and levels.count == drawing.levels.count
+    alike = grid.shape == level_map.shape and levels.count == level_map.levels.count
     # The manifest rounds lengths to its units' last digit.
-    lengths = [(grid.pitch_m, drawing.grid.pitch_m), (levels.step_m, drawing.levels.step_m)]
-    lengths += zip(levels.depths_m, drawing.levels.depths_m, strict=False)
+    lengths = [(grid.pitch_m, level_map.grid.pitch_m), (levels.step_m, level_map.levels.step_m)]
+    lengths += zip(levels.depths_m, level_map.levels.depths_m, strict=False)
     if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
+        ny, nx = grid.shape
         raise InputError(
             str(folder),
-            f"the masks must be those of this run, {_told(drawing.grid, drawing.levels)}",
-            _told(grid, levels),
+            f"the masks must be those of this run, {level_map}",
+            f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels.told}",
             "Give the masks of this run (--masks).",
         )
     combined, moves = folder / manifest.combined_gds, manifest.edge_moves()
     return read_drawn_levels(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)
-
-
-def _told(grid: Grid, levels: Levels) -> str:
-    pixels = f"{grid.shape[0]} x {grid.shape[1]} pixels of {format_length(grid.pitch_m)}"
-    return f"{pixels} in {levels.told}"

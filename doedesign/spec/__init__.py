@@ -101,13 +101,15 @@ _Model = TypeVar("_Model", bound=SpecTable)
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
 
 
-def load_spec(path: str | Path, overrides: Sequence[str] = ()) -> Spec:
+def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) -> Spec:
     """Read a spec from TOML.
 
     Args:
         path: the file.
         overrides: changes such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key (list entries
             by their number) and a TOML value; quotes round text may be left out.
+        values: further changes, as they read best in Python: a key of ``[optimize]`` (``steps=60``), or of another
+            table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``).
 
     Returns:
         The spec with every default filled in. Files it names are not opened (see `input_files`), but for a spectral
@@ -116,13 +118,18 @@ def load_spec(path: str | Path, overrides: Sequence[str] = ()) -> Spec:
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
-    raw = _read_toml(Path(path), "a spec")
+    path = Path(path)
+    raw = _read_toml(path, "a spec")
     keys = [_override(raw, text) for text in overrides]
-    raw = with_response(raw, Path(path))
+    for name, value in values.items():
+        keys.append(key := name.replace("__", ".") if "__" in name else f"optimize.{name}")
+        _put(raw, key, value)
+    raw = with_response(raw, path)
     try:
         spec = Spec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
     except ValidationError as error:
         raise spec_error(str(path), explain(error, raw), keys) from None
+    spec._file = path  # pyright: ignore[reportAttributeAccessIssue]
     return _checked(spec, raw, str(path), keys)
 
 
@@ -216,12 +223,8 @@ def _model_of_toml(model: type[_Model], raw: Mapping[str, Any], source: str) -> 
         raise spec_error(source, explain(error, raw, model)) from None
 
 
-def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
-    """Return the files a spec names, found relative to the folder of the spec file.
-
-    Args:
-        spec: the spec.
-        spec_path: the file it was loaded from.
+def input_files(spec: Spec) -> dict[str, Path]:
+    """Return the files a spec names, found relative to the folder of the spec file (or to the current one).
 
     Returns:
         For each dotted key ("optimize.start", "objective[0].options.image") the existing file.
@@ -235,14 +238,15 @@ def input_files(spec: Spec, spec_path: str | Path) -> dict[str, Path]:
     for index, objective in enumerate(spec.objectives):
         if "image" in objective.options:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
-    files = {key: Path(spec_path).parent / name for key, name in named.items()}
+    folder = Path() if spec.file is None else spec.file.parent
+    files = {key: folder / name for key, name in named.items()}
     missing = [
         SpecMistake(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
         for key, file in files.items()
         if not file.is_file()
     ]
     if missing:
-        raise spec_error(str(spec_path), missing)
+        raise spec_error(str(spec.file or spec.name), missing)
     return files
 
 
@@ -284,7 +288,11 @@ def _override(raw: dict[str, Any], text: str) -> str:
     found = _OVERRIDE.fullmatch(text)
     if not found:
         raise InputError("--set", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
-    key, value = found[1], _override_value(found[2].strip())
+    _put(raw, found[1], _override_value(found[2].strip()))
+    return found[1]
+
+
+def _put(raw: dict[str, Any], key: str, value: Any) -> None:
     *parents, last = key.split(".")
     place: Any = raw
     for part in parents:
@@ -294,7 +302,6 @@ def _override(raw: dict[str, Any], text: str) -> str:
     else:
         _entry(place, last, key)
         place[int(last)] = value
-    return key
 
 
 def _entry(place: Any, part: str, key: str) -> Any:

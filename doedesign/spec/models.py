@@ -6,9 +6,10 @@ Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies bot
 `process`, those of scene and sensor in `scene`, those of the network and its training in `training`.
 """
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
@@ -204,3 +205,17 @@ class Spec(SpecTable, frozen=True):
     wafer: WaferSpec = unsaid(WaferSpec())
     network: NetworkSpec = unsaid(NetworkSpec())
     train: TrainSpec = unsaid(TrainSpec())
+    _file: Path | None = PrivateAttr(None)
+
+    @property
+    def file(self) -> Path | None:
+        """The file it was read from, against which the paths in it are resolved; no part of its content."""
+        return self._file
+
+    def __eq__(self, other: object) -> bool:
+        """Compare content, wherever it was read."""
+        return isinstance(other, Spec) and self.__dict__ == other.__dict__
+
+    def __hash__(self) -> int:
+        """Hash of the content."""
+        return hash(tuple(self.__dict__.values()))

@@ -31,11 +31,11 @@ from fab.errors import InputError
 from fab.process import Process, Variation
 
 if TYPE_CHECKING:
-    from doedesign.prediction import Drawn
+    from doedesign.design.design import Design
     from sim.psf_bank import PsfBank
 
 Rows = list[dict[str, Any]]
-Evaluate = Callable[["Drawn", Process, Variation], Any]
+Evaluate = Callable[["Design", Process, Variation], Any]
 """What is asked of a plate; a study asks for `Rows`."""
 
 _STRIKES = 3
@@ -48,22 +48,22 @@ class Work(NamedTuple):
     """What every worker holds: how plates are evaluated, and of what."""
 
     evaluate: Evaluate
-    drawn: "Drawn"
+    design: "Design"
     process: Process
 
 
-def predicted_rows(drawn: "Drawn", process: Process, variation: Variation) -> Rows:
+def predicted_rows(design: "Design", process: Process, variation: Variation) -> Rows:
     """What light does with one plate, one row per colour and depth (`doedesign.prediction`)."""
     from doedesign.prediction import predict
 
-    return predict(drawn, process, variation).rows
+    return predict(design, process, variation).rows
 
 
-def predicted_bank(drawn: "Drawn", process: Process, variation: Variation) -> "PsfBank":
+def predicted_bank(design: "Design", process: Process, variation: Variation) -> "PsfBank":
     """The PSFs of one plate."""
     from doedesign.prediction import predict
 
-    return predict(drawn, process, variation).bank
+    return predict(design, process, variation).bank
 
 
 class OutOfModel(NamedTuple):
@@ -79,7 +79,7 @@ class OutOfModel(NamedTuple):
 def evaluated(work: Work, variation: Variation) -> Any:
     """What is found of one plate; `OutOfModel` where the evaluation raises `InputError`."""
     try:
-        return work.evaluate(work.drawn, work.process, variation)
+        return work.evaluate(work.design, work.process, variation)
     except InputError as error:
         return OutOfModel(f"{error.where}: {error.rule}, but got {error.got}")
 
@@ -118,8 +118,8 @@ def packed(work: Work) -> WorkerTask:
         raise InputError("evaluate", rule, path_of(work.evaluate), "Move it there.")
     # A read-only mapping cannot be sent.
     process = replace(work.process, spreads=dict(work.process.spreads))
-    drawn = work.drawn
-    return WorkerTask(uuid.uuid4().hex, path_of(work.evaluate), path_of(type(drawn)), dict(vars(drawn)), process)
+    design = work.design
+    return WorkerTask(uuid.uuid4().hex, path_of(work.evaluate), path_of(type(design)), dict(vars(design)), process)
 
 
 _OPENED: dict[str, Work] = {}

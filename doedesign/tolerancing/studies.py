@@ -55,7 +55,7 @@ from fab.levels import Levels
 from fab.process import DEVIATIONS, Normal, Process, Variation, error_names
 
 if TYPE_CHECKING:
-    from doedesign.prediction import Drawn
+    from doedesign.design.design import Design
 
 FORMAT = "doedesign tolerance 1"
 
@@ -109,7 +109,7 @@ class Study:
     Every question evaluates what it needs and has not been evaluated before.
 
     Attributes:
-        drawn: the design.
+        design: the design.
         process: the process.
         limits: what a good plate obeys.
         seed: seed of every draw.
@@ -119,7 +119,7 @@ class Study:
         quiet: whether no progress is shown.
     """
 
-    drawn: "Drawn"
+    design: "Design"
     process: Process
     limits: tuple[LimitSpec, ...]
     seed: int
@@ -131,7 +131,7 @@ class Study:
     @property
     def plate_m(self) -> float:
         """Side of the square on which particles and pinholes fall: the whole grid of the DOE."""
-        return max(self.drawn.camera.grid.extent_m)
+        return max(self.design.camera.grid.extent_m)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -181,7 +181,7 @@ class Study:
             return
         done = total - len(plates)
         progress = nullcontext() if self.quiet else meter("plates", total, done)
-        work = Work(self.evaluate, self.drawn, self.process)
+        work = Work(self.evaluate, self.design, self.process)
         with progress as shown, closing(self.run(work, plates)) as finished:  # pyright: ignore[reportArgumentType]
             for count, (key, found) in enumerate(finished):
                 if count == 0 and not isinstance(found, OutOfModel):
@@ -262,7 +262,7 @@ class Study:
 
 
 def study(
-    design: "str | Path | Run | Drawn",
+    design: "str | Path | Run | Design",
     *,
     process: "str | Path | Process | None" = None,
     errors: Mapping[str, Any] | None = None,
@@ -295,14 +295,14 @@ def study(
     Raises:
         InputError: a run, process, error or limit that cannot be used, or a process without errors.
     """
-    drawn, spec = _drawn_and_spec(design, masks)
-    made = _process(process, spec, drawn)
+    chosen, spec = _drawn_and_spec(design, masks)
+    made = _process(process, spec, chosen)
     if errors:
         made = with_errors(made, errors)
-    if drawn.edge_moves_m:
-        from doedesign.prediction import process_with_moves
+    if chosen.edge_moves_m:
+        from doedesign.build import with_edge_moves
 
-        made = process_with_moves(made, drawn.edge_moves_m)
+        made = with_edge_moves(made, chosen.edge_moves_m)
     if not sources_of(made):
         raise InputError(
             "process.errors",
@@ -315,30 +315,25 @@ def study(
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in limits or ())
     if limits is None and spec is not None:
         obeyed = spec.limits
-    journal = Journal(None if out is None else Path(out), identity(drawn, made, seed, evaluate))
-    return Study(drawn, made, obeyed, seed, journal, evaluate, _runner(drawn, workers, scheduler, quiet), quiet)
+    journal = Journal(None if out is None else Path(out), identity(chosen, made, seed, evaluate))
+    return Study(
+        chosen.bare(), made, obeyed, seed, journal, evaluate, _runner(chosen, workers, scheduler, quiet), quiet
+    )
 
 
-def _drawn_and_spec(design: "str | Path | Run | Drawn", masks: Path | None) -> "tuple[Drawn, Any]":
+def _drawn_and_spec(design: "str | Path | Run | Design", masks: Path | None) -> "tuple[Design, Any]":
     if not isinstance(design, str | Path | Run):
-        return design, None
-    from doedesign.prediction import drawn_of
+        return design, design.spec
+    from doedesign.runs.level_maps import open_design
 
     run = design if isinstance(design, Run) else open_run(Path(design))
-    return drawn_of(run, masks), run.spec
+    return open_design(run, masks), run.spec
 
 
-def _process(given: "str | Path | Process | None", spec: Any, drawn: "Drawn") -> Process:
-    from doedesign.build import matching, process_for, process_from_spec
-    from doedesign.spec import load_process
+def _process(given: "str | Path | Process | None", spec: Any, design: "Design") -> Process:
+    from doedesign.build import resolve_process
 
-    if isinstance(given, Process):
-        return matching(drawn.levels, given, "process")
-    if spec is not None:
-        return process_for(drawn.levels, spec.process, None if given is None else Path(given))
-    if given is None:
-        return Process(drawn.levels)
-    return matching(drawn.levels, process_from_spec(load_process(Path(given)), drawn.levels), str(given))
+    return resolve_process(given, design.levels, None if spec is None else spec.process)
 
 
 def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
@@ -367,14 +362,14 @@ def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
     return replace(process, spreads=spreads)
 
 
-def _runner(drawn: "Drawn", workers: int | None, scheduler: str | None, quiet: bool) -> Any:
+def _runner(design: "Design", workers: int | None, scheduler: str | None, quiet: bool) -> Any:
     if scheduler is not None:
         if workers is not None:
             cure = "Leave --workers out; workers are started where the cluster is."
             raise InputError("--workers", "a cluster brings its own workers", workers, cure)
         say = (lambda _: None) if quiet else (lambda text: print(text, file=sys.stderr, flush=True))
         return lambda work, plates: evaluate_there(work, plates, scheduler, say)
-    ny, nx = drawn.level.shape
+    ny, nx = design.level_map.level.shape
     count = default_workers(ny * nx) if workers is None else _at_least(1, "--workers", workers)
     return lambda work, plates: evaluate_here(work, plates, count)
 
@@ -391,24 +386,24 @@ def _levels_record(levels: Levels) -> dict[str, Any]:
     return {"count": levels.count, "step_m": levels.step_m, **depths}
 
 
-def identity(drawn: "Drawn", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
+def identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Everything a plate's numbers depend on besides its key, as JSON.
 
     How many plates are looked at, and the limits they are judged by, are no part of it: a study may grow.
     """
-    ny, nx = drawn.level.shape
+    ny, nx = design.level_map.level.shape
     spreads: Mapping[str, Normal] = process.spreads
     return {
         "format": FORMAT,
         "version": __version__,
         "design": {
-            "name": drawn.name,
-            "level_sha256": sha256_bytes(drawn.level.tobytes()),
+            "name": design.name,
+            "level_sha256": sha256_bytes(design.level_map.level.tobytes()),
             "shape": [ny, nx],
-            "levels": _levels_record(drawn.levels),
-            "camera": asdict(drawn.camera),
-            "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*drawn.near_m, *drawn.far_m)],
-            "near": len(drawn.near_m),
+            "levels": _levels_record(design.levels),
+            "camera": asdict(design.camera),
+            "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*design.near_m, *design.far_m)],
+            "near": len(design.near_m),
         },
         "process": {
             "order": list(process.order),

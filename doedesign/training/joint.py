@@ -186,7 +186,7 @@ class Trainer(eqx.Module):
         moments = adam.init(eqx.filter(network, eqx.is_inexact_array))
         free, optics_moments = None, None
         if not isinstance(self.plate, StoredPlate):
-            free = jnp.asarray(self.plate.staircase.radians_of(height_m))
+            free = jnp.asarray(self.plate.parametrization.radians_of(height_m))
             optics_moments = adam.init(free) if self.spec.train.moves_optics else None
         state = JointState(0, network, free, moments, optics_moments)
         # Where the step will leave it: otherwise the second step would be compiled anew.
@@ -257,11 +257,11 @@ class Trainer(eqx.Module):
             return self
         plate, camera = self.plate, self.bench.camera
         assert isinstance(state.free, Array)  # learnt depths are refused with errors
-        level = np.asarray(plate.staircase.level(plate.staircase.continuous_m(state.free))).astype(np.uint8)
+        level = np.asarray(plate.parametrization.level(plate.parametrization.continuous_m(state.free))).astype(np.uint8)
         plate_m = max(camera.grid.extent_m)
         errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
         surface = as_fabricated(level, camera, self.process, errors, plate.wavelengths_m)
-        height = jnp.asarray(height_of(level, plate.staircase.levels).astype(np.float32))
+        height = jnp.asarray(height_of(level, plate.parametrization.levels).astype(np.float32))
         rates = [camera.waves_per_metre(line) for line in plate.wavelengths_m]
         ratio = [
             _error_of(jnp.asarray(surface.at(line)), height, rate)
@@ -326,12 +326,12 @@ def _live_plate(spec: Spec, files: Mapping[str, Path], source: str, camera: Came
     wavelengths = tuple(w for colour in camera.colours for w in colour.wavelengths_m)
     if not problem.radial:
         assert problem.coverage is not None  # only rings go without
-        return LivePlate(problem.lines, problem.coverage, None, problem.staircase, camera, wavelengths)
+        return LivePlate(problem.lines, problem.coverage, None, problem.parametrization, camera, wavelengths)
     if spec.train.field == "random" or spec.train.fabricated:
         key = "field" if spec.train.field == "random" else "fabricated"
         cure = 'Use parametrization = "freeform" with this design as its start.'
         raise InputError(f"{source}: train.{key}", "must be left out for a design of rings", "it", cure)
-    return RingPlate(problem.lines, problem.staircase, camera, wavelengths)
+    return RingPlate(problem.lines, problem.parametrization, camera, wavelengths)
 
 
 def _odd_window(spec: Spec) -> Any:

@@ -37,7 +37,7 @@ class LivePlate(eqx.Module):
         lines: propagation of every wavelength.
         coverage: `[y, x]` open share of every cell.
         errors: `[line, y, x]` what a plate as fabricated does to light beside its heights; None for one as drawn.
-        staircase: parameters to heights.
+        parametrization: parameters to heights.
         camera: optics and sensor.
         wavelengths_m: of the lines.
     """
@@ -45,7 +45,7 @@ class LivePlate(eqx.Module):
     lines: tuple[WavelengthPlan, ...]
     coverage: Float[Array, "y x"]
     errors: Complex[Array, "line y x"] | None
-    staircase: LevelParametrization = eqx.field(static=True)
+    parametrization: LevelParametrization = eqx.field(static=True)
     camera: Camera = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
 
@@ -55,7 +55,7 @@ class LivePlate(eqx.Module):
 
     def psf(self, free: Free, softness: Array, source: Source) -> Float[Array, "c y x"]:
         """PSF of every colour, energy per pixel."""
-        height = _height_m(self.staircase, free, softness)
+        height = _height_m(self.parametrization, free, softness)
         grid = self.camera.grid
         y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in ("y", "x"))
 
@@ -80,7 +80,7 @@ class RingPlate(eqx.Module):
     """A profile of rings; see `LivePlate`. Sources lie on the axis."""
 
     lines: tuple[WavelengthPlan, ...]
-    staircase: LevelParametrization = eqx.field(static=True)
+    parametrization: LevelParametrization = eqx.field(static=True)
     camera: Camera = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
 
@@ -96,7 +96,7 @@ class RingPlate(eqx.Module):
 
     def psf(self, free: Free, softness: Array, source: Float[Array, "line ring"]) -> Float[Array, "c y x"]:
         """PSF of every colour, energy per pixel."""
-        profile = _height_m(self.staircase, free, softness)
+        profile = _height_m(self.parametrization, free, softness)
         images = []
         for line, waves in zip(self.lines, source, strict=True):
             assert isinstance(line.plan, Hankel)
@@ -137,11 +137,11 @@ class StoredPlate(eqx.Module):
 Plate = LivePlate | RingPlate | StoredPlate
 
 
-def _height_m(staircase: LevelParametrization, free: Free, softness: Array) -> Array:
+def _height_m(parametrization: LevelParametrization, free: Free, softness: Array) -> Array:
     if isinstance(free, tuple):
-        radians, stretch = free
-        return staircase.height_m(radians, softness, staircase.depths_m(stretch))
-    return staircase.height_m(free, softness)
+        radians, log_depth_ratio = free
+        return parametrization.height_m(radians, softness, parametrization.depths_m(log_depth_ratio))
+    return parametrization.height_m(free, softness)
 
 
 def _by_colour(lines: tuple[WavelengthPlan, ...], images: list[Array]) -> Array:

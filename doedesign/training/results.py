@@ -1,6 +1,7 @@
 """What a training makes: scores and pictures of scenes it never saw, the trained plate, its PSFs, and the network."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,23 +14,24 @@ from jaxtyping import Float
 from doedesign.capture.from_spec import rgb_from_channels
 from doedesign.capture.scenes import SceneBatch, SceneData
 from doedesign.capture.simulate import depth_range_m
+from doedesign.design.design import Design
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
-from doedesign.runs.folder import Run
-from doedesign.runs.level_maps import read_any_height
+from doedesign.runs.folder import CONTINUOUS, Run
+from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.training.evaluation import EvaluationResult, judge
 from doedesign.training.joint import JointState, Trainer, resting_plate
 from doedesign.training.optics import RingPlate, StoredPlate
 from doedesign.training.perceptual import Lpips
 from doedesign.training.validation import looks
 from fab.files import canonical_json, write_atomic
-from fab.levels import height_of
+from fab.level_map import LevelMap
 from sim.camera import Camera
 from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
 from sim.propagation.hankel import radial_profile, revolve, ring_count
 from sim.psf_bank import psf_bank
-from sim.store import write_bank, write_height
+from sim.store import write_bank
 
 
 class HeldOut(NamedTuple):
@@ -72,7 +74,7 @@ def _at_rest(trainer: Trainer, state: JointState, kind: ObstructionKind) -> tupl
     """
     if isinstance(trainer.plate, StoredPlate):
         return trainer, state
-    plate = resting_plate(trainer.spec, trainer.bench.camera, kind, _maps_of(trainer, state).drawn_m)
+    plate = resting_plate(trainer.spec, trainer.bench.camera, kind, _design_of(trainer, state).nominal_height_m)
     return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
 
 
@@ -96,23 +98,11 @@ def _shown(
     }
 
 
-class PlateMaps(NamedTuple):
-    """Height maps of a plate, metres, float32 `[y, x]`.
-
-    Attributes:
-        drawn_m: what is to be made.
-        continuous_m: the same before rounding; None for a plate that training left as it was.
-    """
-
-    drawn_m: Float[np.ndarray, "y x"]
-    continuous_m: Float[np.ndarray, "y x"] | None
-
-
 def height_at_rest_m(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
     """The plate that a run draws, or a flat one where the spec wants a conventional camera."""
     if run.spec.train.camera == "conventional":
         return np.zeros(camera.grid.shape, np.float32)
-    return read_any_height(run.path("height.exr")).height_m
+    return open_design(run, levels=run.spec.process.levels).nominal_height_m
 
 
 def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
@@ -121,7 +111,7 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
     if run.spec.train.camera == "conventional":
         flat = np.zeros(camera.grid.shape, np.float32)
         return flat[0, : ring_count(camera)] if isinstance(trainer.plate, RingPlate) else flat
-    heights = read_any_height(run.path("height_continuous.exr")).height_m
+    heights = read_any_height(run.path(CONTINUOUS)).height_m
     if not isinstance(trainer.plate, RingPlate):
         return heights
     profile = radial_profile(heights, camera.grid)
@@ -129,26 +119,26 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
     return profile[: ring_count(camera)]
 
 
-def plate_after(run: Run, trainer: Trainer, state: JointState) -> PlateMaps:
-    """The plate of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
+def design_after(run: Run, trainer: Trainer, state: JointState) -> Design:
+    """The design of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
     if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
-        return PlateMaps(height_at_rest_m(run, trainer.bench.camera), None)
-    return _maps_of(trainer, state)
+        return replace(open_design(run, levels=run.spec.process.levels), continuous_m=None)
+    return _design_of(trainer, state)
 
 
-def _maps_of(trainer: Trainer, state: JointState) -> PlateMaps:
-    """What parameters make."""
+def _design_of(trainer: Trainer, state: JointState) -> Design:
+    """The design that parameters make."""
     plate = trainer.plate
     assert not isinstance(plate, StoredPlate)  # which has none
     # A finished run has chosen its depths, so only the map is free.
     assert isinstance(state.free, jax.Array)
-    continuous = np.asarray(plate.staircase.continuous_m(state.free))
+    continuous = np.asarray(plate.parametrization.continuous_m(state.free))
     if isinstance(plate, RingPlate):
         continuous = revolve(continuous, trainer.bench.camera.grid)
-    if trainer.spec.optimize.quantisation == "none":
-        return PlateMaps(continuous, continuous)
-    level = np.asarray(plate.staircase.level(jnp.asarray(continuous))).astype(np.uint8)
-    return PlateMaps(height_of(level, plate.staircase.levels).astype(np.float32), continuous)
+    level = np.asarray(plate.parametrization.level(jnp.asarray(continuous))).astype(np.uint8)
+    spec, camera = trainer.spec, trainer.bench.camera
+    level_map = LevelMap(level, plate.parametrization.levels, camera.grid, spec.doe.aperture_m, spec.name)
+    return Design(level_map, camera, spec.scene.near_m, spec.scene.far_m, continuous_m=continuous, spec=spec)
 
 
 def write_results(
@@ -175,15 +165,15 @@ def write_results(
         names of the files.
     """
     spec, camera = run.spec, trainer.bench.camera
-    maps, near = plate_after(run, trainer, state), spec.scene.near_m or depth_range_m(kind)
+    near = spec.scene.near_m or depth_range_m(kind)
     names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
+    height = np.zeros(camera.grid.shape, np.float32)
     if spec.train.camera == "doe":
-        for name, height in (("height", maps.drawn_m), ("height_continuous", maps.continuous_m)):
-            if height is not None:
-                write_height(folder / f"{name}.exr", height, camera.grid.pitch_m, spec.doe.aperture_m)
-                names.append(f"{name}.exr")
+        design = design_after(run, trainer, state)
+        height = design.nominal_height_m
+        names += write_design(folder, design)
     depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
-    bank = psf_bank(camera, maps.drawn_m, depths, propagation=spec.optics.propagation)
+    bank = psf_bank(camera, height, depths, propagation=spec.optics.propagation)
     write_bank(folder / BANK_NAME, bank, {"design": spec.name})
     found = validate(trainer, state, held_out, baselines=True)
     write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))

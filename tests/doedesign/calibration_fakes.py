@@ -14,7 +14,7 @@ from PIL import Image
 
 from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.unknowns import unknowns_of
-from doedesign.prediction import Drawn
+from doedesign.design.design import Design
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -29,7 +29,7 @@ SHIFT = (3.37, -5.21)  # pixels by which the chief ray misses the frame's middle
 _AROUND = 16  # pixels
 
 
-def plate_drawn(cells: int = 200, count: int = 16, relief: float = 1.0, window: int = 96) -> Drawn:
+def plate_drawn(cells: int = 200, count: int = 16, relief: float = 1.0, window: int = 96) -> Design:
     """Rings with something irregular in them, so that up differs from down and left from right."""
     y, x = np.indices((cells, cells)) - (cells - 1) / 2
     rough = np.random.default_rng(7).normal(size=(cells, cells))
@@ -42,23 +42,23 @@ def plate_drawn(cells: int = 200, count: int = 16, relief: float = 1.0, window: 
     level = np.floor(relief * (waves % 1) * count).astype(np.uint8) + np.uint8((1 - relief) * (count - 1))
     grid = Grid((cells, cells), PITCH_M)
     aperture = cells * PITCH_M
-    blank = LevelMap(np.minimum(level, count - 1).astype(np.uint8), levels, grid, aperture).level
+    level_map = LevelMap(np.minimum(level, count - 1).astype(np.uint8), levels, grid, aperture, "fake")
     colour = Colour("550nm", (550e-9,), (1.0,))
     focal = 1.1e-3 * cells / 320 * 1.6
     camera = Camera(grid, aperture - 10e-6, "fused_silica", (colour,), focal, PIXEL_M, window)
-    return Drawn("fake", blank, levels, camera, (6e-3,), (np.inf,))
+    return Design(level_map, camera, (6e-3,), (np.inf,))
 
 
-def usual_process(drawn: Drawn, **sigmas: float) -> Process:
+def usual_process(design: Design, **sigmas: float) -> Process:
     """A process with ordinary spreads; `sigmas` by key of `fab.process.DEVIATIONS` replace them."""
     spreads = {"common_depth_scale": 0.03, "common_cd_bias_m": 0.15e-6, "overlay_y_m": 0.5e-6, "overlay_x_m": 0.5e-6}
-    masks = drawn.levels.bits
+    masks = design.levels.bits
     each = {n: Normal(0.0, s) for key, s in {**spreads, **sigmas}.items() for n in error_names(masks, key) if s}
-    return Process(drawn.levels, spreads=each, name="usual")
+    return Process(design.levels, spreads=each, name="usual")
 
 
 def light_of(
-    drawn: Drawn, process: Process, hidden: Mapping[str, float], depths_m: Sequence[float], margin: int = 20
+    design: Design, process: Process, hidden: Mapping[str, float], depths_m: Sequence[float], margin: int = 20
 ) -> list[np.ndarray]:
     """Images of a plate with hidden errors, `margin` pixels wider than the design's window, in wider frames.
 
@@ -66,8 +66,8 @@ def light_of(
     """
     unknowns = unknowns_of(replace(process, spreads={n: Normal(v, 0.0) for n, v in hidden.items()}), ["etch_lag"])
     probe = Colour("probe", (PROBE_M,), (1.0,))
-    camera = replace(drawn.camera, colours=(probe,), window=drawn.camera.window + margin)
-    seen = ForwardModel(drawn.level, camera, process, unknowns, tuple(depths_m)).plate(np.zeros(1))
+    camera = replace(design.camera, colours=(probe,), window=design.camera.window + margin)
+    seen = ForwardModel(design.level_map.level, camera, process, unknowns, tuple(depths_m)).plate(np.zeros(1))
     whole = [round(s) for s in SHIFT]
     part = np.array([s - w for s, w in zip(SHIFT, whole, strict=True)] + [0.0])
     # The frame is wider still; what little light falls there is left out.

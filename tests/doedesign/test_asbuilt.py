@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from doedesign.commands.asbuilt import as_built
+from doedesign.design.design import Design
 from doedesign.lab.as_built import compared, gratings_compared, plate_of
 from doedesign.lab.predictions import seen_of
-from doedesign.prediction import Drawn, drawn_of, predict
+from doedesign.prediction import predict
 from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_variation
 from fab.errors import InputError
 from fab.layout.structures import PAD_SIDES_UM
-from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Normal, Process, Variation
 from fab.runsheet.as_built import AsBuilt, ChromeMeasured, MaskMeasured
@@ -123,13 +124,12 @@ def run(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def drawn(run: Path) -> Drawn:
-    return drawn_of(open_run(run))
+def design(run: Path) -> Design:
+    return open_design(open_run(run))
 
 
-def write_sheet(path: Path, drawn: Drawn, numbers: dict[str, Any], predicted: Any = None) -> Path:
-    level_map = LevelMap(drawn.level, drawn.levels, drawn.camera.grid, drawn.camera.aperture_m)
-    data = record(sheet(LEVELS, zero_layer=True, level_map=level_map, outlook=outlook()))
+def write_sheet(path: Path, design: Design, numbers: dict[str, Any], predicted: Any = None) -> Path:
+    data = record(sheet(LEVELS, zero_layer=True, level_map=design.level_map, outlook=outlook()))
     if predicted is not None:
         data["predicted"] |= predicted
     path.write_text(json.dumps(data | ({"measured": numbers} if numbers else {})))
@@ -247,10 +247,10 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
 
 
 @pytest.mark.slow
-def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, drawn, tmp_path):
-    wanted = predict(drawn, IDEAL, PLATE)
-    before = [seen._asdict() for seen in seen_of(predict(drawn, IDEAL, Variation()).rows)]
-    file = write_sheet(tmp_path / "s.json", drawn, numbers_of(PLATE, LEVELS), {"as_drawn": before, "expected": before})
+def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, design, tmp_path):
+    wanted = predict(design, IDEAL, PLATE)
+    before = [seen._asdict() for seen in seen_of(predict(design, IDEAL, Variation()).rows)]
+    file = write_sheet(tmp_path / "s.json", design, numbers_of(PLATE, LEVELS), {"as_drawn": before, "expected": before})
     said = []
     folder = as_built(run, file, say=said.append)
     assert folder == run / "as-built"
@@ -270,32 +270,32 @@ def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run
     # What it wrote is what `psf --fabricated --variation` reads.
     variation = load_variation(folder / "variation.toml")
     assert variation.depth_scale == pytest.approx(PLATE.depth_scale)
-    again = predict(drawn, IDEAL, variation)
+    again = predict(design, IDEAL, variation)
     np.testing.assert_array_equal(again.bank.energy.astype(np.float32), bank.energy)
     content = {path.name: path.read_bytes() for path in folder.iterdir()}
     as_built(run, file)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == content
 
 
-def test_an_unfilled_sheet_gives_the_plate_as_drawn(run, drawn, tmp_path):
-    folder = as_built(run, write_sheet(tmp_path / "s.json", drawn, {}))
-    nominal = predict(drawn, IDEAL, Variation())
+def test_an_unfilled_sheet_gives_the_plate_as_drawn(run, design, tmp_path):
+    folder = as_built(run, write_sheet(tmp_path / "s.json", design, {}))
+    nominal = predict(design, IDEAL, Variation())
     np.testing.assert_array_equal(read_bank(folder / "as-built.exr").energy, nominal.bank.energy.astype(np.float32))
     assert load_variation(folder / "variation.toml") == Variation()
 
 
-def test_another_designs_sheet_and_errors_beyond_the_model_are_refused(run, drawn, tmp_path):
-    other = replace(drawn, level=np.roll(drawn.level, 1, axis=0))
+def test_another_designs_sheet_and_errors_beyond_the_model_are_refused(run, design, tmp_path):
+    other = replace(design, level_map=design.level_map.with_level(np.roll(design.level_map.level, 1, axis=0)))
     with pytest.raises(InputError, match="this design"):
         as_built(run, write_sheet(tmp_path / "s.json", other, {}))
     far = {"mask 1": {"overlay_x_um": 40.0}}
     with pytest.raises(InputError, match="overlay") as caught:
-        as_built(run, write_sheet(tmp_path / "t.json", drawn, far))
+        as_built(run, write_sheet(tmp_path / "t.json", design, far))
     assert "t.json" in str(caught.value)
 
 
-def test_rows_that_the_sheet_does_not_have_are_compared_with_nothing(drawn):
-    rows = predict(drawn, IDEAL, Variation()).rows
+def test_rows_that_the_sheet_does_not_have_are_compared_with_nothing(design):
+    rows = predict(design, IDEAL, Variation()).rows
     assert all(row["as_drawn"] is row["expected"] is None for row in compared(rows, None))
     odd = {"as_drawn": [{"colour": rows[0]["colour"], "depth_m": 9.0, "strehl": 0.5}, 3], "expected": "nothing"}
     assert all(row["as_drawn"] is row["expected"] is None for row in compared(rows, odd))

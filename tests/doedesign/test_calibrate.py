@@ -19,7 +19,7 @@ from doedesign.calibration.objective import (
 )
 from doedesign.calibration.target import measured_weights
 from doedesign.calibration.uncertainty import posterior_of
-from doedesign.prediction import Drawn
+from doedesign.design.design import Design
 from fab.errors import InputError
 from fab.process import Normal, Process
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
@@ -40,7 +40,7 @@ FEW = {"common_depth_scale": -0.02, "common_cd_bias_m": 0.1e-6, "overlay_y_m[1]"
 
 def measured(
     folder: Path,
-    drawn: Drawn,
+    design: Design,
     process: Process,
     hidden: dict[str, float],
     depths_m: tuple[float, ...] = (NEAR_M, FAR_M),
@@ -49,27 +49,27 @@ def measured(
     margin: int = 20,
     **options: Any,
 ) -> Calibration:
-    path = photograph(folder, light_of(drawn, process, hidden, depths_m, margin), depths_m, electrons=electrons)
-    return calibrate(drawn, process, load_shots(path, drawn.camera), errors, **options)
+    path = photograph(folder, light_of(design, process, hidden, depths_m, margin), depths_m, electrons=electrons)
+    return calibrate(design, process, load_shots(path, design.camera), errors, **options)
 
 
-def small(cells: int = 96, count: int = 4, relief: float = 1.0) -> tuple[Drawn, Process]:
-    drawn = plate_drawn(cells, count, relief, window=48)
-    return drawn, usual_process(drawn)
+def small(cells: int = 96, count: int = 4, relief: float = 1.0) -> tuple[Design, Process]:
+    design = plate_drawn(cells, count, relief, window=48)
+    return design, usual_process(design)
 
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     """Sixteen levels, eight hidden errors, two images in brackets with full pixels, noise, background, an offset."""
-    drawn = plate_drawn()
-    return measured(tmp_path_factory.mktemp("loop"), drawn, usual_process(drawn), HIDDEN)
+    design = plate_drawn()
+    return measured(tmp_path_factory.mktemp("loop"), design, usual_process(design), HIDDEN)
 
 
 @pytest.fixture(scope="module")
 def objective(tmp_path_factory: pytest.TempPathFactory) -> FitObjective:
     """A small measurement of four errors, before the search."""
-    drawn, process = small()
-    return measured(tmp_path_factory.mktemp("small"), drawn, process, FEW).objective
+    design, process = small()
+    return measured(tmp_path_factory.mktemp("small"), design, process, FEW).objective
 
 
 def found(result: Calibration) -> dict[str, tuple[float, float]]:
@@ -135,9 +135,9 @@ def test_without_relief_nothing_is_claimed(tmp_path: Path):
 
 def test_what_only_adds_up_is_known_only_as_a_sum(tmp_path: Path):
     """Of one mask the common depth and its own cannot be told apart; their sum can."""
-    drawn = plate_drawn(96, 2, window=48)
-    process = usual_process(drawn, depth_scale=0.02)
-    result = measured(tmp_path, drawn, process, {"common_depth_scale": 0.03}, errors=("depth",))
+    design = plate_drawn(96, 2, window=48)
+    process = usual_process(design, depth_scale=0.02)
+    result = measured(tmp_path, design, process, {"common_depth_scale": 0.03}, errors=("depth",))
     (common, common_sigma), (own, own_sigma) = found(result).values()
     assert (1 + common) * (1 + own) == pytest.approx(1.03, abs=5e-3)
     # Two beliefs of 3 % and 2 % and one exact sum leave 0.03 * 0.02 / hypot(0.03, 0.02) = 1.66 % for each.
@@ -147,13 +147,13 @@ def test_what_only_adds_up_is_known_only_as_a_sum(tmp_path: Path):
 
 
 def test_fewer_electrons_are_less_certain_and_still_right(tmp_path: Path):
-    drawn, process = small()
+    design, process = small()
     sigmas = {}
     for electrons in (3e5, 3e6):
         folder = tmp_path / f"{electrons:g}"
         folder.mkdir()
         # Light of the very window that is fitted: what is tested here is noise, not the model's own small errors.
-        result = measured(folder, drawn, process, FEW, electrons=electrons, margin=4)
+        result = measured(folder, design, process, FEW, electrons=electrons, margin=4)
         for name, (value, sigma) in found(result).items():
             assert abs(value - FEW[name]) < 4 * sigma, name
         sigmas[electrons] = result.posterior.sigma
@@ -163,16 +163,16 @@ def test_fewer_electrons_are_less_certain_and_still_right(tmp_path: Path):
 
 def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
     """Half of the pixels, as the green ones of a RAW file lie; the others are never looked at."""
-    drawn, process = small()
-    lights = light_of(drawn, process, FEW, (NEAR_M, FAR_M), margin=4)
-    whole = load_shots(photograph(tmp_path, lights, (NEAR_M, FAR_M), electrons=3e6), drawn.camera)
+    design, process = small()
+    lights = light_of(design, process, FEW, (NEAR_M, FAR_M), margin=4)
+    whole = load_shots(photograph(tmp_path, lights, (NEAR_M, FAR_M), electrons=3e6), design.camera)
     green = np.add.outer(*(np.arange(n) for n in whole.shots[0].psf.rate.shape)) % 2 == 1
     shots = []
     for shot in whole.shots:
         valid = shot.psf.valid & green
         shots.append(shot._replace(psf=shot.psf._replace(rate=np.where(valid, shot.psf.rate, 0.0), valid=valid)))
-    half = calibrate(drawn, process, whole._replace(shots=tuple(shots)))
-    both = calibrate(drawn, process, whole)
+    half = calibrate(design, process, whole._replace(shots=tuple(shots)))
+    both = calibrate(design, process, whole)
     for name, (value, sigma) in found(half).items():
         assert abs(value - FEW[name]) < 5 * sigma, name
     # Half the light is sqrt(2) less certain; the scatter between blocks knows that to a fifth or so.
@@ -181,11 +181,11 @@ def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
 
 
 def test_a_known_brightness_measures_the_throughput(tmp_path: Path):
-    drawn, process = small()
-    lights = light_of(drawn, process, FEW, (NEAR_M,))
+    design, process = small()
+    lights = light_of(design, process, FEW, (NEAR_M,))
     # 1.5e7 counts in a second for all light on the aperture, known to a per cent.
     path = photograph(tmp_path, lights, (NEAR_M,), image_more="incident = 15000000.0\nincident_sigma = 0.01")
-    result = calibrate(drawn, process, load_shots(path, drawn.camera))
+    result = calibrate(design, process, load_shots(path, design.camera))
     (reading,) = [r for r in result.readings if r.quantity == "throughput"]
     assert reading.measured is not None
     assert reading.measured[0] == pytest.approx(reading.predicted[0], rel=0.03)
@@ -196,8 +196,8 @@ def test_a_known_brightness_measures_the_throughput(tmp_path: Path):
 @pytest.mark.slow
 def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
     """Corners were rounded, and nobody asked: the fit must not pass the errors it finds off as sure."""
-    drawn, process = small()
-    wrong = measured(tmp_path, drawn, process, {**FEW, "corner_radius_m": 0.8e-6})
+    design, process = small()
+    wrong = measured(tmp_path, design, process, {**FEW, "corner_radius_m": 0.8e-6})
     assert not wrong.explained
     assert "does not explain the images" in wrong.remarks[0]
     assert wrong.posterior.inflation > 1.2
@@ -205,18 +205,18 @@ def test_a_process_that_is_something_else_is_not_explained(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_picture_the_wrong_way_up_is_noticed(tmp_path: Path):
-    drawn, process = small()
-    lights = [np.rot90(light, 2).copy() for light in light_of(drawn, process, {}, (NEAR_M, FAR_M))]
+    design, process = small()
+    lights = [np.rot90(light, 2).copy() for light in light_of(design, process, {}, (NEAR_M, FAR_M))]
     path = photograph(tmp_path, lights, (NEAR_M, FAR_M))
-    result = calibrate(drawn, process, load_shots(path, drawn.camera), evaluations=0)
+    result = calibrate(design, process, load_shots(path, design.camera), evaluations=0)
     assert any("turned left by 2 more quarter turns" in remark for remark in result.remarks)
 
 
 def test_an_error_beyond_its_range_ends_at_the_end(tmp_path: Path):
     """Believed to a tenth of what it is, the error is looked for no further than five standard deviations."""
-    drawn, _ = small()
-    timid = usual_process(drawn, common_cd_bias_m=0.02e-6)
-    result = measured(tmp_path, drawn, timid, {"common_cd_bias_m": 0.2e-6}, errors=("common_cd_bias",), evaluations=0)
+    design, _ = small()
+    timid = usual_process(design, common_cd_bias_m=0.02e-6)
+    result = measured(tmp_path, design, timid, {"common_cd_bias_m": 0.2e-6}, errors=("common_cd_bias",), evaluations=0)
     assert found(result)["common_cd_bias_m"][0] == pytest.approx(0.1e-6, rel=1e-6)
     assert any("At the end of the range" in remark for remark in result.remarks)
 
@@ -271,8 +271,8 @@ def test_the_exact_gradient_agrees_and_polishes_nothing_away(objective: FitObjec
 
 
 def test_errors_are_named_as_users_name_them():
-    drawn, process = small()
-    pitch = drawn.camera.grid.pitch_m
+    design, process = small()
+    pitch = design.camera.grid.pitch_m
     assert unknowns_of(process, ["overlay_x", "depth_scale[1]"], pitch).names == ("depth_scale[1]", "overlay_x_m[1]")
     assert "corner_radius_m" in unknowns_of(process, ["corners"], pitch).names
     assert unknowns_of(process, ["corner_radius"], pitch).assumed == ("corner_radius_m",)
@@ -288,8 +288,8 @@ def test_errors_are_named_as_users_name_them():
 
 def test_beliefs_of_relative_places():
     """Places relative to mask 0 are as uncertain as two masks, and share that of mask 0."""
-    drawn = plate_drawn(32, 16, window=24)
-    unknowns = unknowns_of(usual_process(drawn), ["overlay_x"])
+    design = plate_drawn(32, 16, window=24)
+    unknowns = unknowns_of(usual_process(design), ["overlay_x"])
     covariance = unknowns.root @ unknowns.root.T
     np.testing.assert_allclose(np.diag(covariance), 2 * 0.5e-6**2)
     np.testing.assert_allclose(covariance[0, 1:], 0.5e-6**2)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from doedesign.build import process_from_spec
-from doedesign.prediction import drawn_of
 from doedesign.runs.folder import open_run
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_process, load_variation
 from fab.files import sha256_file
 from tests.doedesign.calibration_fakes import light_of, photograph, usual_process
@@ -63,9 +63,9 @@ LIMITS = {"common_depth_scale": 0.005, "overlay_y_m": 0.1e-6, "overlay_x_m": 0.1
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small")
     finished_run(folder, SPEC)
-    drawn = drawn_of(open_run(folder / "run"))
+    design = open_design(open_run(folder / "run"))
     depths = (3e-3, np.inf)
-    photograph(folder, light_of(drawn, usual_process(drawn), HIDDEN, depths), depths, electrons=1e7)
+    photograph(folder, light_of(design, usual_process(design), HIDDEN, depths), depths, electrons=1e7)
     return folder / "run"
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from doedesign.calibration import Family, Targets, explanations
-from doedesign.prediction import Drawn, predict
+from doedesign.design.design import Design
+from doedesign.prediction import predict
 from fab.errors import InputError
 from fab.process import Process, variation_of
 from sim.camera import Colour
@@ -19,28 +20,28 @@ ERRORS = ("common_depth_scale", "overlay_x", "common_cd_bias", "etch_lag")
 
 
 @pytest.fixture(scope="module")
-def plate() -> tuple[Drawn, Process]:
-    drawn = plate_drawn(64, 4, window=32)
-    return drawn, usual_process(drawn)
+def plate() -> tuple[Design, Process]:
+    design = plate_drawn(64, 4, window=32)
+    return design, usual_process(design)
 
 
 @pytest.fixture(scope="module")
-def family(plate: tuple[Drawn, Process]) -> Family:
-    drawn, process = plate
-    nothing = explanations(drawn, process, Targets(PROBE_M, NEAR_M, 1.0), ("etch_lag",), pairs=False, reach=1.0)
+def family(plate: tuple[Design, Process]) -> Family:
+    design, process = plate
+    nothing = explanations(design, process, Targets(PROBE_M, NEAR_M, 1.0), ("etch_lag",), pairs=False, reach=1.0)
     ratio, throughput = (nothing.nominal[key] for key in ("ring_to_disc", "throughput"))
     targets = Targets(PROBE_M, NEAR_M, 0.9 * ratio, throughput, 0.02)
-    return explanations(drawn, process, targets, ERRORS)
+    return explanations(design, process, targets, ERRORS)
 
 
-def test_every_explanation_gives_the_ratio(plate: tuple[Drawn, Process], family: Family):
-    drawn, process = plate
+def test_every_explanation_gives_the_ratio(plate: tuple[Design, Process], family: Family):
+    design, process = plate
     assert len(family.singles) >= 2
     assert family.pairs
-    probe = replace(drawn.camera, colours=(Colour("p", (PROBE_M,), (1.0,)),))
-    drawn = replace(drawn, camera=probe, near_m=(NEAR_M,), far_m=())
+    probe = replace(design.camera, colours=(Colour("p", (PROBE_M,), (1.0,)),))
+    design = replace(design, camera=probe, near_m=(NEAR_M,), far_m=())
     for each in [*family.singles, *family.pairs[:2]]:
-        (row,) = predict(drawn, process, variation_of(process.masks, each.values)).rows
+        (row,) = predict(design, process, variation_of(process.masks, each.values)).rows
         assert row["ring_to_disc"] == pytest.approx(each.ring_to_disc, rel=1e-5)
         # A crossing is found to a hundredth of a standard deviation, along which the ratio changes by a few per cent.
         assert row["ring_to_disc"] == pytest.approx(family.targets.ring_to_disc, rel=0.01)
@@ -59,7 +60,7 @@ def test_explanations_come_in_order_and_within_reach(family: Family):
     assert {"common_depth_scale", "common_cd_bias_m", "etch_lag", "overlay_x_m[0]", "overlay_x_m[1]"} <= named
 
 
-def test_values_are_scores_times_sigmas(plate: tuple[Drawn, Process], family: Family):
+def test_values_are_scores_times_sigmas(plate: tuple[Design, Process], family: Family):
     _, process = plate
     for each in family.singles:
         for name, value in each.values.items():
@@ -68,11 +69,11 @@ def test_values_are_scores_times_sigmas(plate: tuple[Drawn, Process], family: Fa
             assert name != "etch_lag" or value > 0
 
 
-def test_none_is_an_answer(plate: tuple[Drawn, Process], family: Family):
+def test_none_is_an_answer(plate: tuple[Design, Process], family: Family):
     """A ratio a hundred times as large is not to be had from a little depth."""
-    drawn, process = plate
+    design, process = plate
     targets = Targets(PROBE_M, NEAR_M, 100 * family.nominal["ring_to_disc"])
-    found = explanations(drawn, process, targets, ("common_depth_scale", "common_cd_bias"), reach=2.0)
+    found = explanations(design, process, targets, ("common_depth_scale", "common_cd_bias"), reach=2.0)
     assert not found.singles
     assert not found.pairs
     assert ("common_depth_scale",) in found.none
@@ -80,11 +81,11 @@ def test_none_is_an_answer(plate: tuple[Drawn, Process], family: Family):
     assert all(ratio > 0 for ratio in found.curves["common_depth_scale"].ring_to_disc)
 
 
-def test_impossible_targets_are_refused(plate: tuple[Drawn, Process]):
-    drawn, process = plate
+def test_impossible_targets_are_refused(plate: tuple[Design, Process]):
+    design, process = plate
     with pytest.raises(InputError, match="--ring-to-disc: must be positive"):
-        explanations(drawn, process, Targets(PROBE_M, NEAR_M, 0.0))
+        explanations(design, process, Targets(PROBE_M, NEAR_M, 0.0))
     with pytest.raises(InputError, match="--depth: the source must be near enough"):
-        explanations(drawn, process, Targets(PROBE_M, 1e3, 1.0))
+        explanations(design, process, Targets(PROBE_M, 1e3, 1.0))
     with pytest.raises(InputError, match="in a definite way, but got weather"):
-        explanations(drawn, process, Targets(PROBE_M, NEAR_M, 1.0), ("weather",))
+        explanations(design, process, Targets(PROBE_M, NEAR_M, 1.0), ("weather",))

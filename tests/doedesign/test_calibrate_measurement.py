@@ -123,20 +123,20 @@ def test_pictures_are_turned_to_the_plates_axes(tmp_path: Path, turns: int, mirr
 
 
 def test_a_window_of_other_pixels_covers_the_same_field(tmp_path: Path):
-    drawn = plate_drawn(32, 4, window=24)
+    design = plate_drawn(32, 4, window=24)
     path = photographed(tmp_path, spot(), "")
     text = path.read_text()
     # 60 pixels are all there are.
     for pixel, window in (("1.85 um", 24), ("0.925 um", 48), ("0.4 um", 60)):
-        assert load_shots(written(tmp_path, text.replace("1.85 um", pixel)), drawn.camera).window == window
+        assert load_shots(written(tmp_path, text.replace("1.85 um", pixel)), design.camera).window == window
 
 
 def test_brackets_become_images(tmp_path: Path):
-    drawn = plate_drawn(96, 4, window=48)
-    lights = light_of(drawn, usual_process(drawn), {}, (6e-3, np.inf))
+    design = plate_drawn(96, 4, window=48)
+    lights = light_of(design, usual_process(design), {}, (6e-3, np.inf))
     path = photograph(tmp_path, lights, (6e-3, np.inf), kinds=("tiff", "exr"), more="window = 40")
     files: list[str] = []
-    measurement = load_shots(path, drawn.camera, files.append)
+    measurement = load_shots(path, design.camera, files.append)
     assert len(files) == 8
     assert set(measurement.digests) == {"measurement.toml", *files}
     assert [shot.name for shot in measurement.shots] == ["near0", "far1"]

@@ -113,14 +113,26 @@ def test_json_is_one_line(plate: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_warnings_go_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("doedesign.commands.optimize.optimize", failing_optimize)
-    assert main(["optimize", str(ROOT / "examples/quick.toml"), "--set", "process.level_step=70 nm"]) == 2
+    monkeypatch.setattr("doedesign.commands.optimize.problem_of", failing_problem)
+    assert (
+        main(
+            [
+                "optimize",
+                str(ROOT / "examples/quick.toml"),
+                "--out",
+                str(tmp_path / "run"),
+                "--set",
+                "process.level_step=70 nm",
+            ]
+        )
+        == 2
+    )
     printed = capsys.readouterr()
     assert "warning: process.level_step: 16 x 70 nm" in printed.err
     assert printed.out == ""
 
 
-def failing_optimize(*_: object) -> None:
+def failing_problem(*_: object) -> None:
     raise InputError("here", "stops", "it", "Go on.")
 
 

@@ -143,7 +143,7 @@ def test_depths_given_as_2_to_the_k_steps_change_no_bit() -> None:
         problem, _ = problem_of(spec, {})
         designs.append(finished_design(spec, problem, run(spec)))
     assert designs[0].levels == designs[1].levels == Levels(4, 300e-9)
-    assert designs[0].drawn_m.tobytes() == designs[1].drawn_m.tobytes()
+    assert designs[0].height_m.tobytes() == designs[1].height_m.tobytes()
     assert designs[0].continuous_m.tobytes() == designs[1].continuous_m.tobytes()
 
 
@@ -170,14 +170,14 @@ def test_gradient_of_the_whole_chain_by_the_depths() -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN])
     problem, scene = problem_of(spec, {})
     state = initial_state(spec, problem, scene, {}, unread)
-    look, staircase = scene.look(0, 0), problem.staircase
+    look, staircase = scene.look(0, 0), problem.parametrization
     # Heights in the middle of levels' shares, so that a step of a few nanometres moves no cell to another level.
     level = quantise_wrapped(np.asarray(staircase.continuous_m(state.radians)), staircase.levels)
     radians = jnp.asarray(staircase.radians_of(height_of(level, staircase.levels) + 20e-9))
 
     @jax.jit
-    def loss(stretch: jax.Array) -> jax.Array:
-        height = staircase.height_m(radians, jnp.float32(0), staircase.depths_m(stretch))
+    def loss(log_depth_ratio: jax.Array) -> jax.Array:
+        height = staircase.height_m(radians, jnp.float32(0), staircase.depths_m(log_depth_ratio))
         return losses(problem, view_of(problem, height, look))[0]
 
     slopes = np.asarray(jax.jit(jax.grad(loss))(jnp.zeros(2)))
@@ -204,8 +204,8 @@ def test_chosen_depths_resume_to_the_last_bit(changes: list[str]) -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN, *changes])
     whole = run(spec)
     resumed = run(spec, run(spec, stop=3))
-    assert whole.stretch is not None
-    assert np.any(whole.stretch != 0)
+    assert whole.log_depth_ratio is not None
+    assert np.any(whole.log_depth_ratio != 0)
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(resumed), strict=True):
         assert np.array_equal(one, other)
 
@@ -215,20 +215,19 @@ def test_the_design_stands_on_the_chosen_levels() -> None:
     problem, _ = problem_of(spec, {})
     state = run(spec)
     design = finished_design(spec, problem, state)
-    assert state.stretch is not None
-    learnt = np.array([300e-9, 600e-9]) * np.exp(DEPTH_SCALE * state.stretch)
+    assert state.log_depth_ratio is not None
+    learnt = np.array([300e-9, 600e-9]) * np.exp(DEPTH_SCALE * state.log_depth_ratio)
     # A recipe holds tenths of a nanometre.
     np.testing.assert_allclose(design.levels.depths_m, learnt, atol=0.051 * NM)
     assert not design.levels.is_binary
-    level = quantise(design.drawn_m, design.levels)
-    assert height_of(level, design.levels).astype(np.float32).tobytes() == design.drawn_m.tobytes()
+    assert np.array_equal(quantise(design.height_m, design.levels), design.level_map.level)
 
 
 def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN, "optimize.quantisation=none"])
     problem, _ = problem_of(spec, {})
     state = run(spec)
-    assert state.stretch is None
+    assert state.log_depth_ratio is None
     design = finished_design(spec, problem, state)
     area = np.asarray(problem.coverage)
     seen = heights_of(design.continuous_m, area, design.levels.period_m, problem.camera)
@@ -243,6 +242,6 @@ def test_chosen_depths_serve_the_objective_better_than_even_steps() -> None:
     for name, change in (("even", []), ("chosen", ["process.etch_depths=optimize"])):
         spec = load_spec(QUICK, [*SMALL, *few, *change])
         problem, scene = problem_of(spec, {})
-        drawn = finished_design(spec, problem, run(spec)).drawn_m
+        drawn = finished_design(spec, problem, run(spec)).height_m
         found[name] = float(losses(problem, view_of(problem, jnp.asarray(drawn), scene.first_look()))[0])
     assert found["chosen"] < 0.98 * found["even"]

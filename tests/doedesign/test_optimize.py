@@ -51,7 +51,7 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     look = scene.look(0, 0)
 
     def loss(radians: jax.Array) -> jax.Array:
-        height = radians * problem.staircase.metres_per_radian  # no wrap: it has no derivative
+        height = radians * problem.parametrization.metres_per_radian  # no wrap: it has no derivative
         return losses(problem, view_of(problem, height, look))[0]
 
     direction = jnp.asarray(np.random.default_rng(0).normal(size=state.radians.shape), jnp.float32)
@@ -75,8 +75,8 @@ def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.parametrization=radial", "optimize.steps=2"])
     problem, scene = problem_of(spec, {})
     design = finished_design(spec, problem, initial_state(spec, problem, scene, {}, unread))
-    level = quantise(design.drawn_m, problem.staircase.levels)
-    np.testing.assert_allclose(design.drawn_m, level * 75e-9, rtol=1e-6)
+    level = quantise(design.height_m, problem.parametrization.levels)
+    np.testing.assert_allclose(design.height_m, level * 75e-9, rtol=1e-6)
     assert radial_profile(design.continuous_m, problem.camera.grid) is not None
 
 

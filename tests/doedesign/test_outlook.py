@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from doedesign.build import with_edge_moves
+from doedesign.design.design import Design
 from doedesign.lab.predictions import grating_orders, matters_of, predict_sheet
-from doedesign.prediction import Drawn, predict, process_with_moves
+from doedesign.prediction import predict
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -26,11 +28,11 @@ CAMERA = Camera(
 
 
 @pytest.fixture(scope="module")
-def drawn() -> Drawn:
+def design() -> Design:
     y, x = np.indices((64, 64)) - 31.5
     level = (np.mod(np.hypot(y, x) / 8, 1) * 16).astype(np.uint8)
-    level = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m).level
-    return Drawn("ring", level, LEVELS, CAMERA, (4e-3, 6e-3, 9e-3), (5.0, np.inf))
+    level_map = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m, "ring")
+    return Design(level_map, CAMERA, (4e-3, 6e-3, 9e-3), (5.0, np.inf))
 
 
 def test_gratings_are_the_sums_over_their_stripes():
@@ -75,12 +77,12 @@ def test_no_other_etch_makes_up_for_a_wrong_depth():
     assert leaking > 1e-3
 
 
-def test_the_outlook_is_the_prediction_of_one_depth(drawn):
+def test_the_outlook_is_the_prediction_of_one_depth(design):
     spreads = {"common_depth_scale": Normal(0.03, 0.01), "overlay_x_m[3]": Normal(0.1 * UM, 0.3 * UM)}
     process = Process(LEVELS, spreads=spreads)
-    outlook, picture = predict_sheet(drawn, process, 550e-9)
+    outlook, picture = predict_sheet(design, process, 550e-9)
     assert [(seen.depth_m, seen.far_spot) for seen in outlook.drawn] == [(6e-3, None)]
-    short = replace(drawn, near_m=(6e-3,), far_m=())
+    short = replace(design, near_m=(6e-3,), far_m=())
     # The plate as drawn is cut into the pieces of the other one, and added up again in single precision.
     for seen, plate, within in ((outlook.drawn, Variation(), 1e-4), (outlook.expected, process.expected(), 1e-12)):
         for one, row in zip(seen, predict(short, process, plate).rows, strict=True):
@@ -94,30 +96,30 @@ def test_the_outlook_is_the_prediction_of_one_depth(drawn):
     assert Image.open(BytesIO(picture)).format == "PNG"
 
 
-def test_a_design_without_near_depths_is_foretold_for_its_farthest(drawn):
-    far = predict_sheet(replace(drawn, near_m=()), Process(LEVELS), 550e-9).outlook
+def test_a_design_without_near_depths_is_foretold_for_its_farthest(design):
+    far = predict_sheet(replace(design, near_m=()), Process(LEVELS), 550e-9).outlook
     assert [(seen.depth_m, seen.ring_to_disc) for seen in far.drawn] == [(None, None)]
     assert far.drawn == far.expected
     assert far.matters == ()
 
 
-def test_a_height_without_a_full_wave_is_said_so(drawn):
-    flat = replace(drawn, level=drawn.level.copy(), levels=Levels(16, 20 * NM), near_m=())
+def test_a_height_without_a_full_wave_is_said_so(design):
+    flat = replace(design, level_map=replace(design.level_map, levels=Levels(16, 20 * NM)), near_m=())
     assert predict_sheet(flat, Process(flat.levels), 550e-9).outlook.full_wave_m is None
 
 
-def test_compensated_masks_bring_the_expected_plate_back(drawn):
+def test_compensated_masks_bring_the_expected_plate_back(design):
     process = Process(LEVELS, spreads=spreads_of(LEVELS, common_cd_bias_m=(80 * NM, 0.0)))
-    moved = process_with_moves(process, (-80 * NM,) * 4)
-    outlook = predict_sheet(drawn, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).outlook
+    moved = with_edge_moves(process, (-80 * NM,) * 4)
+    outlook = predict_sheet(design, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).outlook
     assert moved.expected().common_cd_bias_m + moved.expected().cd_bias_m[0] == 0
     # Widened and narrowed by the same, the plate goes through the model of pieces, which rounds differently.
     for a, b in zip(outlook.drawn, outlook.expected, strict=True):
         assert b.strehl == pytest.approx(a.strehl, abs=1e-5)
-    assert predict_sheet(drawn, process, 550e-9).outlook.expected[0].strehl < 0.99
+    assert predict_sheet(design, process, 550e-9).outlook.expected[0].strehl < 0.99
 
 
-def test_the_largest_error_matters_most(drawn):
+def test_the_largest_error_matters_most(design):
     spreads = {
         "overlay_x_m[3]": Normal(0.0, 0.4 * UM),
         "overlay_y_m[3]": Normal(0.0, 0.4 * UM),
@@ -125,10 +127,10 @@ def test_the_largest_error_matters_most(drawn):
         "depth_scale[3]": Normal(0.0, 0.04),
         "chrome_x_m": Normal(0.0, 5 * UM),
     }
-    matters = matters_of(drawn, Process(LEVELS, spreads=spreads), 550e-9)
+    matters = matters_of(design, Process(LEVELS, spreads=spreads), 550e-9)
     assert matters[0].measured == "overlay of mask 4"
     assert max(matters, key=lambda one: one.zeroth_order).measured == "depth of mask 4"
     assert {one.measured for one in matters} == {"overlay of mask 4", "overlay of mask 1", "depth of mask 4"}
     assert sum(one.strehl for one in matters) == pytest.approx(1)
     assert sum(one.zeroth_order for one in matters) == pytest.approx(1)
-    assert matters_of(drawn, Process(LEVELS), 550e-9) == ()
+    assert matters_of(design, Process(LEVELS), 550e-9) == ()

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from doedesign.prediction import Drawn, Prediction, plate_rows, predict
+from doedesign.design.design import Design
+from doedesign.prediction import Prediction, plate_rows, predict
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.level_map import LevelMap
@@ -26,17 +27,17 @@ NEAR_M, FAR_M = (6e-3,), (5.0, np.inf)
 
 
 @pytest.fixture(scope="module")
-def drawn() -> Drawn:
+def design() -> Design:
     """A ring that keeps some light on the axis."""
     y, x = np.indices((CELLS, CELLS)) - (CELLS - 1) / 2
     level = (np.mod(np.hypot(y, x) / 8, 1) * 13).astype(np.uint8)
-    level = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m).level
-    return Drawn("ring", level, LEVELS, CAMERA, NEAR_M, FAR_M)
+    level_map = LevelMap(level, LEVELS, CAMERA.grid, CAMERA.aperture_m, "ring")
+    return Design(level_map, CAMERA, NEAR_M, FAR_M)
 
 
 @pytest.fixture(scope="module")
-def nominal(drawn: Drawn) -> Prediction:
-    return predict(drawn, PROCESS, Variation())
+def nominal(design: Design) -> Prediction:
+    return predict(design, PROCESS, Variation())
 
 
 def test_there_is_a_row_for_every_depth_and_colour_near_depths_first(nominal: Prediction):
@@ -50,21 +51,21 @@ def test_there_is_a_row_for_every_depth_and_colour_near_depths_first(nominal: Pr
         assert all(isinstance(v, float) for k, v in row.items() if k not in ("colour", "depth_m"))
 
 
-def test_the_bank_of_a_plate_without_errors_is_that_of_its_height_map(drawn: Drawn, nominal: Prediction):
-    bank = psf_bank(CAMERA, height_of(drawn.level, LEVELS), drawn.depths_m)
+def test_the_bank_of_a_plate_without_errors_is_that_of_its_height_map(design: Design, nominal: Prediction):
+    bank = psf_bank(CAMERA, height_of(design.level_map.level, LEVELS), design.depths_m)
     np.testing.assert_allclose(nominal.bank.energy, bank.energy, rtol=0, atol=1e-6 * bank.energy.max())
     assert (nominal.bank.depths_m, nominal.bank.colours) == (bank.depths_m, bank.colours)
-    surface = as_fabricated(drawn.level, CAMERA, PROCESS, Variation())
+    surface = as_fabricated(design.level_map.level, CAMERA, PROCESS, Variation())
     np.testing.assert_array_equal(np.asarray(nominal.surface.transmission), np.asarray(surface.transmission))
 
 
-def test_rows_are_the_metrics_of_the_plates_psfs(drawn: Drawn, nominal: Prediction):
-    height = height_of(drawn.level, LEVELS)
+def test_rows_are_the_metrics_of_the_plates_psfs(design: Design, nominal: Prediction):
+    height = height_of(design.level_map.level, LEVELS)
     for row in nominal.rows:
         c = [colour.name for colour in COLOURS].index(row["colour"])
         colour = COLOURS[c]
         depth = np.inf if row["depth_m"] is None else row["depth_m"]
-        psf = nominal.bank.energy[c, drawn.depths_m.index(depth)]
+        psf = nominal.bank.energy[c, design.depths_m.index(depth)]
         budget = energy_budget(CAMERA, height, psf, depth, colour)
         weighted = list(zip(colour.wavelengths_m, colour.weights, strict=True))
         # The opening's area is once pi r², once a sum of the cells' shares: 1e-5 apart.
@@ -82,11 +83,11 @@ def test_rows_are_the_metrics_of_the_plates_psfs(drawn: Drawn, nominal: Predicti
             assert row["far_spot"] == energy_within(psf, CAMERA.pixel_m, radius)
 
 
-def test_a_deeper_etch_shows_in_every_number_it_should(drawn: Drawn, nominal: Prediction):
+def test_a_deeper_etch_shows_in_every_number_it_should(design: Design, nominal: Prediction):
     """All etches 8 % too deep: the overlap with the design falls as the square of the rms phase."""
-    deep = predict(drawn, PROCESS, Variation(common_depth_scale=0.08))
+    deep = predict(design, PROCESS, Variation(common_depth_scale=0.08))
     open_ = np.asarray(nominal.surface.coverage, float)
-    lost = (15 - drawn.level) * 75e-9 * 0.08
+    lost = (15 - design.level_map.level) * 75e-9 * 0.08
     for row in deep.rows[:2]:
         colour = next(colour for colour in COLOURS if colour.name == row["colour"])
         wanted = 0.0
@@ -101,9 +102,9 @@ def test_a_deeper_etch_shows_in_every_number_it_should(drawn: Drawn, nominal: Pr
         assert row["throughput"] + row["outside_window"] == pytest.approx(passed, abs=1e-6)
 
 
-def test_chrome_out_of_place_is_booked_as_such(drawn: Drawn, nominal: Prediction):
+def test_chrome_out_of_place_is_booked_as_such(design: Design, nominal: Prediction):
     wide = 0.02 * CAMERA.aperture_m
-    narrow = predict(drawn, PROCESS, Variation(chrome_diameter_m=-wide))
+    narrow = predict(design, PROCESS, Variation(chrome_diameter_m=-wide))
     for row, other in zip(narrow.rows, nominal.rows, strict=True):
         passed = other["throughput"] + other["outside_window"]
         # Circles of 64 cells with straight rims: 1e-4 of their area.
@@ -112,26 +113,28 @@ def test_chrome_out_of_place_is_booked_as_such(drawn: Drawn, nominal: Prediction
         assert row["throughput"] < other["throughput"]
 
 
-def test_strehl_does_not_fall_with_a_plate_that_only_leaks_less_light_through_its_chrome(drawn: Drawn):
+def test_strehl_does_not_fall_with_a_plate_that_only_leaks_less_light_through_its_chrome(design: Design):
     """The overlap is one over the open cells, so a displaced opening before a perfect plate leaves it at 1."""
-    moved = as_fabricated(drawn.level, CAMERA, PROCESS, Variation(chrome_x_m=2e-6))
+    moved = as_fabricated(design.level_map.level, CAMERA, PROCESS, Variation(chrome_x_m=2e-6))
     bank = surface_bank(CAMERA, moved, (np.inf,))
-    rows = plate_rows(drawn, moved, bank)
+    rows = plate_rows(design, moved, bank)
     assert [row["strehl"] for row in rows] == pytest.approx([1.0, 1.0], abs=2e-5)
 
 
-def test_predictions_repeat_to_the_last_bit(drawn: Drawn):
-    short = dataclasses.replace(drawn, near_m=(), far_m=(np.inf,))
+def test_predictions_repeat_to_the_last_bit(design: Design):
+    short = dataclasses.replace(design, near_m=(), far_m=(np.inf,))
     rough = Variation(roughness_m=4e-9, correlation_m=2e-6, seed=9, depth_scale=(0.01, 0.0, -0.02, 0.01))
     one, two = (predict(short, PROCESS, rough) for _ in range(2))
     np.testing.assert_array_equal(one.bank.energy, two.bank.energy)
     assert one.rows == two.rows
 
 
-def test_another_design_is_not_compared_with_the_one_before(drawn: Drawn, nominal: Prediction):
+def test_another_design_is_not_compared_with_the_one_before(design: Design, nominal: Prediction):
     """The plate as drawn is kept between predictions; a new level map or camera must not meet the old one."""
-    short = dataclasses.replace(drawn, near_m=(), far_m=(np.inf,))
-    other = dataclasses.replace(short, level=np.roll(drawn.level, 3, axis=0))
+    short = dataclasses.replace(design, near_m=(), far_m=(np.inf,))
+    other = dataclasses.replace(
+        short, level_map=design.level_map.with_level(np.roll(design.level_map.level, 3, axis=0))
+    )
     assert predict(other, PROCESS, Variation()).rows[0]["strehl"] == pytest.approx(1.0, abs=1e-5)
     blue = dataclasses.replace(CAMERA, colours=(Colour("blue", (450e-9,), (1.0,)),))
     rows = predict(dataclasses.replace(other, camera=blue), PROCESS, Variation()).rows
@@ -139,12 +142,13 @@ def test_another_design_is_not_compared_with_the_one_before(drawn: Drawn, nomina
     assert predict(short, PROCESS, Variation()).rows == nominal.rows[-2:]
 
 
-def test_digests_tell_designs_apart(drawn: Drawn):
-    assert drawn.digest() == dataclasses.replace(drawn, name="copy", level=drawn.level.copy()).digest()
-    assert drawn.digest() != dataclasses.replace(drawn, level=np.roll(drawn.level, 1, axis=0)).digest()
-    assert drawn.depths_m == (*NEAR_M, *FAR_M)
+def test_digests_tell_designs_apart(design: Design):
+    level_map = design.level_map
+    assert level_map.digest == dataclasses.replace(level_map, name="copy").digest
+    assert level_map.digest != level_map.with_level(np.roll(level_map.level, 1, axis=0)).digest
+    assert design.depths_m == (*NEAR_M, *FAR_M)
 
 
-def test_errors_beyond_the_model_are_refused(drawn: Drawn):
+def test_errors_beyond_the_model_are_refused(design: Design):
     with pytest.raises(InputError, match="half a cell"):
-        predict(drawn, PROCESS, Variation(common_cd_bias_m=PITCH_M))
+        predict(design, PROCESS, Variation(common_cd_bias_m=PITCH_M))

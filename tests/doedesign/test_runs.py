@@ -45,8 +45,8 @@ def run(spec: Spec, tmp_path: Path) -> Run:
 @pytest.fixture
 def done(run: Run) -> Run:
     """A finished run with one result."""
-    run.path("height.exr").write_bytes(b"heights")
-    finish_run(run, {}, [], ["height.exr", "spec.toml"])
+    run.path("level_map.npz").write_bytes(b"levels")
+    finish_run(run, {}, [], ["level_map.npz", "spec.toml"])
     return run
 
 
@@ -156,8 +156,8 @@ def test_nothing_stays_open(run: Run, spec: Spec):
         (lambda run: run.path("spec.toml").unlink(), "must exist"),
         (lambda run: run.path("spec.toml").write_text("name = 3"), "spec.toml"),
         (lambda run: run.path("spec.toml").write_text(QUICK.read_text().replace("seed = 1", "seed = 2")), "changed"),
-        (lambda run: run.path("height.exr").write_bytes(b"other"), "the file this run wrote"),
-        (lambda run: run.path("height.exr").unlink(), "must exist"),
+        (lambda run: run.path("level_map.npz").write_bytes(b"other"), "the file this run wrote"),
+        (lambda run: run.path("level_map.npz").unlink(), "must exist"),
     ],
 )
 def test_a_changed_run_is_refused(done: Run, change: Callable[[Run], object], message: str):

@@ -71,7 +71,7 @@ def test_every_example_is_sound(path: Path):
     spec = load_spec(path)
     assert spec.name == path.stem
     assert spec_warnings(spec) == []
-    assert input_files(spec, path) == {}
+    assert input_files(spec) == {}
 
 
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
@@ -316,14 +316,14 @@ def test_missing_files_are_named(tmp_path: Path):
     assert str(tmp_path) in refusal(tmp_path)
     spec = load_spec(AUTOMOTIVE, ["optimize.start=start.exr", "objective.0.options.image=picture.png"])
     with pytest.raises(InputError, match=r"optimize\.start: the file must exist") as caught:
-        input_files(spec, AUTOMOTIVE)
+        input_files(spec)
     assert "objective[0].options.image" in str(caught.value)
 
 
 def test_files_are_found_beside_the_spec(edited: Callable[..., Path]):
     path = edited(('"ring"', '"start.npy"'))
     (path.parent / "start.npy").touch()
-    assert input_files(load_spec(path), path) == {"optimize.start": path.parent / "start.npy"}
+    assert input_files(load_spec(path)) == {"optimize.start": path.parent / "start.npy"}
 
 
 @given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5), st.lists))

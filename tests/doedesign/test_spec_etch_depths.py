@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from doedesign.build import levels_from_spec, process_for, process_from_spec, process_spec_of
+from doedesign.build import levels_from_spec, process_from_spec, process_spec_of, resolve_process
 from doedesign.spec import (
     ProcessSpec,
     load_process,
@@ -69,12 +69,12 @@ def test_what_is_to_be_chosen_must_be_known_where_it_is_needed():
     with pytest.raises(InputError, match=r"process\.etch_depths: the depths must be known here"):
         process_from_spec(process)
     # A process file that leaves the choice to the optimisation goes with whatever the design chose.
-    assert process_for(LEVELS, process).levels == LEVELS
+    assert resolve_process(process, LEVELS).levels == LEVELS
 
 
 def test_a_process_of_other_depths_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"must be for 16 levels by etches of 80 nm, 150\.5 nm, 301 nm and 590 nm"):
-        process_for(LEVELS, ProcessSpec(levels=16, level_step_m=75e-9))
+        resolve_process(ProcessSpec(levels=16, level_step_m=75e-9), LEVELS)
 
 
 @pytest.mark.parametrize(

@@ -29,13 +29,13 @@ def fakes():
 def one_after_another(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
     """Evaluate in this process; how plates are handed to workers is tested elsewhere."""
     for key, variation in plates.items():
-        yield key, work.evaluate(work.drawn, work.process, variation)
+        yield key, work.evaluate(work.design, work.process, variation)
 
 
 @pytest.fixture(scope="module")
 def ask(fakes) -> Callable[..., Study]:
     def make(**settings: Any) -> Study:
-        made = study(fakes.drawn(), **{"process": fakes.process(), "evaluate": fakes.rows, "quiet": True, **settings})
+        made = study(fakes.design(), **{"process": fakes.process(), "evaluate": fakes.rows, "quiet": True, **settings})
         return dataclasses.replace(made, run=one_after_another)
 
     return make
@@ -211,7 +211,7 @@ def test_shares_of_variance_agree_with_those_worked_out(ask: Callable[..., Study
 
 
 def test_what_errors_do_together_shows_in_the_total_index(ask: Callable[..., Study], fakes):
-    def together(drawn: object, process: Process, variation: Variation) -> Rows:
+    def together(design: object, process: Process, variation: Variation) -> Rows:
         return [row("red", None, strehl=1e5 * variation.depth_scale[0] * variation.overlay_x_m[0])]
 
     process = Process(fakes.LEVELS, spreads={"depth_scale[0]": Normal(0, 0.02), "overlay_x_m[0]": Normal(0.0, 0.5e-6)})

@@ -90,13 +90,13 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def ask(fakes: ModuleType, cluster: Cluster) -> Callable[..., Study]:
     def make(**settings: Any) -> Study:
         usual = {"process": fakes.process(), "evaluate": fakes.slow_rows, "quiet": True, "scheduler": cluster.address}
-        return study(fakes.drawn(), **{**usual, **settings})
+        return study(fakes.design(), **{**usual, **settings})
 
     return make
 
 
 def right(fakes: ModuleType, asked: Study, count: int) -> dict[str, Any]:
-    plates = {key: fakes.rows(asked.drawn, asked.process, asked.variation(key)) for key in normal_keys(count)}
+    plates = {key: fakes.rows(asked.design, asked.process, asked.variation(key)) for key in normal_keys(count)}
     return json.loads(json.dumps(plates))
 
 

@@ -41,7 +41,7 @@ def fakes():
 def ask(fakes: ModuleType) -> Callable[..., Study]:
     def make(name: object = "fake", **settings: Any) -> Study:
         usual = {"process": fakes.process(), "evaluate": fakes.rows, "quiet": True, "workers": 1}
-        return study(fakes.drawn(name), **{**usual, **settings})
+        return study(fakes.design(name), **{**usual, **settings})
 
     return make
 
@@ -49,9 +49,9 @@ def ask(fakes: ModuleType) -> Callable[..., Study]:
 @pytest.fixture(scope="module")
 def right(fakes: ModuleType) -> dict[str, Any]:
     """The rows of 40 plates, computed here."""
-    asked = study(fakes.drawn(), process=fakes.process(), evaluate=fakes.rows, quiet=True)
+    asked = study(fakes.design(), process=fakes.process(), evaluate=fakes.rows, quiet=True)
     return {
-        key: json.loads(json.dumps(fakes.rows(asked.drawn, asked.process, asked.variation(key))))
+        key: json.loads(json.dumps(fakes.rows(asked.design, asked.process, asked.variation(key))))
         for key in normal_keys(40)
     }
 

@@ -13,7 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from doedesign.design.design import Design
 from fab.errors import InputError
+from fab.grid import Grid
+from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Defects, Normal, Process, Variation, error_names
 
@@ -30,21 +33,11 @@ class FakeCamera:
     grid: FakeGrid = FakeGrid()
 
 
-@dataclass(frozen=True)
-class FakeDrawn:
-    """What a study needs to know of a design; `name` tells the evaluations below where to leave their marks."""
-
-    name: str
-    level: np.ndarray
-    levels: Levels = LEVELS
-    camera: FakeCamera = FakeCamera()
-    near_m: tuple[float, ...] = (0.05,)
-    far_m: tuple[float, ...] = (np.inf,)
-    edge_moves_m: tuple[float, ...] = ()
-
-
-def drawn(name: object = "fake") -> FakeDrawn:
-    return FakeDrawn(str(name), np.arange(64, dtype=np.uint8).reshape(8, 8) % 4)
+def design(name: object = "fake") -> Design:
+    """A design whose name tells the evaluations below where to leave their marks."""
+    level = np.arange(64, dtype=np.uint8).reshape(8, 8) % 4
+    level_map = LevelMap(level, LEVELS, Grid((8, 8), 1e-3 / 8), 1e-3, str(name))
+    return Design(level_map, FakeCamera(), (0.05,), (np.inf,))  # type: ignore[arg-type]
 
 
 def process(**sigmas: float) -> Process:
@@ -58,7 +51,7 @@ def with_defects(**rates: float) -> Process:
     return Process(LEVELS, spreads=process().spreads, defects=Defects(**rates))
 
 
-def rows(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def rows(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """A plate whose numbers are plain functions of its errors: light 0.01 + (sum of depth errors)² goes straight."""
     depth = sum(variation.value(f"depth_scale[{k}]") for k in range(process.masks))
     shift = sum((variation.value(f"overlay_x_m[{k}]") / 1e-6) ** 2 for k in range(process.masks))
@@ -73,47 +66,47 @@ def rows(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[
     return out
 
 
-def slow_rows(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def slow_rows(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     time.sleep(0.05)
-    return rows(drawn, process, variation)
+    return rows(design, process, variation)
 
 
-def _mark(drawn: FakeDrawn, word: str) -> int:
+def _mark(design: Design, word: str) -> int:
     """Append a line to a file beside the test; returns how many there are."""
-    with open(Path(drawn.name) / word, "a") as stream:
+    with open(Path(design.name) / word, "a") as stream:
         stream.write(json.dumps({"pid": os.getpid()}) + "\n")
-    return len((Path(drawn.name) / word).read_text().splitlines())
+    return len((Path(design.name) / word).read_text().splitlines())
 
 
-def rows_or_death_once(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def rows_or_death_once(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """Kills its worker at the third plate, the first time only."""
-    if _mark(drawn, "plates") == 3:
+    if _mark(design, "plates") == 3:
         os.kill(os.getpid(), signal.SIGKILL)
-    return slow_rows(drawn, process, variation)
+    return slow_rows(design, process, variation)
 
 
-def rows_or_death(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def rows_or_death(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """Kills its worker whenever the errors are those of a certain plate."""
     if variation.overlay_x_m and abs(variation.overlay_x_m[0] - DEADLY) < 1e-12:
         os.kill(os.getpid(), signal.SIGKILL)
-    return slow_rows(drawn, process, variation)
+    return slow_rows(design, process, variation)
 
 
 DEADLY = 1.234e-6
 
 
-def refused(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def refused(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """Cannot model a shift of more than 0.5 um."""
     if variation.overlay_x_m and max(map(abs, variation.overlay_x_m)) > 0.5e-6:
         raise InputError("overlay_x", "must stay below 0.5 um", "more", "Take a smaller sigma.")
-    return rows(drawn, process, variation)
+    return rows(design, process, variation)
 
 
-def broken(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def broken(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     raise ZeroDivisionError("a mistake in the user's own function")
 
 
-def settings(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def settings(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """How the worker that computes it is set up."""
     import sys
 
@@ -122,7 +115,7 @@ def settings(drawn: FakeDrawn, process: Process, variation: Variation) -> list[d
     return [{"colour": "red", "depth_m": None, "pid": os.getpid(), "main": sys.modules["__main__"].__name__, **found}]
 
 
-def marked_rows(drawn: FakeDrawn, process: Process, variation: Variation) -> list[dict[str, Any]]:
+def marked_rows(design: Design, process: Process, variation: Variation) -> list[dict[str, Any]]:
     """Leaves its process id in a file."""
-    _mark(drawn, "plates")
-    return slow_rows(drawn, process, variation)
+    _mark(design, "plates")
+    return slow_rows(design, process, variation)

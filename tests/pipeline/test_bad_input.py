@@ -12,6 +12,7 @@ import pytest
 
 import fab.archive
 from doedesign.cli import main
+from fab.level_map import read_level_map, write_level_map
 from sim.store import write_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
@@ -199,9 +200,13 @@ def test_spec_changed_inside_a_run(copied, tiny, cli):
         refuse(cli(*command), spec, "changed")
 
 
-@pytest.mark.parametrize("name", ["height.exr", "height_continuous.exr"])
+@pytest.mark.parametrize("name", ["level_map.npz", "height.exr", "height_continuous.exr"])
 def test_height_changed_inside_a_run(copied, tiny, cli, name):
-    write_height(copied.run / name, np.zeros((64, 64)), 1.85e-6, 118.4e-6)
+    if name.endswith(".exr"):
+        write_height(copied.run / name, np.zeros((64, 64)), 1.85e-6, 118.4e-6)
+    else:
+        level_map = read_level_map(copied.run / name)
+        write_level_map(copied.run / name, level_map.with_level(np.roll(level_map.level, 1)))
     for command in (("masks", copied.run), ("psf", copied.run), ("optimize", tiny, "--out", copied.run)):
         refuse(cli(*command), copied.run / name, "changed")
     (copied.run / name).unlink()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import doedesign.commands.optimize
-from doedesign.prediction import drawn_of
 from doedesign.runs.folder import open_run
-from doedesign.runs.level_maps import levels_of_run
+from doedesign.runs.level_maps import level_map_of_run, open_design
 from fab.layout.geometry import pixel_edges
 from fab.levels import Levels, height_of
 from fab.manifest.records import read_manifest
@@ -73,10 +72,10 @@ def test_a_finished_run_is_opened_with_the_depths_it_chose(chosen):
     run, order = chosen
     opened, levels = open_run(run), levels_in(run)
     assert opened.spec.process.etch_depths_m == levels.depths_m
-    assert levels_of_run(opened).levels == drawn_of(opened, order).levels == levels
+    assert level_map_of_run(opened).levels == open_design(opened, order).levels == levels
     assert 'etch_depths = "optimize"' in (run / "spec.toml").read_text()
     # Another number of levels over the same wave is even again.
-    assert levels_of_run(opened, 8).levels == Levels(8, 150e-9)
+    assert level_map_of_run(opened, 8).levels == Levels(8, 150e-9)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from doedesign.runs.folder import open_run
-from doedesign.runs.level_maps import levels_of_run
+from doedesign.runs.level_maps import level_map_of_run
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.records import read_manifest
@@ -117,7 +117,7 @@ common_cd_bias = { mean = "0.2 um" }
 def test_masks_drawn_against_the_bias_of_the_process_give_the_design(copy_of_run, cli, tmp_path):
     """A bias of 0.2 um that the masks foresee is not seen in the light; one that nobody foresaw is."""
     run = open_run(copy_of_run)
-    drawing = levels_of_run(run)
+    drawing = level_map_of_run(run)
     biased = tmp_path / "biased.toml"
     biased.write_text(BIASED)
     order = tmp_path / "moved"

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from doedesign.runs.folder import open_run
-from doedesign.runs.level_maps import levels_of_run
-from fab.level_map import LevelMap
+from doedesign.runs.level_maps import level_map_of_run
 from fab.solids.rings import ring_levels
 
 
@@ -24,8 +23,8 @@ def test_a_radial_design_is_ordered_with_its_rings_as_circles(tiny, cli, tmp_pat
     assert done.code == 0, done.err
     assert "relief of 32 rings as exact circles" in models(tmp_path / "order")["PLATE.step"]["content"]
     # Rounded to other levels it is as radial.
-    other = levels_of_run(open_run(tmp_path / "run"), 4)
-    rings = ring_levels(LevelMap(other.level, other.levels, other.grid, other.aperture_m))
+    other = level_map_of_run(open_run(tmp_path / "run"), 4)
+    rings = ring_levels(other)
     assert rings is not None
     assert len(rings) == 32
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fab.files import sha256_file
+from fab.level_map import read_level_map
 from fab.levels import Levels, height_of
 from sim.store import read_bank, read_height
 
@@ -43,7 +44,15 @@ def test_the_run_folder_holds_what_its_manifest_lists(finished):
     assert manifest["name"] == "tiny"
     found = {path.name for path in finished.run.iterdir()} - {"manifest.json", "psf"}
     assert set(manifest["results_sha256"]) == found
-    expected = {"height.exr", "height_continuous.exr", "history.jsonl", "metrics.json", "spec.toml", "height.png"}
+    expected = {
+        "level_map.npz",
+        "height.exr",
+        "height_continuous.exr",
+        "history.jsonl",
+        "metrics.json",
+        "spec.toml",
+        "height.png",
+    }
     assert expected | {"psf.png", "mtf.png", "encircled.png", "history.png"} == found
     for name, digest in manifest["results_sha256"].items():
         assert sha256_file(finished.run / name) == digest, name
@@ -58,7 +67,11 @@ def test_the_order_holds_what_its_manifest_lists(finished):
         assert sha256_file(finished.order / name) == entry["sha256"]
         assert (finished.order / name).stat().st_size == entry["bytes"]
     source = manifest["source"]
-    assert source == {"kind": "run", "name": "tiny", "height_sha256": sha256_file(finished.run / "height.exr")}
+    assert source == {
+        "kind": "run",
+        "name": "tiny",
+        "level_map_sha256": read_level_map(finished.run / "level_map.npz").digest,
+    }
 
 
 def test_the_psf_folder_holds_what_its_manifest_lists(finished):
@@ -167,7 +180,7 @@ def test_fewer_levels_come_from_the_continuous_design(finished, cli, tmp_path):
     assert cli("masks", finished.run, "--levels", 4, "--out", tmp_path / "order").code == 0
     manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
     assert (manifest["levels"], manifest["step_nm"]) == (4, 300)
-    assert manifest["source"]["height_sha256"] == sha256_file(finished.run / "height_continuous.exr")
+    assert manifest["source"]["level_map_sha256"] == read_level_map(finished.run / "level_map.npz").digest
     level = np.load(tmp_path / "order" / "DOE_TINY_LEVELS.npy")
     continuous = read_height(finished.run / "height_continuous.exr").height_m
     y, x = np.indices(level.shape) - 31.5

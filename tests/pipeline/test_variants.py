@@ -67,7 +67,8 @@ def test_a_start_from_a_file_is_an_input_of_the_run(tiny, cli, tmp_path, content
     command = ("optimize", spec, "--out", run, *overrides("optimize.start=start.exr", "optimize.steps=0"))
     assert cli(*command).code == 0
     # A start that lies on the levels is drawn as it is.
-    assert np.array_equal(read_height(run / "height.exr").height_m, heights.astype(np.float32))
+    inside = Grid((64, 64), 1.85e-6).inside_circle(118.4e-6)
+    assert np.array_equal(read_height(run / "height.exr").height_m[inside], heights.astype(np.float32)[inside])
     before = content(run)
     write_height(start, heights[::-1], 1.85e-6, 118.4e-6)
     done = cli(*command)

@@ -33,7 +33,7 @@ def live(*changes: str) -> tuple[Trainer, LivePlate]:
 
 
 def radians_of(plate: LivePlate | RingPlate, height_m: np.ndarray) -> jax.Array:
-    return jnp.asarray(plate.staircase.radians_of(height_m))
+    return jnp.asarray(plate.parametrization.radians_of(height_m))
 
 
 def difference(found: jax.Array, wanted: np.ndarray) -> float:
@@ -67,7 +67,7 @@ def test_sparse_sampling_keeps_the_energy(depth_m: float, field_rad: tuple[float
 def test_a_live_plate_is_quantised_as_it_will_be_drawn() -> None:
     made, plate = live("optimize.sampling=exact")
     free = radians_of(plate, heights())
-    drawn = plate.staircase.level(plate.staircase.continuous_m(free)) * plate.staircase.levels.step_m
+    drawn = plate.parametrization.level(plate.parametrization.continuous_m(free)) * plate.parametrization.levels.step_m
     wanted = psf_bank(made.bench.camera, np.asarray(drawn), (FAR_M,)).energy[:, 0]
     found = psf_of(plate, free, jnp.float32(0), plate.source(FAR_M))
     assert difference(found, wanted) < 2e-4  # as above
@@ -152,7 +152,7 @@ def test_a_capture_has_the_gradient_of_its_plate() -> None:
 
     slope = jax.jit(jax.grad(value))(free)
     # Cells that a step would wrap have a jump in between.
-    room = (free > 0.1) & (free < plate.staircase.levels.period_m / plate.staircase.metres_per_radian - 0.1)
+    room = (free > 0.1) & (free < plate.parametrization.levels.period_m / plate.parametrization.metres_per_radian - 0.1)
     along = jnp.where(room, jnp.sign(slope), 0.0)
     step = 1e-2
     found = (value(free + step * along) - value(free - step * along)) / (2 * step)

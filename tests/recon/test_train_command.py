@@ -29,13 +29,14 @@ from doedesign.cli import exit_code, main
 from doedesign.commands.train import TrainingSettings, train
 from doedesign.recon.weights import read_network
 from doedesign.report.training import ValidationRow, draw_training, draw_validation
-from doedesign.runs.level_maps import level_map_from
+from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import load_spec
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
-from fab.files import read_json, sha256_file, write_atomic
+from fab.files import read_json, write_atomic
+from fab.level_map import read_level_map
 from fab.pictures import read_display
 from sim.psf_bank import psf_bank
 from sim.store import read_bank
@@ -160,7 +161,15 @@ def whole(run: Path, images: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_what_is_written(run: Path, images: Path, whole: Path):
-    results = {"network.npz", "psf.exr", "height.exr", "height_continuous.exr", "metrics.json", "curves.png"}
+    results = {
+        "network.npz",
+        "psf.exr",
+        "level_map.npz",
+        "height.exr",
+        "height_continuous.exr",
+        "metrics.json",
+        "curves.png",
+    }
     names = {"manifest.json", "spec.toml", "pictures.json", "history.jsonl", "validation"} | results
     assert {path.name for path in whole.iterdir()} == names
     assert {path.name for path in (whole / "validation").iterdir()} == {"step_000003.png", "step_000006.png"}
@@ -195,7 +204,7 @@ def test_the_history_has_every_step_once(whole: Path):
 
 def test_the_trained_plate_can_be_ordered(run: Path, whole: Path):
     """As a height map of its own, with other heights than the run's."""
-    drawn, before = (level_map_from(folder / "height.exr", 4, step_m=300e-9) for folder in (whole, run))
+    drawn, before = (drawing_from(folder, 4).level_map for folder in (whole, run))
     assert drawn.aperture_m == before.aperture_m == 0.1184e-3
     # Steps of 0.02 rad move a few of the cells whose height was near the middle of two levels.
     assert 0 < np.mean(drawn.level != before.level) < 0.2
@@ -235,7 +244,7 @@ def test_the_trained_plate_can_be_drawn(whole: Path, tmp_path: Path, capsys: pyt
     assert main(["masks", str(whole), "--out", str(tmp_path / "order"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["checks"] > 0
     source = read_json(tmp_path / "order" / "manifest.json")["source"]
-    assert source["height_sha256"] == sha256_file(whole / "height.exr")
+    assert source["level_map_sha256"] == read_level_map(whole / "level_map.npz").digest
 
 
 @pytest.mark.slow
@@ -244,7 +253,7 @@ def test_a_training_without_a_plate_has_no_masks(
 ):
     assert trained(run, tmp_path / "out", images, 'train.camera="conventional"', "train.steps=1")[0] == 0
     assert main(["masks", str(tmp_path / "out"), "--out", str(tmp_path / "order")]) == 2
-    assert "must hold a plate, height.exr" in capsys.readouterr().err
+    assert "must hold a plate, level_map.npz" in capsys.readouterr().err
 
 
 # --- stopped and resumed ---------------------------------------------------------------------------------------------
@@ -513,7 +522,7 @@ def test_what_stays_at_rest(
     if height is None:
         assert not (out / "height.exr").exists()
     else:
-        drawn, before = (level_map_from(folder / "height.exr", 4, step_m=300e-9).level for folder in (out, run))
+        drawn, before = (drawing_from(folder, 4).level_map.level for folder in (out, run))
         assert np.array_equal(drawn, before) == height
     moved, _ = read_network(out / "network.npz")
     fresh = jax.tree.leaves(command.Trainer.initial(_still(run), np.zeros((2, 2), np.float32)).network)

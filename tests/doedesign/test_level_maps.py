@@ -5,11 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from doedesign.build import camera_from_spec
+from doedesign.design.design import Design
 from doedesign.runs.folder import Run, begin_run, claim_run, finish_run
-from doedesign.runs.level_maps import level_map_from, levels_of_run, read_any_height
+from doedesign.runs.level_maps import drawing_from, level_map_of_run, read_any_height, write_design
 from doedesign.spec import load_spec
 from fab.errors import InputError
-from fab.levels import Levels, height_of
+from fab.grid import Grid
+from fab.height import HeightMap
+from fab.level_map import LevelMap
+from fab.levels import Levels
 from sim.store import write_height
 
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
@@ -21,10 +26,12 @@ def finished(folder: Path, continuous_m: np.ndarray, *overrides: str) -> Run:
     spec = load_spec(QUICK, ["doe.samples=16", "doe.aperture=29.6 um", *overrides])
     with claim_run(folder, spec, {}) as run:
         begin_run(run, {}, overrides)
-        drawn = np.mod(np.rint(continuous_m / STEP_M), 16) * STEP_M
-        write_height(run.path("height.exr"), drawn, 1.85e-6, 29.6e-6)
-        write_height(run.path("height_continuous.exr"), continuous_m, 1.85e-6, 29.6e-6)
-        finish_run(run, {}, overrides, ["height.exr", "height_continuous.exr"])
+        height = HeightMap(continuous_m, Grid((16, 16), 1.85e-6), 29.6e-6)
+        level_map = LevelMap.from_height(height, Levels(16, STEP_M), "quick", wrapped=True)
+        files = write_design(
+            folder, Design(level_map, camera_from_spec(spec), (), (), continuous_m=continuous_m, spec=spec)
+        )
+        finish_run(run, {}, overrides, files)
     return run
 
 
@@ -36,40 +43,42 @@ def continuous_m(rng: np.random.Generator) -> np.ndarray:
 def test_a_run_gives_the_levels_it_drew(tmp_path: Path, continuous_m: np.ndarray):
     run = finished(tmp_path, continuous_m)
     for count in (None, 16):
-        drawing = levels_of_run(run, count)
+        drawing = level_map_of_run(run, count)
         assert drawing.levels == Levels(16, STEP_M)
-        assert drawing.file == run.path("height.exr")
-        assert np.array_equal(drawing.level, np.mod(np.rint(continuous_m / STEP_M), 16))
+        inside = drawing.grid.inside_circle(29.6e-6)
+        assert np.array_equal(drawing.level[inside], np.mod(np.rint(continuous_m / STEP_M), 16)[inside])
+        assert (drawing.level[~inside] == 15).all()
     assert drawing.name == "quick"
     assert drawing.aperture_m == 29.6e-6
 
 
 @pytest.mark.parametrize("count", [2, 4, 8, 32, 64])
 def test_another_number_of_levels_spans_the_same_height(tmp_path: Path, continuous_m: np.ndarray, count: int):
-    drawing = levels_of_run(finished(tmp_path, continuous_m), count)
+    drawing = level_map_of_run(finished(tmp_path, continuous_m), count)
     full = 16 * STEP_M
     assert drawing.levels.count * drawing.levels.step_m == pytest.approx(full, rel=1e-12)
-    assert drawing.file.name == "height_continuous.exr"
-    off = height_of(drawing.level, drawing.levels) - continuous_m
+    inside = drawing.grid.inside_circle(29.6e-6)
+    off = (drawing.height_m - continuous_m)[inside]
     around = np.minimum(np.abs(off), full - np.abs(off))
     # Half a step, and the file's float32 heights.
     assert around.max() <= drawing.levels.step_m / 2 + 1e-7 * full
 
 
 def test_a_continuous_run_is_rounded_when_it_is_drawn(tmp_path: Path, continuous_m: np.ndarray):
-    drawing = levels_of_run(finished(tmp_path, continuous_m, "optimize.quantisation=none"))
+    drawing = level_map_of_run(finished(tmp_path, continuous_m, "optimize.quantisation=none"))
     assert drawing.levels == Levels(16, STEP_M)
-    assert drawing.file.name == "height_continuous.exr"
+    kept = read_any_height(tmp_path / "height.exr").height_m
+    np.testing.assert_allclose(kept, continuous_m, rtol=1e-6)  # float32, and not rounded
 
 
 @pytest.mark.parametrize("count", [0, -8, 3, 12, 128])
 def test_impossible_levels(tmp_path: Path, continuous_m: np.ndarray, count: int):
     run = finished(tmp_path, continuous_m)
     with pytest.raises(InputError, match="power of two"):
-        level_map_from(run.folder, count)
+        drawing_from(run.folder, count)
     np.save(tmp_path / "map.npy", continuous_m)
     with pytest.raises(InputError, match="power of two"):
-        level_map_from(tmp_path / "map.npy", count, step_m=STEP_M, pitch_m=1e-6)
+        drawing_from(tmp_path / "map.npy", count, step_m=STEP_M, pitch_m=1e-6)
 
 
 def test_what_an_exr_does_not_say_must_be_given(tmp_path: Path):
@@ -92,4 +101,4 @@ def test_a_folder_is_no_height_map(tmp_path: Path):
 def test_messages_name_the_file(tmp_path: Path):
     np.save(tmp_path / "high.npy", np.full((4, 4), 1e-3))
     with pytest.raises(InputError, match=r"high\.npy: no height may lie more than half a step above"):
-        level_map_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)
+        drawing_from(tmp_path / "high.npy", 16, step_m=STEP_M, pitch_m=1e-6)

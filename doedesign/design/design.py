@@ -1,0 +1,117 @@
+"""Design: a DOE as it is drawn, with the camera it is for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.build import resolve_process, with_edge_moves
+from doedesign.spec import Spec
+from fab.draws import EXPECTED, variation_at
+from fab.level_map import LevelMap
+from fab.levels import Levels
+from fab.process import Process, Variation
+from sim.camera import Camera
+
+if TYPE_CHECKING:
+    from sim.surface import FabricatedDoe
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A DOE as drawn, with all that is needed to predict it.
+
+    Attributes:
+        level_map: level of every cell; heights follow from it.
+        camera: lens, sensor and substrate, on the grid of the level map.
+        near_m: distances of obstructions, metres.
+        far_m: distances of the scene, metres; `inf` for a star.
+        edge_moves_m: how far the masks draw the edges of etched areas outward to make up for the line-width bias of the
+            process, mask 0 first, metres; empty for nowhere.
+        continuous_m: ``[y, x]`` heights before rounding to levels, metres, if they are at hand.
+        spec: the spec it was optimised for, if there was one.
+        history: one record per step of its optimisation, if at hand: `step`, `loss`, `terms` and their `names`.
+        folder: its run folder, if it has one.
+    """
+
+    level_map: LevelMap
+    camera: Camera
+    near_m: tuple[float, ...]
+    far_m: tuple[float, ...]
+    edge_moves_m: tuple[float, ...] = ()
+    continuous_m: Float[np.ndarray, "y x"] | None = None
+    spec: Spec | None = None
+    history: tuple[Mapping[str, Any], ...] = ()
+    folder: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the level map."""
+        return self.level_map.name
+
+    @property
+    def levels(self) -> Levels:
+        """Staircase of the level map."""
+        return self.level_map.levels
+
+    @property
+    def height_m(self) -> Float[np.ndarray, "y x"]:
+        """Height ``[y, x]`` of every cell above the deepest floor, metres, float32."""
+        return self.level_map.height_m
+
+    @property
+    def nominal_height_m(self) -> Float[np.ndarray, "y x"]:
+        """Heights ``[y, x]`` that the optimisation ended with, metres: not rounded where the spec leaves them so."""
+        unrounded = self.spec is not None and self.spec.optimize.quantisation == "none"
+        return self.continuous_m if unrounded and self.continuous_m is not None else self.height_m
+
+    @property
+    def depths_m(self) -> tuple[float, ...]:
+        """All source distances, near ones first, metres."""
+        return (*self.near_m, *self.far_m)
+
+    def bare(self) -> "Design":
+        """The same without what only its optimisation knew: what other processes need to predict it."""
+        return replace(self, continuous_m=None, spec=None, history=(), folder=None)
+
+    def process(self, process: "Process | str | Path | None" = None) -> Process:
+        """Return the process that makes this design, as the design sees it through its masks.
+
+        Args:
+            process: a process; the name of a stock process ("contact_aligner"); a TOML file with a process; by default
+                that of the spec, or an ideal one.
+
+        Raises:
+            InputError: the process cannot be read, or makes another staircase.
+        """
+        own = None if self.spec is None else self.spec.process
+        return with_edge_moves(resolve_process(process, self.levels, own), self.edge_moves_m)
+
+    def fabricated(
+        self,
+        process: "Process | str | Path | None" = None,
+        seed: int | None = None,
+        draw: str = "normal/0",
+        variation: Variation | None = None,
+    ) -> "FabricatedDoe":
+        """Predict the DOE that a process makes of this design.
+
+        Args:
+            process: see `process`.
+            seed: seed of the process errors; without one (and without a variation) every error is at its mean.
+            draw: which draw of the seed, as in a tolerance study (`fab.draws`).
+            variation: the process errors themselves, SI units.
+
+        Raises:
+            InputError: a process that cannot be used, or errors beyond the model (`sim.surface.as_fabricated`).
+        """
+        from sim.surface import as_fabricated
+
+        made_by = self.process(process)
+        if variation is None:
+            side_m = max(self.camera.grid.extent_m)
+            variation = variation_at(made_by, seed or 0, side_m, EXPECTED if seed is None else draw)
+        return as_fabricated(self.level_map.level, self.camera, made_by, variation)
