@@ -52,7 +52,7 @@ def say(text: str) -> None:
 class Bench:
     """A design before light of two wavelengths."""
 
-    drawing: RunMap
+    drawing: LevelMap
     camera: Camera
     near_m: float
 

@@ -1,12 +1,9 @@
 """`doedesign masks` and `doedesign verify`: a height map becomes a mask order, and an order is proved."""
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from doedesign.build import camera_from_spec, process_from_spec, require_levels_of, wafer_from_spec
 from doedesign.design.design import Design
@@ -167,26 +164,6 @@ def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
         return made
     said = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
     return Process(levels, name=made.name, **said)
-
-
-def _fixed(
-    design: Design | None, drawing: LevelMap, rules: Rules, say: Say
-) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-    """Change a level map until the process prints it; say what that costs."""
-    waves_per_metre = 1 / drawing.levels.period_m
-    if design is not None and design.spec is not None:
-        waves_per_metre = design.camera.waves_per_metre(design.spec.optics.design_wavelength_m)
-    say("repairing the level map")
-    fixed, cost = repaired(drawing.level, drawing.levels, drawing.grid, drawing.aperture_m, rules, waves_per_metre)
-    left = f", {cost.broken_after} of {cost.broken_before} broken places are left" if cost.broken_after else ""
-    say(
-        f"repaired: {100 * cost.changed_share:.3g} % of the pixels changed, {100 * (1 - cost.efficiency):.2g} % of the "
-        f"light goes astray{left}"
-    )
-    record: dict[str, Any] = asdict(cost)
-    if design is not None:
-        record["psf"] = _psf_cost(design, fixed, say)
-    return fixed, record
 
 
 def _psf_cost(design: Design, repaired: LevelMap, say: Say) -> list[dict[str, Any]]:

@@ -77,7 +77,7 @@ def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
     design = finished_design(spec, problem, initial_state(spec, problem, scene, {}, unread))
     level = quantise(design.height_m, problem.parametrization.levels)
     np.testing.assert_allclose(design.height_m, level * 75e-9, rtol=1e-6)
-    assert radial_profile(design.continuous_m, problem.camera.grid) is not None
+    assert radial_profile(np.asarray(design.continuous_m), problem.camera.grid) is not None
 
 
 def test_looks_see_every_depth_equally_often() -> None:
