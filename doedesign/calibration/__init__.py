@@ -1,9 +1,9 @@
 """Calibration: the process errors behind measured PSFs, how well they are known, and what two numbers alone may mean.
 
-    measurement = load_shots(Path("measurement.toml"), drawn.camera)
-    result = calibrate(drawn, process, measurement)
+    measurement = load_shots(Path("measurement.toml"), design.camera)
+    result = calibrate(design, process, measurement)
     result.process                      # the estimate, usable everywhere a process is
-    explanations(drawn, process, targets)   # where only a ring:disc ratio and a throughput were measured
+    explanations(design, process, targets)   # where only a ring:disc ratio and a throughput were measured
 
 Reading order:
 

@@ -139,7 +139,7 @@ def test_a_manifest_that_was_edited_is_noticed(tiny, cli, chosen, tmp_path):
     manifest = json.loads(path.read_text())
     first, second = manifest["etch_depths_m"]
     for depths, message in (
-        ([first + 2e-9, second], "every height must be one of the 4 levels by etches of"),
+        ([first + 2e-9, second], "must be for 4 levels by etches of"),
         ([first], "4 levels must have 2 etches"),
         (None, 'must be a list of depths or "optimize"'),
     ):
