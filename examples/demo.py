@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.commands.masks import verify, write_masks
+from doedesign.commands.masks import write_masks
 from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
 from doedesign.design.design import Design
@@ -24,6 +24,7 @@ from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length
+from fab.verification.verify import verify
 
 HERE = Path(__file__).parent
 

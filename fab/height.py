@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error, read_npy
+from fab.files import read_npy
 from fab.grid import Grid
-from fab.units import format_length
+from fab.pictures import MOST_PIXELS, TIFF_FILES, read_pixels
+from fab.units import format_length, metres
 
 __all__ = ["HeightMap", "read_height", "refuse_where", "require_heights"]
 
-# 16384 x 16384: 2 GB as float64, beyond which a plate of micrometre pixels is a mistake.
-_MOST_PIXELS = 1 << 28
-_CURE = "Write the file again from its source."
+_PICTURES = (".png", *TIFF_FILES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,72 +94,32 @@ def require_heights(height_m: NDArray[Any], where: str) -> None:
     refuse_where(height_m, height_m < 0, where, "no height may be negative", cure)
 
 
-def _load_tiff(path: Path) -> NDArray[Any]:
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
-        _require_size(path, file.pages[0].shape)
-        if len(file.pages) != 1:
-            raise ValueError(f"{len(file.pages)} pages")
-        return file.asarray()[::-1]
-
-
-def _load_png(path: Path) -> NDArray[Any]:
-    from PIL import Image
-
-    with Image.open(path, formats=["PNG"]) as image:
-        image.verify()  # reading the pixels skips their checksum
-    with Image.open(path, formats=["PNG"]) as image:
-        _require_size(path, image.size)
-        if image.mode not in ("L", "I;16", "I;16B", "I"):
-            raise ValueError(f"colours (mode {image.mode})")
-        return np.asarray(image)[::-1]
-
-
-_LOADERS = {".npy": read_npy, ".tif": _load_tiff, ".tiff": _load_tiff, ".png": _load_png}
-
-
-def _require_size(path: Path, shape: tuple[int, ...]) -> None:
-    if len(shape) != 2 or not 0 < shape[0] * shape[1] <= _MOST_PIXELS:
-        rule = f"a height map must have two axes and 1 to {_MOST_PIXELS} pixels"
-        raise InputError(str(path), rule, f"shape {shape}", "Give one plane of heights, [y, x].")
-
-
 def _load(path: Path) -> NDArray[Any]:
-    loader = _LOADERS.get(path.suffix.lower())
-    if loader is None:
-        kinds = ", ".join(sorted(_LOADERS))
+    suffix = path.suffix.lower()
+    if suffix != ".npy" and suffix not in _PICTURES:
+        kinds = ", ".join(sorted((".npy", *_PICTURES)))
         raise InputError(str(path), f"the file must be one of {kinds}", path.suffix or "no suffix", "Convert it first.")
-    try:
-        values = loader(path)
-    except InputError:
-        raise
-    except OSError as error:
-        if error.errno is None:
-            raise InputError(str(path), "the file must be whole and of its kind", str(error), _CURE) from error
-        raise explain_os_error(error, path) from error
-    # The three libraries raise what they like on a damaged file; all of it means the same to the user.
-    except Exception as error:
-        got = str(error) or type(error).__name__
-        raise InputError(str(path), "the file must be whole and hold one array of numbers", got, _CURE) from error
-    _require_size(path, values.shape)
+    values = read_npy(path, MOST_PIXELS) if suffix == ".npy" else read_pixels(path)
+    if values.ndim != 2:
+        rule = "a height map must have two axes, and no colours"
+        raise InputError(str(path), rule, f"shape {values.shape}", "Give one plane of heights, [y, x].")
     return values
 
 
 def read_height(
     path: str | Path,
-    pitch_m: float | None = None,
-    scale_m: float | None = None,
-    aperture_m: float | None = None,
+    pitch: float | str | None = None,
+    scale: float | str | None = None,
+    aperture: float | str | None = None,
 ) -> HeightMap:
-    """Read a height map that a user brings.
+    """Read a height map that a user brings; lengths are metres, or text with a unit such as ``"1.85 um"``.
 
     Args:
         path: ``.npy`` (row 0 at the lowest y), ``.tif``, ``.tiff`` or ``.png`` (first row on top; turned).
-        pitch_m: edge of a pixel, metres. None of these files holds it, so it must be given.
-        scale_m: metres that one count of the file stands for. Floats are metres if it is left out;
+        pitch: edge of a pixel. None of these files holds it, so it must be given.
+        scale: length that one count of the file stands for. Floats are metres if it is left out;
             integers, and so every PNG, need it.
-        aperture_m: diameter of the clear aperture, metres; the shorter side of the map if left out.
+        aperture: diameter of the clear aperture; the shorter side of the map if left out.
 
     Returns:
         The height map, float32 if the file holds float32 or float16, otherwise float64.
@@ -170,20 +129,21 @@ def read_height(
             two-dimensional, or holds NaN, infinite or negative heights; or pitch or scale is missing.
     """
     path = Path(path)
-    if pitch_m is None:
-        raise InputError(str(path), "the pixel pitch must be given", "none", "Add --pitch-um.")
+    if pitch is None:
+        raise InputError(str(path), "the pixel pitch must be given", "none", "Give the pitch of a pixel.")
     values = _load(path)
     if values.dtype.kind not in "fiu":
         raise InputError(str(path), "heights must be real numbers", values.dtype, "Save floats in metres.")
-    if scale_m is None and values.dtype.kind != "f":
+    if scale is None and values.dtype.kind != "f":
         rule = "integers need a scale, the metres that one count stands for"
         raise InputError(str(path), rule, f"{values.dtype} and no scale", "Give the scale.")
-    if scale_m is not None and not 0 < scale_m < float("inf"):
-        raise InputError(str(path), "the scale must be positive and finite", scale_m, "Give metres per count.")
     narrow = values.dtype.kind == "f" and values.dtype.itemsize <= 4
     height_m = np.ascontiguousarray(values, dtype=np.float32 if narrow else np.float64)
-    if scale_m is not None:
+    if scale is not None:
+        scale_m = metres(scale, "scale")
+        if scale_m <= 0:
+            raise InputError(str(path), "the scale must be positive and finite", scale, "Give metres per count.")
         height_m *= scale_m
     require_heights(height_m, str(path))
-    grid = Grid((height_m.shape[0], height_m.shape[1]), pitch_m)
-    return HeightMap(height_m, grid, min(grid.extent_m) if aperture_m is None else aperture_m)
+    grid = Grid((height_m.shape[0], height_m.shape[1]), metres(pitch, "pitch"))
+    return HeightMap(height_m, grid, min(grid.extent_m) if aperture is None else metres(aperture, "aperture"))

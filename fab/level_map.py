@@ -121,7 +121,7 @@ def level_digest(level: NDArray[np.uint8]) -> str:
 
 
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
-    """Write a level map without loss; the same map gives the same bytes.
+    """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres.
 
     Raises:
         InputError: the system refuses the path.
@@ -142,7 +142,7 @@ def write_level_map(path: str | Path, level_map: LevelMap) -> None:
 
 
 def read_level_map(path: str | Path) -> LevelMap:
-    """Read what `write_level_map` wrote.
+    """Read what `write_level_map` wrote to `path`.
 
     Raises:
         InputError: the file is missing, damaged, changed since it was written, or no level map.

@@ -93,7 +93,7 @@ class MaskDisc(NamedTuple):
 
 @dataclass(frozen=True)
 class Variation:
-    """The errors of one plate; all zero is a plate exactly as drawn.
+    """The errors of one plate, in metres, radians and shares; all zero is a plate exactly as drawn.
 
     A per-mask error is empty (zero for every mask) or has one value per mask, mask 0 first; the other values mean what
     `DEVIATIONS` says.
@@ -169,7 +169,7 @@ class Normal(NamedTuple):
 
 @dataclass(frozen=True)
 class Defects:
-    """Rare events.
+    """Rare events; lengths in metres.
 
     Attributes:
         particles_per_m2: particles per area and etch that keep an etch off a disc.
@@ -205,7 +205,7 @@ class Defects:
 
 @dataclass(frozen=True)
 class Process:
-    """What a fab lab does to a plate, and how well.
+    """What a fab lab does to a plate, and how well; lengths in metres.
 
     Attributes:
         levels: the staircase that the etches make together.

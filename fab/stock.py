@@ -16,9 +16,11 @@ from math import radians
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from fab.process import DEVIATIONS
+from fab.errors import InputError
+from fab.levels import Levels
+from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 
-__all__ = ["IDEAL", "STOCK", "Figure", "Number", "Source", "Stock", "Typical"]
+__all__ = ["IDEAL", "STOCK", "Figure", "Number", "Source", "Stock", "Typical", "process_from"]
 
 
 class Source(NamedTuple):
@@ -103,6 +105,39 @@ class Stock:
             yield Number(name, "value", *getattr(self, name))
         for name, figure in self.defects.items():
             yield Number(name, "value", *figure)
+
+    def process(self, levels: Levels) -> Process:
+        """Return the process with these numbers for a staircase; all masks have the same ones."""
+        spreads = {
+            name: Normal(typical.mean, typical.sigma)
+            for error, typical in self.errors.items()
+            for name in error_names(levels.bits, error)
+        }
+        limits = {name: getattr(self, name).value for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m")}
+        defects = Defects(**{name: figure.value for name, figure in self.defects.items()})
+        return Process(levels, spreads=spreads, defects=defects, tone=self.tone, name=self.name, **limits)
+
+
+def process_from(given: Process | str | None, levels: Levels) -> Process:
+    """Return a process for a staircase: itself, the stock process of a name, or an ideal one.
+
+    Args:
+        given: a process, a key of `STOCK`, "ideal", or None for the ideal one.
+        levels: the staircase that it must make.
+
+    Raises:
+        InputError: an unknown name, or a process that makes another staircase.
+    """
+    known = {**STOCK, IDEAL.name: IDEAL}
+    if given is None or isinstance(given, Process):
+        process = given or Process(levels)
+        if process.levels != levels:
+            cure = "Give a process for this design."
+            raise InputError("process", f"must be for {levels.told}", process.levels.told, cure)
+        return process
+    if given not in known:
+        raise InputError("process", "must be a process or the name of one", repr(given), f"Name {' or '.join(known)}.")
+    return known[given].process(levels)
 
 
 def _degrees(angle: float) -> float:

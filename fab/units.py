@@ -8,9 +8,12 @@ therefore loaded on the first use.
 import math
 import re
 from functools import cache
+from numbers import Real
 from typing import Any
 
-__all__ = ["MM", "NM", "UM", "format_length", "parse_angle", "parse_length"]
+from fab.errors import InputError
+
+__all__ = ["MM", "NM", "UM", "format_length", "metres", "parse_angle", "parse_length"]
 
 NM = 1e-9
 UM = 1e-6
@@ -81,6 +84,31 @@ def parse_angle(text: str) -> float:
         ValueError: no unit, a unit that is not an angle, or no finite number.
     """
     return _parse(text, "rad", "2 deg")
+
+
+def metres(value: float | str, name: str = "length", *, infinite: bool = False) -> float:
+    """Return a length in metres, given as an SI number or as text with a unit.
+
+    Args:
+        value: metres, or text such as ``"75 nm"``.
+        name: what the length is of, for messages.
+        infinite: whether infinity will do, as a number or as ``"inf"``.
+
+    Raises:
+        InputError: anything else: text without a unit, a number that is not finite, another type.
+    """
+    if infinite and value in (math.inf, "inf"):
+        return math.inf
+    rule = f'must be metres or text with a unit such as "75 nm"{", or infinite" if infinite else ""}'
+    cure = 'Give a number of metres, 75e-9, or text, "75 nm".'
+    if isinstance(value, str):
+        try:
+            return parse_length(value)
+        except ValueError as error:
+            raise InputError(name, rule, repr(value), cure) from error
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        raise InputError(name, rule, repr(value), cure)
+    return float(value)
 
 
 def format_length(length_m: float) -> str:

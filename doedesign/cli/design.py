@@ -111,7 +111,7 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     Args:
         order: Folder that masks wrote.
     """
-    from doedesign.commands.masks import verify as work
+    from fab.verification.verify import verify as work
 
     report = work(order)
     if json_:

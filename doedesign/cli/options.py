@@ -26,3 +26,21 @@ def length_of(option: str, text: str | None) -> float | None:
         return parse_length(text)
     except ValueError as error:
         raise InputError(option, "must be a length with a unit", f'"{text}"', 'For example "75 nm".') from error
+
+
+# What the library calls in its own words is an option here.
+_OPTIONS = {
+    "Give the pitch of a pixel": "Add --pitch-um",
+    "Give the scale": "Add --scale",
+    "have the level map repaired": "take --on-violation fix",
+    "take the mesh alone": "take the mesh alone (--mesh-patch)",
+    "or its masks.": "or its masks (--order).",
+}
+
+
+def in_options(error: InputError) -> str:
+    """The message of an error, with the options that its cure asks for."""
+    text = str(error)
+    for words, option in _OPTIONS.items():
+        text = text.replace(words, option)
+    return text

@@ -11,6 +11,7 @@ from typing import Any
 
 from cyclopts import CycloptsError
 
+from doedesign.cli.options import in_options
 from fab.errors import CheckFailed, InputError
 
 
@@ -70,7 +71,7 @@ def exit_code(work: Callable[[], Any]) -> int:
         with shown_log():
             work()
     except InputError as error:
-        say(f"doedesign: {error}")
+        say(f"doedesign: {in_options(error)}")
         return 2
     except CheckFailed as error:
         say(f"doedesign: check failed\n{error}")

@@ -1,4 +1,4 @@
-"""`doedesign masks` and `doedesign verify`: a height map becomes a mask order, and an order is proved."""
+"""`doedesign masks`: a level map becomes a mask order."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +26,7 @@ from fab.process import Process, Variation
 from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
 from fab.runsheet.write import write_run_sheet
 from fab.solids.patch import Patch
-from fab.verification.verify import VerificationReport, verify_order
+from fab.verification.verify import VerificationReport
 
 Say = Callable[[str], None]
 
@@ -68,21 +68,17 @@ def write_masks(
     chrome = Chrome() if spec is None else Chrome(overlap_m=spec.process.chrome_overlap_m)
     process = _process(spec, level_map.levels, process_file)
     filled = (spec.wafer if spec else WaferSpec()) if wafer_file is None else load_wafer(wafer_file)
-    try:
-        order = plan_order(
-            level_map,
-            process=process,
-            wafer=wafer_from_spec(filled),
-            chrome=chrome,
-            patch=patch,
-            source=drawing.origin,
-            on_violation=on_violation,
-            waves_per_metre=None if spec is None else _waves_per_metre(spec),
-            say=say,
-        )
-    except InputError as error:
-        cure = error.cure.replace("have the level map repaired", "take --on-violation fix")
-        raise InputError(error.where, error.rule, error.got, cure) from error
+    order = plan_order(
+        level_map,
+        process=process,
+        wafer=wafer_from_spec(filled),
+        chrome=chrome,
+        patch=patch,
+        source=drawing.origin,
+        on_violation=on_violation,
+        waves_per_metre=None if spec is None else _waves_per_metre(spec),
+        say=say,
+    )
     if order.repair is not None and design is not None:
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map, say)}
         order = replace(order, source={**order.source, "repair": repair})
@@ -180,8 +176,3 @@ def _psf_cost(design: Design, repaired: LevelMap, say: Say) -> list[dict[str, An
     if worst is not None:
         say(f"far spot of {worst['colour']}: {worst['far_spot'][0]:.3f} before, {worst['far_spot'][1]:.3f} after")
     return told
-
-
-def verify(folder: Path) -> VerificationReport:
-    """Prove a mask order from its files alone; see `fab.verification.verify.verify_order`."""
-    return verify_order(folder)

@@ -317,7 +317,7 @@ def read_manifest(folder: str | Path) -> Manifest:
     data = read_json(path)
     if data.get("format") != FORMAT:
         got = repr(data.get("format"))
-        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give a folder written by `masks`.")
+        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give the folder of a mask order.")
     digest = data.pop("sha256", None)
     if digest != sha256_bytes(canonical_json(data)):
         rule = "its content must have the digest that it states"

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from fab.errors import InputError
 from fab.layout.compensation import edge_moves
@@ -14,10 +14,15 @@ from fab.layout.split import Split, splits_of
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.process import Process
-from fab.rules.check import Rules, RulesReport, check
+from fab.rules.check import RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.solids.patch import Patch
+from fab.stock import process_from
 from fab.units import NM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 __all__ = ["OnViolation", "Order", "order_id", "plan_order"]
 
@@ -78,6 +83,13 @@ class Order:
         """How the dies draw the DOE, the plate as ordered first."""
         return splits_of(self.wafer, self.level_map.levels, self.edge_moves(), self.dbu_m)
 
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw heights, chrome and every etch mask (`fab.plots.masks.plot_masks`)."""
+        from fab.plots.masks import plot_masks
+
+        title = f"{self.stem}: {self.level_map.levels.told}, level map {self.level_map.digest[:12]}"
+        return plot_masks(self.level_map, self.chrome.radii_m(self.level_map), title, ax)
+
     def plate_stem(self, plate: Photomask) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
         if plate.bit is not None:
@@ -98,7 +110,7 @@ class Order:
 def plan_order(
     level_map: LevelMap,
     *,
-    process: Process | None = None,
+    process: Process | str | None = None,
     wafer: Wafer | None = None,
     chrome: Chrome | None = None,
     patch: Patch | None = None,
@@ -112,14 +124,14 @@ def plan_order(
     Raises:
         InputError: the process cannot print the map and `on_violation` is "fail", or an argument is out of range.
     """
-    process = process or Process(level_map.levels)
-    report = check(level_map, Rules.of(process))
+    made_by = process_from(process, level_map.levels)
+    report = check(level_map, made_by)
     for headline in report.headlines():
         say(f"warning: {headline}")
     if on_violation == "fail" and not report.printable:
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    order = Order(report, process, wafer or Wafer(), chrome or Chrome(), source or {}, patch)
+    order = Order(report, made_by, wafer or Wafer(), chrome or Chrome(), source or {}, patch)
     if on_violation == "fix" and not report.clean:
         say("repairing the level map")
         repair = repaired(report, waves_per_metre)

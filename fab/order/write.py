@@ -16,14 +16,16 @@ level map.
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.figure import html_of
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.gds.writer import write_gds, write_oasis
 from fab.layout.doe import mask_layout
@@ -54,7 +56,11 @@ from fab.process import Process
 from fab.solids.patch import Patch
 from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
-from fab.verification.verify import VerificationReport, verify_order
+from fab.verification.verify import VerificationReport, verify
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 __all__ = ["Add", "WrittenOrder", "mask_file", "write_order", "write_planned"]
 
@@ -246,25 +252,36 @@ def _require_own(folder: Path) -> None:
         raise InputError(str(folder), rule, f"also {extra[0]!r}", "Move that file, or choose another folder.")
 
 
-class WrittenOrder(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class WrittenOrder:
     """A mask order on the disk.
 
     Attributes:
         folder: where its files lie.
         order: what was drawn.
+        manifest: what every file is.
         report: the read-back, every check passed.
     """
 
     folder: Path
     order: Order
+    manifest: Manifest
     report: VerificationReport
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw heights, chrome and every etch mask (`fab.plots.masks.plot_masks`)."""
+        return self.order.plot(ax)
+
+    def _repr_html_(self) -> str:
+        rows = {entry.file: f"{entry.format}, {entry.bytes} bytes" for entry in self.manifest.files}
+        return html_of(f"Mask order {self.folder}, {len(self.report.checks)} checks passed", rows, self.plot())
 
 
 def write_order(
     folder: str | Path,
     level_map: LevelMap,
     *,
-    process: Process | None = None,
+    process: Process | str | None = None,
     wafer: Wafer | None = None,
     chrome: Chrome | None = None,
     patch: Patch | None = None,
@@ -278,7 +295,8 @@ def write_order(
     Args:
         folder: the final folder; missing, empty, or an earlier order, which is replaced.
         level_map: the DOE; file names are made from its name.
-        process: order of the etches, tone of the masks and what is printed; an ideal process if left out.
+        process: order of the etches, tone of the masks and what is printed, or the name of a stock process; an ideal
+            process if left out.
         wafer: what the masks are filled with; the defaults of `Wafer` if left out.
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
         patch: a window to write as a solid at full resolution, too.
@@ -323,7 +341,7 @@ def write_planned(
         manifest = _write_files(fresh, order, add, say)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
         say("reading everything back")
-        report = verify_order(fresh)
+        report = verify(fresh)
         report.require()
         say("moving the folder into place")
-    return WrittenOrder(folder, order, report)
+    return WrittenOrder(folder, order, manifest, report)

@@ -20,21 +20,38 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.figure import html_of
 from fab.grid import Grid
 from fab.layout.geometry import pixel_edges
 from fab.level_map import LevelMap
+from fab.levels import Levels
 from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
+from fab.stock import process_from
 from fab.units import UM, format_length
 
-__all__ = ["OffGrid", "PlaneRules", "Rules", "RulesReport", "Violation", "Widths", "check", "shortest_run"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+__all__ = [
+    "OffGrid",
+    "PlaneRules",
+    "Rules",
+    "RulesReport",
+    "Violation",
+    "Widths",
+    "check",
+    "rules_from",
+    "shortest_run",
+]
 
 Kind = Literal["line", "space", "kissing corner"]
 
@@ -76,7 +93,7 @@ class Rules:
                 raise InputError(f"rules: {name}", "must be positive and finite", value, cure)
 
     @classmethod
-    def of(cls, process: Process) -> "Rules":
+    def from_process(cls, process: Process) -> "Rules":
         """Return the rules of a process: the narrowest line and space that it prints."""
         return cls(process.minimum_line_m, process.minimum_space_m)
 
@@ -191,6 +208,16 @@ class RulesReport:
     def printable(self) -> bool:
         """Whether no line and no space is too narrow. Touching corners print, though nobody knows as what."""
         return not any(plane.line.narrow or plane.space.narrow for plane in self.planes)
+
+    def plot(self, ax: "Axes | None" = None, title: str = "") -> "FigureBase":
+        """Draw where every mask breaks a rule (`fab.plots.rules.plot_rules`)."""
+        from fab.plots.rules import plot_rules
+
+        return plot_rules(self, title or f"{self.level_map.name}: where the masks break the rules", ax)
+
+    def _repr_html_(self) -> str:
+        rows = {f"mask {plane.bit + 1}": "".join(_headline(plane)) or "breaks no rule" for plane in self.planes}
+        return html_of(f"Rules of {self.level_map.name}", rows, self.plot())
 
     def headlines(self) -> tuple[str, ...]:
         """Say in one sentence per mask why the process cannot print it; empty if it can."""
@@ -315,16 +342,30 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
     return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
 
 
-def check(level_map: LevelMap, rules: Rules) -> RulesReport:
+def rules_from(process: Process | Rules | str, levels: Levels) -> Rules:
+    """Return the rules of a process or of a stock process by its name; rules are returned as they are.
+
+    Raises:
+        InputError: a process of another staircase, or one of an unknown name.
+    """
+    return process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
+
+
+def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     """Check every etch mask of a level map.
 
     Args:
         level_map: the DOE; outside its clear aperture nothing is etched.
-        rules: what the masks may hold.
+        process: what the masks may hold: rules, or a process or the name of a stock process, whose rules are the
+            narrowest line and space that it prints.
 
     Returns:
         The numbers of every mask, its worst places, and the raster against the address grid.
+
+    Raises:
+        InputError: a process of another staircase, or one of an unknown name.
     """
+    rules = rules_from(process, level_map.levels)
     grid, aperture_m = level_map.grid, level_map.aperture_m
     spans = np.clip(_spans(grid, aperture_m), 0, grid.shape[1])
     area = int(np.sum(spans[:, 1] - spans[:, 0]))

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
+from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check, shortest_run
 from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
 
@@ -208,19 +209,19 @@ def _phases(levels: Levels, waves_per_metre: float) -> NDArray[np.float64]:
     return 2 * math.pi * waves_per_metre * np.subtract.outer(levels.heights_m(), levels.heights_m())
 
 
-def repair(level_map: LevelMap, rules: Rules, waves_per_metre: float | None = None) -> Repair:
+def repair(level_map: LevelMap, process: Process | Rules | str, waves_per_metre: float | None = None) -> Repair:
     """Change as few levels as possible, as little as possible, until no mask breaks a rule.
 
     Args:
         level_map: the DOE; nothing changes outside its clear aperture, where the glass stays blank.
-        rules: narrowest line and space. With neither there is nothing to repair.
+        process: narrowest line and space, as for `check`. With neither there is nothing to repair.
         waves_per_metre: waves of light per metre of height, (n - 1) / wavelength, which says which levels are near each
             other; one wave over the period of the staircase by default.
 
     Raises:
         InputError: waves per metre that are not positive, or a minimum of more than 32 pixels.
     """
-    return repaired(check(level_map, rules), waves_per_metre)
+    return repaired(check(level_map, process), waves_per_metre)
 
 
 def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repair:

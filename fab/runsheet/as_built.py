@@ -225,7 +225,7 @@ def _chrome(table: _Table, opening_m: float) -> ChromeMeasured:
 def _sheet_number(path: Path, data: Mapping[str, Any], key: str) -> float:
     value = data.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        cure = "Fill in a copy of the sheet that `doedesign masks` wrote, and change nothing but the blanks."
+        cure = "Fill in a copy of the sheet as it was written, and change nothing but the blanks."
         raise InputError(f"{path}: {key}", "must be a number", _short(value), cure)
     return float(value)
 
@@ -251,12 +251,12 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
     """
     data = read_json(path)
     if data.get("format") != FORMAT:
-        cure = "Give the filled JSON of the run sheet that `doedesign masks` wrote."
+        cure = "Give the filled JSON of the run sheet of this order."
         raise InputError(str(path), f'the format must be "{FORMAT}"', _short(data.get("format")), cure)
     levels, digest = level_map.levels, level_map.digest
     if data.get("level_map_sha256") != digest:
         rule = f"must be the run sheet of this design (level map {digest[:12]})"
-        cure = "Give the run that the wafer was made from, or its masks (--masks)."
+        cure = "Give the run that the wafer was made from, or its masks."
         raise InputError(str(path), rule, _short(data.get("level_map_sha256"))[:14], cure)
     moves = _edge_moves_m(path, data)
     measured = _Table(path, "measured", data.get("measured"))

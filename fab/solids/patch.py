@@ -90,7 +90,7 @@ def _tops(level_map: LevelMap, window: Window, most_boxes: int) -> dict[int, NDA
     count = sum(len(found) for found in tops.values())
     if count > most_boxes:
         rule = f"a STEP patch may have at most {most_boxes} boxes (a file of about 7 kB each)"
-        cure = "Choose a smaller window, or take the mesh alone (--mesh-patch)."
+        cure = "Choose a smaller window, or take the mesh alone."
         raise InputError("patch", rule, f"{count} in {window.rows} x {window.columns} pixels", cure)
     return tops
 

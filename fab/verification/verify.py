@@ -19,11 +19,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
+from fab.figure import html_of
 from fab.files import explain_os_error, read_npy, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
@@ -38,7 +40,10 @@ from fab.verification.compare import Expected, cell_problems, layout_problems, r
 from fab.verification.models import model_problems
 from fab.verification.shop_checks import drawing_problems, number_problems
 
-__all__ = ["Check", "VerificationReport", "read_drawn_levels", "verify_order"]
+if TYPE_CHECKING:
+    from fab.order.write import WrittenOrder
+
+__all__ = ["Check", "VerificationReport", "read_drawn_levels", "verify"]
 
 _GDS, _OASIS = "GDSII", "OASIS"
 
@@ -78,6 +83,10 @@ class VerificationReport:
     def differences(self) -> tuple[str, ...]:
         """One sentence per difference, each naming its file first."""
         return tuple(f"{c.file}: {c.question}: {problem}" for c in self.checks for problem in c.problems)
+
+    def _repr_html_(self) -> str:
+        rows = {f"{c.file}: {c.question}": "; ".join(c.problems) or "passed" for c in self.checks}
+        return html_of(f"{sum(check.passed for check in self.checks)} of {len(self.checks)} checks passed", rows)
 
     def require(self) -> None:
         """Raise if anything differs.
@@ -251,11 +260,11 @@ def _check_mask_file(folder: Path, entry: FileEntry, intact: bool, expected: Exp
     return [own, _library_check(path, entry, expected)] if fit else [own]
 
 
-def verify_order(folder: str | Path) -> VerificationReport:
+def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
     """Read a mask order back, with two readers, and compare every pixel with its level map.
 
     Args:
-        folder: a folder written by `write_order`.
+        order: the folder that `write_order` wrote, or what it returned.
 
     Returns:
         The checks; `VerificationReport.require` raises if any failed.
@@ -264,7 +273,7 @@ def verify_order(folder: str | Path) -> VerificationReport:
         InputError: the folder is not a mask order, or its manifest is corrupt.
         CheckFailed: no level map is left to compare with.
     """
-    folder = Path(folder)
+    folder = Path(order) if isinstance(order, str | Path) else order.folder
     manifest = read_manifest(folder)
     levels = manifest.staircase()
     edges = pixel_edges(manifest.grid())

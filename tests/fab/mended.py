@@ -8,7 +8,7 @@ from fab.files import sha256_file
 from fab.gds.reader import read_gds
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import FileEntry, Manifest, read_manifest
-from fab.verification.verify import verify_order
+from fab.verification.verify import verify
 
 
 def restate(folder: Path, change: Callable[[Manifest], Manifest]) -> None:
@@ -36,6 +36,6 @@ def mend(folder: Path, *files: str, cells: bool = False) -> None:
 
 def told(folder: Path, file: str) -> str:
     """What verify says of a file whose bytes are those of the manifest."""
-    problems = [d for d in verify_order(folder).differences if d.startswith(f"{file}:")]
+    problems = [d for d in verify(folder).differences if d.startswith(f"{file}:")]
     assert not any("bytes as in the manifest" in problem for problem in problems), problems
     return "\n".join(problems)

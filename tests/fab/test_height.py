@@ -14,30 +14,30 @@ COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
 
 def test_a_bare_array_is_metres_with_row_zero_lowest(tmp_path):
     np.save(tmp_path / "h.npy", HEIGHTS)
-    found = read_height(tmp_path / "h.npy", pitch_m=UM)
+    found = read_height(tmp_path / "h.npy", pitch=UM)
     assert np.array_equal(found.height_m, HEIGHTS)
     assert found.grid == Grid((3, 4), UM)
     assert found.aperture_m == 3 * UM
-    assert read_height(tmp_path / "h.npy", pitch_m=UM, aperture_m=2 * UM).aperture_m == 2 * UM
+    assert read_height(tmp_path / "h.npy", pitch=UM, aperture=2 * UM).aperture_m == 2 * UM
 
 
 def test_single_precision_stays_single(tmp_path):
     np.save(tmp_path / "h.npy", HEIGHTS.astype(np.float32))
-    assert read_height(tmp_path / "h.npy", pitch_m=UM).height_m.dtype == np.float32
+    assert read_height(tmp_path / "h.npy", pitch=UM).height_m.dtype == np.float32
     np.save(tmp_path / "h.npy", np.asfortranarray(HEIGHTS))
-    assert read_height(tmp_path / "h.npy", pitch_m=UM).height_m.flags.c_contiguous
+    assert read_height(tmp_path / "h.npy", pitch=UM).height_m.flags.c_contiguous
 
 
 def test_counts_are_scaled(tmp_path):
     np.save(tmp_path / "h.npy", COUNTS)
-    found = read_height(tmp_path / "h.npy", pitch_m=UM, scale_m=75 * NM)
+    found = read_height(tmp_path / "h.npy", pitch=UM, scale=75 * NM)
     assert np.array_equal(found.height_m, COUNTS * (75 * NM))
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_a_png_is_turned_so_that_its_top_is_plus_y(tmp_path, kind):
     Image.fromarray(COUNTS.astype(kind)).save(tmp_path / "h.png")
-    found = read_height(tmp_path / "h.png", pitch_m=UM, scale_m=NM)
+    found = read_height(tmp_path / "h.png", pitch=UM, scale=NM)
     assert np.array_equal(found.height_m, COUNTS[::-1] * NM)
 
 
@@ -45,7 +45,7 @@ def test_a_png_is_turned_so_that_its_top_is_plus_y(tmp_path, kind):
 @pytest.mark.parametrize("suffix", ["tif", "TIFF"])
 def test_a_tiff_of_floats_is_metres_and_turned(tmp_path, values, suffix):
     tifffile.imwrite(tmp_path / f"h.{suffix}", values)
-    found = read_height(tmp_path / f"h.{suffix}", pitch_m=UM)
+    found = read_height(tmp_path / f"h.{suffix}", pitch=UM)
     assert np.array_equal(found.height_m, values[::-1])
 
 
@@ -71,7 +71,7 @@ def test_a_tiff_of_counts_is_scaled(tmp_path):
 def test_bad_arrays_are_refused_by_file_rule_and_cure(tmp_path, values, message):
     np.save(tmp_path / "h.npy", values)
     with pytest.raises(InputError, match=f"h.npy: .*{message}"):
-        read_height(tmp_path / "h.npy", pitch_m=UM)
+        read_height(tmp_path / "h.npy", pitch=UM)
 
 
 @pytest.mark.parametrize("name", ["h.npy", "h.tif", "h.png"])
@@ -109,8 +109,11 @@ def test_other_kinds_and_colours_are_refused(tmp_path):
 
 def test_pitch_and_scale_are_asked_for(tmp_path):
     np.save(tmp_path / "h.npy", HEIGHTS)
-    with pytest.raises(InputError, match="--pitch-um"):
+    with pytest.raises(InputError, match="Give the pitch"):
         read_height(tmp_path / "h.npy")
+    assert read_height(tmp_path / "h.npy", "1.85 um", aperture="3 um").grid.pitch_m == 1.85e-6
+    with pytest.raises(InputError, match="pitch: must be metres or text with a unit"):
+        read_height(tmp_path / "h.npy", "1.85")
     with pytest.raises(InputError, match="scale must be positive"):
         read_height(tmp_path / "h.npy", UM, 0.0)
     with pytest.raises(InputError, match="pitch"):

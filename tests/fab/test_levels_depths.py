@@ -19,7 +19,7 @@ from fab.process import Process
 from fab.rules.check import Rules
 from fab.rules.repair import repair
 from fab.runsheet.recipe import depths_m
-from fab.verification.verify import verify_order
+from fab.verification.verify import verify
 from tests.fab.maps import level_map_from, wide_map
 
 NM = 1e-9
@@ -197,7 +197,7 @@ def order(tmp_path_factory):
 def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
     folder, levels, report = order
     assert report.passed
-    assert verify_order(folder).passed
+    assert verify(folder).passed
     manifest = read_manifest(folder)
     assert [mask.depth_nm for mask in manifest.masks] == [520.3, 160.1, 330.0]
     assert [mask.file.partition("_M")[2] for mask in manifest.masks] == [

@@ -18,7 +18,7 @@ from fab.solids.patch import Patch
 from fab.solids.step import step_bodies
 from fab.solids.write import PlateModel, write_models
 from fab.units import MM, NM, UM
-from fab.verification.verify import verify_order
+from fab.verification.verify import verify
 from tests.fab.maps import level_map_from
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
@@ -105,7 +105,7 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
     volume = heights.sum() * 1.85e-6**2 / MM**3
     assert found["PATCH.step"].volumes_mm3["PATCH"] == pytest.approx(volume, rel=1e-12)
     assert found["PATCH.glb"].volumes_mm3["RELIEF"] == pytest.approx(volume, rel=1e-12)
-    asked = [check.file for check in verify_order(patched).checks if "read back" in check.question]
+    asked = [check.file for check in verify(patched).checks if "read back" in check.question]
     assert set(asked) >= {entry.file for entry in found.values()}
 
 

@@ -16,7 +16,7 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from fab.verification.verify import read_drawn_levels, verify_order
+from fab.verification.verify import read_drawn_levels, verify
 from tests.fab.maps import wide_map
 
 
@@ -61,7 +61,7 @@ def test_an_edge_that_was_moved_otherwise_is_told_by_both_readers(compensated, t
     rects = doe.shapes[Layer(3)].rectangles.copy()
     rects[5, 2] += 1
     write_gds(folder / file, replace(layout, cells=(replace(doe, shapes={Layer(3): Shapes(rects)}), *around)))
-    told = {c.question: " ".join(c.problems) for c in verify_order(folder).checks if c.file == file}
+    told = {c.question: " ".join(c.problems) for c in verify(folder).checks if c.file == file}
     for question in ("own reader, every pixel", "gdstk, every pixel"):
         assert "layer 3/0: every edge must be a pixel edge moved by 200 nm" in told[question]
 

@@ -90,7 +90,7 @@ def test_a_patch_is_the_pixels_nearest_to_what_was_asked_for(patch, window):
 def test_a_patch_knows_what_is_too_large_for_its_files():
     level_map = level_map_from(np.indices((60, 60)).sum(axis=0) % 2)
     Patch(0.0, 0.0, 44 * UM).require(level_map)
-    with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2025 in 45 x 45 pixels.*--mesh-patch"):
+    with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2025 in 45 x 45 pixels.*take the mesh alone"):
         Patch(0.0, 0.0, 45 * UM).require(level_map)
     Patch(0.0, 0.0, 60 * UM, step=False).require(level_map)
     wide = level_map_from(np.zeros((1100, 1100)))

@@ -20,7 +20,7 @@ from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.manifest.records import Manifest, read_manifest
 from fab.verification.compare import Expected
 from fab.verification.shop_checks import drawing_problems
-from fab.verification.verify import verify_order
+from fab.verification.verify import verify
 from tests.fab.mended import mend, restate, told
 
 ALL, OASIS = "DOE_SMALL_ALL.gds", "DOE_SMALL_ALL.oas"
@@ -269,10 +269,10 @@ def test_a_wrong_unit_is_named(order_folder):
 
 def test_a_missing_mask_is_named(order_folder):
     (order_folder / M2).unlink()
-    assert f"{M2}: bytes as in the manifest: the file is missing" in verify_order(order_folder).differences
+    assert f"{M2}: bytes as in the manifest: the file is missing" in verify(order_folder).differences
     restate(order_folder, lambda m: replace(m, files=[e for e in m.files if e.file != M2]))
     with pytest.raises(InputError, match=rf"every file must be listed.*{M2}"):
-        verify_order(order_folder)
+        verify(order_folder)
 
 
 @pytest.mark.parametrize(

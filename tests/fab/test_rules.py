@@ -202,7 +202,7 @@ def test_empty_and_full_planes_break_nothing(fill):
 
 
 def test_an_ideal_process_is_broken_by_nothing_but_still_measured():
-    report = check(level_map_from(np.indices((6, 6)).sum(axis=0) % 2, TWO), Rules.of(Process(TWO)))
+    report = check(level_map_from(np.indices((6, 6)).sum(axis=0) % 2, TWO), Rules.from_process(Process(TWO)))
     assert report.clean
     assert report.planes[0].kissing == 25
     assert report.planes[0].line.smallest_m == 1e-6
@@ -221,7 +221,7 @@ def test_the_headline_says_what_cannot_be_printed():
     level_map = np.full((40, 40), 15, np.uint8)
     level_map[10:30, 10] = 14
     process = Process(SIXTEEN, minimum_line_m=2 * UM, minimum_space_m=2 * UM)
-    report = check(level_map_from(level_map, SIXTEEN, 1.85 * UM, 74 * UM), Rules.of(process))
+    report = check(level_map_from(level_map, SIXTEEN, 1.85 * UM, 74 * UM), Rules.from_process(process))
     assert report.headlines() == (
         "mask 1 (bit 0): 95 % of its lines are narrower than the 2 um that the process prints "
         "(down to 1.85 um, in 1 places, 1 of them slivers)",

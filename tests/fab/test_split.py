@@ -18,7 +18,7 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from fab.verification.verify import verify_order
+from fab.verification.verify import verify
 from tests.fab.maps import wide_map
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
@@ -103,7 +103,7 @@ def test_a_split_that_is_not_what_it_should_be_is_told_by_both_readers(split, tm
     shapes = cells[cell].shapes
     cells[cell] = replace(cells[cell], shapes={**shapes, Layer(3): Shapes(shapes[Layer(3)].rectangles[1:])})
     write_gds(folder / file, replace(layout, cells=tuple(cells.values())))
-    told = [line for line in verify_order(folder).differences if f"cell {cell}: layer 3/0" in line]
+    told = [line for line in verify(folder).differences if f"cell {cell}: layer 3/0" in line]
     assert any("own reader" in line and "polygons more or less" in line for line in told)
     assert any("gdstk" in line and "from the level map" in line for line in told)
 

@@ -12,7 +12,7 @@ from fab.grid import Grid
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.verification.verify import read_drawn_levels, verify_order
+from fab.verification.verify import read_drawn_levels, verify
 
 MASKS = [
     "DOE_SMALL_ALL.gds",
@@ -26,7 +26,7 @@ MASKS = [
 
 
 def problems_of(folder, file, question=""):
-    found = [c for c in verify_order(folder).checks if c.file == file and question in c.question]
+    found = [c for c in verify(folder).checks if c.file == file and question in c.question]
     return [problem for check in found for problem in check.problems]
 
 
@@ -44,7 +44,7 @@ def redraw(folder, file, change):
 
 
 def test_a_whole_order_passes_every_question(written_order):
-    report = verify_order(written_order)
+    report = verify(written_order)
     assert report.passed
     assert report.differences == ()
     report.require()
@@ -60,7 +60,7 @@ def test_a_whole_order_passes_every_question(written_order):
 def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
     path = order_folder / file
     flip(path, int(where * path.stat().st_size), 0x10)
-    report = verify_order(order_folder)
+    report = verify(order_folder)
     assert not report.passed
     assert all(difference.startswith(file) for difference in report.differences)
     with pytest.raises(CheckFailed, match=file):
@@ -75,7 +75,7 @@ def test_every_single_byte_of_a_mask_file_counts(order_folder):
     places = {*range(0, 700, 41), *np.linspace(700, len(whole) - 1, 20).astype(int).tolist()}
     for place in sorted(places):
         flip(path, place, 0x40)
-        assert any(MASKS[3] in difference for difference in verify_order(order_folder).differences)
+        assert any(MASKS[3] in difference for difference in verify(order_folder).differences)
         path.write_bytes(whole)
 
 
@@ -223,7 +223,7 @@ def test_missing_cut_and_unlisted_files_are_named(order_folder):
     (order_folder / MASKS[3]).unlink()
     (order_folder / MASKS[4]).write_bytes((order_folder / MASKS[4]).read_bytes()[:500])
     shutil.copy(order_folder / MASKS[5], order_folder / "EXTRA.GDS")
-    differences = verify_order(order_folder).differences
+    differences = verify(order_folder).differences
     assert f"{MASKS[3]}: bytes as in the manifest: the file is missing" in differences
     assert any(d.startswith(MASKS[4]) and "cannot be read" in d for d in differences)
     assert any(d.startswith("EXTRA.GDS") for d in differences)
@@ -231,36 +231,36 @@ def test_missing_cut_and_unlisted_files_are_named(order_folder):
 
 def test_a_damaged_level_map_does_not_put_the_blame_on_the_masks(order_folder):
     flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
-    assert {d.split(":")[0] for d in verify_order(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
+    assert {d.split(":")[0] for d in verify(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
     (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
-    assert {d.split(":")[0] for d in verify_order(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
+    assert {d.split(":")[0] for d in verify(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
 
 
 def test_without_any_level_map_there_is_nothing_to_compare_with(order_folder):
     (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
     (order_folder / MASKS[0]).write_bytes(b"ruin")
     with pytest.raises(CheckFailed, match=r"LEVELS\.npy"):
-        verify_order(order_folder)
+        verify(order_folder)
 
 
 def test_a_damaged_map_and_a_damaged_mask_are_both_told(order_folder):
     flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
     redraw(order_folder, MASKS[0], lambda s: {**s, Layer(1): Shapes(s[Layer(1)].rectangles[1:])})
-    files = {d.split(":")[0] for d in verify_order(order_folder).differences}
+    files = {d.split(":")[0] for d in verify(order_folder).differences}
     assert {"DOE_SMALL_LEVELS.npy", MASKS[0]} <= files
 
 
 def test_verifying_changes_nothing(order_folder):
     before = {path.name: sha256_file(path) for path in order_folder.iterdir()}
-    verify_order(order_folder)
+    verify(order_folder)
     assert {path.name: sha256_file(path) for path in order_folder.iterdir()} == before
 
 
 def test_what_is_no_order_is_refused(tmp_path):
     with pytest.raises(InputError, match="must exist"):
-        verify_order(tmp_path)
+        verify(tmp_path)
     with pytest.raises(InputError, match="must exist"):
-        verify_order(tmp_path / "missing")
+        verify(tmp_path / "missing")
 
 
 def test_a_level_map_is_rebuilt_only_from_separate_pixels(tmp_path):
