@@ -1,33 +1,37 @@
-"""Design of diffractive optical elements: from a spec to a plate that can be ordered, and what it will do.
+"""Design of diffractive optical elements, from a spec to a plate that can be ordered, and its light predicted.
 
-Reading order, from the user's words to the result:
+    import doedesign as dd
 
-    spec            a TOML spec as frozen tables, its rules, its words for every mistake, its digest
-    build           a spec's camera, levels and process, as values the physics works on
-    drawing         what is to be drawn: level maps of runs, mask files, maps of the user's own
-    parametrize     free parameters -> heights the process can make
-    starts          baseline designs by name: flat, random, fresnel, ring
-    patterns        target images: spots, areas, pictures
-    objectives      what a design is judged by
-    problem         spec -> loss of one step, ready to differentiate
-    compiling       steps that take little memory
-    optimize        the loop
-    evaluate        the table of numbers every design gets
-    predict         what a drawn design will do once it is made
-    tolerance       what a process that strays makes of a design, and how far it may stray
-    calibrate       the process errors that explain measured PSFs
-    images          pictures of a folder as scenes
-    capture         a spec's obstruction, sensor and colours
-    simulated       one scene through a plate onto a sensor; capturefiles writes it
-    recon           the reconstruction network and its training, with the plate or alone
-    runs            run folders: manifest, checkpoint, resume
+    spec = dd.load_spec("examples/quick.toml", steps=60)
+    design = dd.optimize(spec)
+    design.level_map, design.height_m, design.camera
+
+Public names are listed in `__init__.pyi` and loaded when they are used. The rooms behind them, from the user's words to
+the result:
+
+    spec            a TOML spec as frozen tables, its rules, its messages, its digest
+    build           spec -> values: camera, levels, process, wafer
+    design          parameters, objectives and optimisation of a height map; `Design`, which carries the result
+    optimization    `optimize`: a spec becomes a design, in memory or in a run folder
+    runs            designs on the disk
+    prediction      PSFs and figures of merit of a design as fabricated
+    lab             predictions for a run sheet, and plates as measured
+    tolerancing     yield, sensitivities and error budgets of a process
+    calibration     the process errors that explain measured PSFs
+    capture         scenes photographed through a plate
+    recon           the reconstruction network
+    training        its training, with the plate or alone
     report          pictures
-    commands        the work behind each command
-    progress, cli   how the user sees it
+    runtime         progress, signals, compilation
+    commands, cli   the command line
 
 Conventions (the whole list is in README.md): a spec's lengths are text with a unit in TOML (`pitch = "1.85 um"`)
-and SI numbers with the unit in the name everywhere else (`pitch_m`). Importing this package imports nothing
-heavy; a module that needs jax says so by being imported where it is used.
+and SI numbers with the unit in the name everywhere else (`pitch_m`). Functions take lengths as SI numbers or as text with
+a unit. Importing this package imports nothing heavy.
 """
 
+import lazy_loader
+
 __version__ = "0.1.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.commands.masks import write_masks
-from doedesign.commands.optimize import optimize
 from doedesign.commands.psf import psf
 from doedesign.design.design import Design
+from doedesign.optimization import optimize
 from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json

@@ -51,7 +51,7 @@ from explain_plates import (
 )
 
 from doedesign.cli import exit_code
-from doedesign.commands.optimize import optimize
+from doedesign.optimization import optimize
 from doedesign.report.canvas import length_text
 from doedesign.runs.folder import Run, open_run
 from fab.files import canonical_json, write_atomic

@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.commands.optimize import optimize
+from doedesign.optimization import optimize
 from doedesign.report.pictures import draw_budget
 from doedesign.tolerancing import Budget, study
 from fab.units import format_length

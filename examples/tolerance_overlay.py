@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.commands.optimize import optimize
+from doedesign.optimization import optimize
 from doedesign.report.pictures import draw_changes, draw_histograms
 from doedesign.tolerancing import Change, Plates, Study, study
 

@@ -35,8 +35,8 @@ from doedesign.capture.images import PICTURE_FILES, Pictures, picture_files, sam
 from doedesign.capture.scenes import SceneData
 from doedesign.capture.simulate import captured, within
 from doedesign.cli import exit_code
-from doedesign.commands.optimize import optimize
 from doedesign.commands.train import TrainingSettings, train
+from doedesign.optimization import optimize
 from doedesign.recon.model import open_model
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec

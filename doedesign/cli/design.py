@@ -16,7 +16,7 @@ def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
     """
-    from doedesign.commands.optimize import optimize as work
+    from doedesign.optimization import optimize as work
     from doedesign.spec import load_spec
 
     folder = out or Path("runs") / load_spec(spec, set_).name

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import doedesign.commands.optimize
+import doedesign.optimization
 from doedesign.cli import main
 from fab.files import write_atomic
 
@@ -23,9 +23,9 @@ def finished_run(folder: Path, spec: str) -> Path:
     """Optimise a spec into FOLDER/run without its pictures, which are looked at elsewhere."""
     (folder / "small.toml").write_text(spec)
     with pytest.MonkeyPatch.context() as patch:
-        for name in dir(doedesign.commands.optimize):
+        for name in dir(doedesign.optimization):
             if name.startswith("draw_"):
-                patch.setattr(doedesign.commands.optimize, name, lambda path, *_: write_atomic(path, b"picture"))
+                patch.setattr(doedesign.optimization, name, lambda path, *_: write_atomic(path, b"picture"))
         code, _, said = call("optimize", folder / "small.toml", "--out", folder / "run")
     assert code == 0, said
     return folder / "run"

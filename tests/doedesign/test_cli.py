@@ -113,7 +113,7 @@ def test_json_is_one_line(plate: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_warnings_go_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("doedesign.commands.optimize.problem_of", failing_problem)
+    monkeypatch.setattr("doedesign.optimization.problem_of", failing_problem)
     assert (
         main(
             [

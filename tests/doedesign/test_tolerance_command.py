@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import doedesign.commands.optimize
 import doedesign.commands.tolerance
+import doedesign.optimization
 from doedesign.spec import load_variation
 from doedesign.tolerancing import study
 from fab.files import sha256_file, write_atomic

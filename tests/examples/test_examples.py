@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-import doedesign.commands.optimize
 import doedesign.commands.psf
+import doedesign.optimization
 from doedesign.cli import main
 from doedesign.spec import load_spec, spec_warnings
 from fab.files import write_atomic
@@ -104,7 +104,7 @@ def test_demo_twice(demo: ModuleType, small: Path, tmp_path: Path):
 def test_demo_takes_no_other_order_for_its_own(
     demo: ModuleType, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    for module in (doedesign.commands.optimize, doedesign.commands.psf):
+    for module in (doedesign.optimization, doedesign.commands.psf):
         for name in dir(module):
             if name.startswith("draw_"):  # pictures take most of the time
                 monkeypatch.setattr(module, name, lambda path, *_, **__: write_atomic(path, b"picture"))

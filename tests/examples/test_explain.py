@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-import doedesign.commands.optimize
+import doedesign.optimization
 from fab.files import write_atomic
 
 pytestmark = pytest.mark.slow
@@ -36,9 +36,9 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Example]:
         import explain_1to1  # pyright: ignore[reportMissingImports]
         import explain_plates  # pyright: ignore[reportMissingImports]
 
-        for name in dir(doedesign.commands.optimize):
+        for name in dir(doedesign.optimization):
             if name.startswith("draw_"):  # pictures of the run take longer than the run
-                patch.setattr(doedesign.commands.optimize, name, lambda path, *_, **__: write_atomic(path, b"picture"))
+                patch.setattr(doedesign.optimization, name, lambda path, *_, **__: write_atomic(path, b"picture"))
         # Each of these compiles a program of its own for seconds; tests/sim looks at what they do.
         slow = ("rounded corners", "tilted walls", "etch lag", "roughness")
         quick = [plate for plate in explain_plates.singles() if plate.error not in slow]

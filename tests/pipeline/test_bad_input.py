@@ -231,7 +231,7 @@ def test_manifest_of_a_run_with_a_hole(copied, tiny, cli, key):
 
 
 def test_unfinished_run(tiny, cli, tmp_path, monkeypatch):
-    monkeypatch.setattr("doedesign.commands.optimize.write_history", lambda *_: main(["nonsense"]) and 1 / 0)
+    monkeypatch.setattr("doedesign.optimization.write_history", lambda *_: main(["nonsense"]) and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli("optimize", tiny, "--out", tmp_path / "run")
     refuse(cli("masks", tmp_path / "run"), tmp_path / "run", "unfinished", "Resume")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-import doedesign.commands.optimize
+import doedesign.optimization
 from doedesign.runs.folder import open_run
 from doedesign.runs.level_maps import level_map_of_run, open_design
 from fab.layout.geometry import pixel_edges
@@ -100,14 +100,14 @@ def test_light_and_tolerances_are_those_of_the_chosen_depths(chosen, cli, tmp_pa
 
 def test_a_stopped_run_chooses_the_same(tiny, cli, chosen, content, tmp_path, monkeypatch):
     run = tmp_path / "run"
-    save, stops = doedesign.commands.optimize.save_checkpoint, iter([10])
+    save, stops = doedesign.optimization.save_checkpoint, iter([10])
 
     def save_and_stop(a_run, arrays, step, history):
         save(a_run, arrays, step, history)
         if step == next(stops, None):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(doedesign.commands.optimize, "save_checkpoint", save_and_stop)
+    monkeypatch.setattr(doedesign.optimization, "save_checkpoint", save_and_stop)
     every = ("--set", "optimize.checkpoint_every=10")
     assert cli("optimize", tiny, "--out", run, *CHOSEN, *every).code == 130
     done = cli("optimize", tiny, "--out", run, *CHOSEN, *every)

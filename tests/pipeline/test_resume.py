@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import doedesign.commands.optimize
+import doedesign.optimization
 import doedesign.runs.folder
 from doedesign.runs.folder import alone_in
 
@@ -70,11 +70,11 @@ def finished_files(finished, content):
     ("module", "name"),
     [
         (doedesign.runs.folder, "spec_to_toml"),  # between the manifest and the spec
-        (doedesign.commands.optimize, "steps"),  # before the first step
-        (doedesign.commands.optimize, "save_checkpoint"),  # before the first checkpoint
-        (doedesign.commands.optimize, "write_history"),  # between the height maps and the rest
-        (doedesign.commands.optimize, "draw_encircled"),  # among the pictures
-        (doedesign.commands.optimize, "finish_run"),  # when all is written and nothing is said to be done
+        (doedesign.optimization, "steps"),  # before the first step
+        (doedesign.optimization, "save_checkpoint"),  # before the first checkpoint
+        (doedesign.optimization, "write_history"),  # between the height maps and the rest
+        (doedesign.optimization, "draw_encircled"),  # among the pictures
+        (doedesign.optimization, "finish_run"),  # when all is written and nothing is said to be done
     ],
 )
 def test_stopped_in_between(tiny, cli, content, finished_files, tmp_path, monkeypatch, module, name):
@@ -138,7 +138,7 @@ def test_the_last_call_tells_how_the_spec_came_about(tiny, cli, content, tmp_pat
     spec, run = tmp_path / "edited.toml", tmp_path / "run"
     spec.write_text(tiny.read_text().replace("steps = 6", "steps = 4"))
     with monkeypatch.context() as patch:
-        patch.setattr(doedesign.commands.optimize, "finish_run", lambda *_: 1 / 0)
+        patch.setattr(doedesign.optimization, "finish_run", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             cli("optimize", tiny, "--out", run, "--set", "optimize.steps=4")
     assert cli("optimize", spec, "--out", run).code == 0
