@@ -25,9 +25,8 @@ the result:
     runtime         progress, signals, compilation
     commands, cli   the command line
 
-Conventions (the whole list is in README.md): a spec's lengths are text with a unit in TOML (`pitch = "1.85 um"`)
-and SI numbers with the unit in the name everywhere else (`pitch_m`). Functions take lengths as SI numbers or as text with
-a unit. Importing this package imports nothing heavy.
+Conventions (see README.md): in specs a length is text with a unit (`pitch = "1.85 um"`), everywhere else an SI number
+with the unit in its name (`pitch_m`); functions take either. Importing this package imports nothing heavy.
 """
 
 import lazy_loader
