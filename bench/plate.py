@@ -20,7 +20,7 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.design.design import Design
 from doedesign.prediction import predict
 from doedesign.spec import load_spec
-from doedesign.tolerancing.pool import Work, evaluate_here, predicted_rows
+from doedesign.tolerancing.pool import DrawModel, evaluate_here, predicted_rows
 from fab.level_map import LevelMap
 from fab.levels import Levels, height_of, quantise
 from fab.process import Process
@@ -73,7 +73,7 @@ def seconds_of(design: Design, process: Process, count: int, workers: int) -> fl
     side = max(design.camera.grid.extent_m)
     plates = {f"normal/{i}": normal_draw(process, 0, i, side) for i in range(count + 2 * workers)}
     begun = 0.0
-    for done, _ in enumerate(evaluate_here(Work(predicted_rows, design, process), plates, workers), 1):
+    for done, _ in enumerate(evaluate_here(DrawModel(predicted_rows, design, process), plates, workers), 1):
         if done == 2 * workers:
             begun = time.perf_counter()
     return time.perf_counter() - begun

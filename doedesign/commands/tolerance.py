@@ -20,7 +20,7 @@ from doedesign.runs.folder import open_run
 from doedesign.spec import variation_to_toml
 from doedesign.tolerancing.analysis import QUANTITIES, limit_text, obeys, yield_of
 from doedesign.tolerancing.budget import Budget
-from doedesign.tolerancing.pool import OutOfModel, Work, evaluate_here, predicted_bank
+from doedesign.tolerancing.pool import DrawModel, OutOfModel, evaluate_here, predicted_bank
 from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
 from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
@@ -249,8 +249,8 @@ def _draw(folder: Path, asked: Study, found: StudyFindings) -> list[str]:
         names.append("budget.png")
     shown = {NOMINAL: "nominal_psf.png", plates.worst: "worst_psf.png"}
     # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
-    work = Work(predicted_bank, design, asked.process)
-    for key, bank in evaluate_here(work, {key: asked.variation(key) for key in shown}, 1):
+    model = DrawModel(predicted_bank, design, asked.process)
+    for key, bank in evaluate_here(model, {key: asked.variation(key) for key in shown}, 1):
         draw_psfs(folder / shown[key], design.camera, bank, design.near_m, design.far_m)
         names.append(shown[key])
     return names

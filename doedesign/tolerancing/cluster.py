@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from doedesign import __version__
-from doedesign.tolerancing.pool import Work, WorkerTask, evaluated, named, opened, packed, single_thread_settings
+from doedesign.tolerancing.pool import DrawModel, named, single_thread_settings
 from fab.errors import InputError
 from fab.process import Variation
 
@@ -28,13 +28,13 @@ _KEPT = "Finished draws are kept."
 
 
 def evaluate_there(
-    work: Work, plates: Mapping[str, Variation], address: str, say: Callable[[str], None] = lambda _: None
+    model: DrawModel, draws: Mapping[str, Variation], address: str, say: Callable[[str], None] = lambda _: None
 ) -> Iterator[tuple[str, Any]]:
     """Evaluate plates by the workers of a Dask cluster.
 
     Args:
-        work: how, and of what design and process.
-        plates: variations by key.
+        model: how, and of what design and process.
+        draws: variations by key.
         address: of the scheduler, such as "tcp://10.0.0.1:8786".
         say: told when there is nobody to work.
 
@@ -46,13 +46,12 @@ def evaluate_there(
             plate that ended its worker again and again.
     """
     finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
-    parcel = packed(work)
     with _client(address) as client:
         # A task, and no scattered value: whoever holds it may be lost.
-        held = client.submit(_held, parcel, key=f"doedesign-{parcel.token}", pure=False)
+        held = client.submit(_held, model, key=f"doedesign-{model.token}", pure=False)
         waiting: dict[Future, str] = {}
-        for key, variation in plates.items():
-            name = f"doedesign-plate-{parcel.token}-{key}"
+        for key, variation in draws.items():
+            name = f"doedesign-draw-{model.token}-{key}"
             future = client.submit(_evaluate, held, variation, __version__, key=name, pure=False)
             waiting[future] = key
             future.add_done_callback(finished.put)
@@ -134,14 +133,14 @@ def _lost(address: str) -> InputError:
 # What follows runs in a worker.
 
 
-def _held(parcel: WorkerTask) -> WorkerTask:
-    return parcel
+def _held(model: DrawModel) -> DrawModel:
+    return model
 
 
-def _evaluate(parcel: WorkerTask, variation: Variation, version: str) -> Any:
+def _evaluate(model: DrawModel, variation: Variation, version: str) -> Any:
     if version != __version__:
         cure = "Install the same version everywhere."
         raise InputError("worker", f"must have doedesign {version}", __version__, cure)
     if "jax" not in sys.modules:
         os.environ.update(single_thread_settings())
-    return evaluated(opened(parcel), variation)
+    return model(variation)

@@ -1,30 +1,25 @@
-"""Plates evaluated on all cores of this machine, by worker processes that are each single-threaded.
+"""Draws evaluated on all cores of this machine, by worker processes of loky that compute with one thread each.
 
-A plate's numbers must not depend on how many workers there are or which one is free, so every worker computes with one
-thread, alone or not. A worker that dies (no memory left, say) takes nothing with it: the pool starts again, and the
-plates that were under way are tried once more one by one, so that a plate that kills its worker is found and named.
+A draw's numbers must not depend on how many workers there are or which one is free, so every worker computes with one
+thread, alone or not. loky starts the workers, hands them their draws and keeps them a while for the next question. A
+worker that dies (no memory left, say) takes nothing with it: the draws that were under way are tried once more one by
+one by new workers, so that a draw that kills its worker is found and named.
 """
 
 import atexit
-import multiprocessing
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import threading
+import time
 import uuid
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field
 from functools import cache
-from importlib import import_module
-from multiprocessing.connection import Connection
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fab.errors import InputError
@@ -36,38 +31,17 @@ if TYPE_CHECKING:
 
 Rows = list[dict[str, Any]]
 Evaluate = Callable[["Design", Process, Variation], Any]
-"""What is asked of a plate; a study asks for `Rows`."""
+"""What is asked of a draw; a study asks for `Rows`."""
 
 _STRIKES = 3
 _GIB = 2**30
 # Measured: an idle worker with its libraries, and what a prediction holds per DOE cell at its peak.
 _BASE_GIB, _BYTES_PER_CELL = 0.7, 350
-
-
-class Work(NamedTuple):
-    """What every worker holds: how plates are evaluated, and of what."""
-
-    evaluate: Evaluate
-    design: "Design"
-    process: Process
-
-
-def predicted_rows(design: "Design", process: Process, variation: Variation) -> Rows:
-    """What light does with one plate, one row per colour and depth (`doedesign.prediction`)."""
-    from doedesign.prediction import predict
-
-    return predict(design, process, variation).rows
-
-
-def predicted_bank(design: "Design", process: Process, variation: Variation) -> "PsfBank":
-    """The PSFs of one plate."""
-    from doedesign.prediction import predict
-
-    return predict(design, process, variation).bank
+_IDLE_S = 30  # after which a worker without work ends
 
 
 class OutOfModel(NamedTuple):
-    """What is found of a plate whose errors are larger than the evaluation can describe.
+    """Result of a draw whose errors are larger than the evaluation can describe.
 
     Attributes:
         reason: which of them, in a sentence.
@@ -76,67 +50,42 @@ class OutOfModel(NamedTuple):
     reason: str
 
 
-def evaluated(work: Work, variation: Variation) -> Any:
-    """What is found of one plate; `OutOfModel` where the evaluation raises `InputError`."""
-    try:
-        return work.evaluate(work.design, work.process, variation)
-    except InputError as error:
-        return OutOfModel(f"{error.where}: {error.rule}, but got {error.got}")
-
-
-class WorkerTask(NamedTuple):
-    """Work on its way to a worker: values, and the names of what is to be imported once threads are limited.
+@dataclass(frozen=True, eq=False)
+class DrawModel:
+    """Model of a study: how a draw is evaluated, of which design and process. It is sent to workers.
 
     Attributes:
-        token: tells one piece of work from another.
-        evaluate: "module:function".
-        design: "module:class".
-        fields: what the design is made of.
+        evaluate: what is asked of every draw.
+        design: the design.
         process: the process.
+        token: tells one model from another where copies of it arrive.
     """
 
-    token: str
-    evaluate: str
-    design: str
-    fields: dict[str, Any]
+    evaluate: Evaluate
+    design: "Design"
     process: Process
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    def __call__(self, variation: Variation) -> Any:
+        """Evaluate one draw; `OutOfModel` where the evaluation raises `InputError`."""
+        try:
+            return self.evaluate(self.design, self.process, variation)
+        except InputError as error:
+            return OutOfModel(f"{error.where}: {error.rule}, but got {error.got}")
 
 
-def path_of(thing: Callable[..., Any]) -> str:
-    """Where a function or class is found, "module:name"."""
-    return f"{thing.__module__}:{thing.__qualname__}"
+def predicted_rows(design: "Design", process: Process, variation: Variation) -> Rows:
+    """Metrics of one draw, a row per colour and depth (`doedesign.prediction`)."""
+    from doedesign.prediction import predict
+
+    return predict(design, process, variation).rows
 
 
-def packed(work: Work) -> WorkerTask:
-    """Work as it is sent to a worker.
+def predicted_bank(design: "Design", process: Process, variation: Variation) -> "PsfBank":
+    """PSFs of one draw."""
+    from doedesign.prediction import predict
 
-    Raises:
-        InputError: a function that a worker cannot import.
-    """
-    if "<" in path_of(work.evaluate):
-        rule = "must be a function at the top of a module, for workers import it"
-        raise InputError("evaluate", rule, path_of(work.evaluate), "Move it there.")
-    # A read-only mapping cannot be sent.
-    process = replace(work.process, spreads=dict(work.process.spreads))
-    design = work.design
-    return WorkerTask(uuid.uuid4().hex, path_of(work.evaluate), path_of(type(design)), dict(vars(design)), process)
-
-
-_OPENED: dict[str, Work] = {}
-
-
-def opened(parcel: WorkerTask) -> Work:
-    """The work in a parcel; kept, so that a worker opens it once."""
-    if parcel.token not in _OPENED:
-        work = Work(_found(parcel.evaluate), _found(parcel.design)(**parcel.fields), parcel.process)
-        _OPENED.clear()
-        _OPENED[parcel.token] = work
-    return _OPENED[parcel.token]
-
-
-def _found(path: str) -> Any:
-    module, _, name = path.partition(":")
-    return attrgetter(name)(import_module(module))
+    return predict(design, process, variation).bank
 
 
 def single_thread_settings() -> dict[str, str]:
@@ -170,26 +119,26 @@ def _free_gib() -> float:
         return float("inf")
 
 
-def evaluate_here(work: Work, plates: Mapping[str, Variation], workers: int) -> Iterator[tuple[str, Any]]:
-    """Evaluate plates by worker processes on this machine.
+def evaluate_here(model: DrawModel, draws: Mapping[str, Variation], workers: int) -> Iterator[tuple[str, Any]]:
+    """Evaluate draws by worker processes on this machine.
 
     Args:
-        work: how, and of what design and process.
-        plates: variations by key.
+        model: how, and of what design and process.
+        draws: variations by key.
         workers: number of processes.
 
     Yields:
-        key and what was found of every plate, as they are finished.
+        key and result of every draw, as they are finished.
 
     Raises:
-        InputError: a plate that ended its worker three times, or a function that a worker cannot import.
+        InputError: a draw that ended its worker three times.
     """
     strikes: Counter[str] = Counter()
-    fresh, suspects = deque(plates), deque[str]()
+    fresh, suspects = deque(draws), deque[str]()
     while fresh or suspects:
-        alone = not fresh
-        queue, count = (suspects, 1) if alone else (fresh, workers)
-        lost = yield from _until_broken(work, plates, queue, min(count, len(queue)), alone)
+        # One more than can be computed keeps every worker busy; alone, the one under way must be the one to blame.
+        queue, count, ahead = (fresh, min(workers, len(fresh)), workers + 1) if fresh else (suspects, 1, 1)
+        lost = yield from _until_broken(model, draws, queue, count, ahead)
         strikes.update(lost)
         for key in lost:
             if strikes[key] >= _STRIKES:
@@ -200,33 +149,38 @@ def evaluate_here(work: Work, plates: Mapping[str, Variation], workers: int) -> 
 
 
 def _until_broken(
-    work: Work, plates: Mapping[str, Variation], queue: deque[str], workers: int, alone: bool
+    model: DrawModel, draws: Mapping[str, Variation], queue: deque[str], workers: int, ahead: int
 ) -> Generator[tuple[str, Any], None, list[str]]:
-    """Evaluate a queue until it is empty or a worker dies; returns the plates that were under way then."""
+    """Evaluate a queue until it is empty or a worker dies; returns the draws that were under way then."""
+    from loky import get_reusable_executor
+    from loky.process_executor import TerminatedWorkerError
+
+    # Idle workers are taken again if they were started with the same arguments.
+    started = {"env": _worker_settings(), "initializer": _begin, "initargs": (os.getpid(), tuple(sys.path))}
+    executor = get_reusable_executor(workers, timeout=_IDLE_S, **started)
     flying: dict[Future[Any], str] = {}
-    # One more than can be computed keeps every worker busy; alone, the one under way must be the one to blame.
-    ahead = 1 if alone else workers + 1
-    with _pool(work, workers) as pool:
-        try:
-            while queue or flying:
-                while queue and len(flying) < ahead:
-                    flying[_submitted(pool, work, plates[queue[0]])] = queue[0]
-                    queue.popleft()
-                done = wait(flying, return_when=FIRST_COMPLETED).done
-                for future in [one for one in flying if one in done]:  # in the order in which they were handed over
-                    yield flying[future], named(flying[future], future.result)
-                    del flying[future]
-        except BrokenProcessPool:
-            # What was finished just before counts.
-            for future, key in flying.items():
-                if future.done() and not future.cancelled() and future.exception() is None:
-                    yield key, future.result()
-            return [k for f, k in flying.items() if not f.done() or f.cancelled() or f.exception() is not None]
+    try:
+        while queue or flying:
+            while queue and len(flying) < ahead:
+                flying[executor.submit(_evaluate, model, draws[queue[0]])] = queue[0]
+                queue.popleft()
+            done = wait(flying, return_when=FIRST_COMPLETED).done
+            for future in [one for one in flying if one in done]:  # in the order in which they were handed over
+                yield flying[future], named(flying[future], future.result)
+                del flying[future]
+    except TerminatedWorkerError:
+        # What was finished just before counts.
+        lost = [future for future in flying if not future.done() or future.cancelled() or future.exception()]
+        yield from ((key, future.result()) for future, key in flying.items() if future not in lost)
+        return [flying[future] for future in lost]
+    except BaseException:
+        executor.shutdown(kill_workers=True)  # nobody waits for what is under way
+        raise
     return []
 
 
 def named(key: str, result: Callable[[], Any]) -> Any:
-    """What was found of a plate; an error says which plate it was."""
+    """The result of a draw; an error says which draw it was."""
     try:
         return result()
     except InputError:
@@ -236,85 +190,41 @@ def named(key: str, result: Callable[[], Any]) -> Any:
         raise
 
 
-@contextmanager
-def _pool(work: Work, workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that end when the body ends, at once if it raises, and also if this process is killed."""
-    context = multiprocessing.get_context("spawn")
-    # Nothing is ever sent: the other end tells that it was closed, which the system does for a process that is killed.
-    theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(packed(work), theirs))
-    try:
-        yield pool
-        pool.shutdown()
-    finally:
-        ours.close()
-        pool.shutdown(cancel_futures=True)
-        theirs.close()
-
-
-def _submitted(pool: ProcessPoolExecutor, work: Work, variation: Variation) -> "Future[Any]":
-    # Workers start while their first plates are handed over.
-    with _sheltered_start(work):
-        return pool.submit(_evaluate, variation)
-
-
 @cache
-def _compiled() -> str:
-    """A folder in which workers find what others have compiled, as long as this process lives."""
-    folder = tempfile.mkdtemp(prefix="doedesign-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-@contextmanager
-def _sheltered_start(work: Work) -> Iterator[None]:
-    """Start processes in the body with one thread each, deaf to Ctrl-C, and without the user's script.
-
-    A worker would otherwise run the script that asked for it once more, to find functions that are defined there.
-    Ctrl-C is for this process, which ends its workers.
-    """
-    settings = single_thread_settings()
+def _worker_settings() -> dict[str, str]:
+    """Environment of workers, with a folder for what they have compiled, as long as this process lives."""
+    # loky would end workers that grow, as they do from draw to draw by what they compile.
+    settings = {**single_thread_settings(), "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        # A worker compiles for eight seconds at its first plate; its successors need not.
-        settings |= {"JAX_COMPILATION_CACHE_DIR": _compiled(), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    before = {name: os.environ.get(name) for name in settings}
-    main = vars(sys.modules["__main__"])
-    told = {name: main[name] for name in ("__file__", "__spec__") if name in main}
-    hidden = work.evaluate.__module__ != "__main__"
-    deaf_before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        os.environ.update(settings)
-        if hidden:
-            main.pop("__file__", None)
-            main["__spec__"] = None
-        yield
-    finally:
-        main.update(told)
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, deaf_before)
+        # A worker compiles for eight seconds at its first draw; its successors need not.
+        folder = tempfile.mkdtemp(prefix="doedesign-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        settings |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    return settings
 
 
 # What follows runs in a worker.
 
-_HELD: list[WorkerTask] = []
+_MODELS: dict[str, DrawModel] = {}
 
 
-def _begin(parcel: WorkerTask, parent: Connection) -> None:
+def _begin(parent: int, path: tuple[str, ...]) -> None:
+    sys.path[:] = path
     # What another worker is just writing cannot be read; it is then compiled here, too.
     warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
-    _HELD.append(parcel)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
-def _end_with(parent: Connection) -> None:
-    with suppress(EOFError, OSError):
-        parent.recv_bytes()  # returns when the other end is closed
+def _end_with(parent: int) -> None:
+    """End this process when the one that started it is gone: loky's workers would wait for ever."""
+    while os.getppid() == parent:
+        time.sleep(1)
     os._exit(1)
 
 
-def _evaluate(variation: Variation) -> Any:
-    return evaluated(opened(_HELD[0]), variation)
+def _evaluate(model: DrawModel, variation: Variation) -> Any:
+    # The first copy stands for all that follow it, for predictions know a level map by its identity.
+    if model.token not in _MODELS:
+        _MODELS.clear()
+        _MODELS[model.token] = model
+    return _MODELS[model.token](variation)

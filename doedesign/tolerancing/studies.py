@@ -27,13 +27,12 @@ from doedesign.tolerancing.budget import FACTORS, Budget, budget_of
 from doedesign.tolerancing.cluster import evaluate_there
 from doedesign.tolerancing.journal import Journal
 from doedesign.tolerancing.pool import (
+    DrawModel,
     Evaluate,
     OutOfModel,
     Rows,
-    Work,
     default_workers,
     evaluate_here,
-    path_of,
     predicted_rows,
 )
 from doedesign.tolerancing.sensitivity import Change, Share, one_at_a_time, sobol
@@ -58,6 +57,8 @@ if TYPE_CHECKING:
     from doedesign.design.design import Design
 
 FORMAT = "doedesign tolerance 1"
+# Folders of studies know the prediction by the module in which it once was.
+_EARLIER = {"doedesign.tolerancing.pool:predicted_rows": "doedesign.tolerance.pool:predicted_rows"}
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class Study:
     seed: int
     journal: Journal
     evaluate: Evaluate
-    run: Callable[[Work, Mapping[str, Variation]], Iterator[tuple[str, Rows]]]
+    run: Callable[[DrawModel, Mapping[str, Variation]], Iterator[tuple[str, Rows]]]
     quiet: bool = False
 
     @property
@@ -181,8 +182,8 @@ class Study:
             return
         done = total - len(plates)
         progress = nullcontext() if self.quiet else meter("plates", total, done)
-        work = Work(self.evaluate, self.design, self.process)
-        with progress as shown, closing(self.run(work, plates)) as finished:  # pyright: ignore[reportArgumentType]
+        model = DrawModel(self.evaluate, self.design, self.process)
+        with progress as shown, closing(self.run(model, plates)) as finished:  # pyright: ignore[reportArgumentType]
             for count, (key, found) in enumerate(finished):
                 if count == 0 and not isinstance(found, OutOfModel):
                     # A limit that speaks of none of the plates' rows is told now, and not after all of them.
@@ -315,6 +316,9 @@ def study(
     obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in limits or ())
     if limits is None and spec is not None:
         obeyed = spec.limits
+    if out is not None and "<" in evaluate.__qualname__:
+        rule = "must be a function at the top of a module, for a study on disk is known by its name"
+        raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
     journal = Journal(None if out is None else Path(out), identity(chosen, made, seed, evaluate))
     return Study(
         chosen.bare(), made, obeyed, seed, journal, evaluate, _runner(chosen, workers, scheduler, quiet), quiet
@@ -368,10 +372,10 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, quiet:
             cure = "Leave --workers out; workers are started where the cluster is."
             raise InputError("--workers", "a cluster brings its own workers", workers, cure)
         say = (lambda _: None) if quiet else (lambda text: print(text, file=sys.stderr, flush=True))
-        return lambda work, plates: evaluate_there(work, plates, scheduler, say)
+        return lambda model, draws: evaluate_there(model, draws, scheduler, say)
     ny, nx = design.level_map.level.shape
     count = default_workers(ny * nx) if workers is None else _at_least(1, "--workers", workers)
-    return lambda work, plates: evaluate_here(work, plates, count)
+    return lambda model, draws: evaluate_here(model, draws, count)
 
 
 def _at_least(least: int, name: str, value: int) -> int:
@@ -393,6 +397,7 @@ def identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) 
     """
     ny, nx = design.level_map.level.shape
     spreads: Mapping[str, Normal] = process.spreads
+    name = f"{evaluate.__module__}:{evaluate.__qualname__}"
     return {
         "format": FORMAT,
         "version": __version__,
@@ -413,5 +418,5 @@ def identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) 
             "wafer_radius_m": process.wafer_radius_m,
         },
         "seed": seed,
-        "evaluate": path_of(evaluate),
+        "evaluate": _EARLIER.get(name, name),
     }

@@ -14,7 +14,7 @@ from doedesign.spec import LimitSpec
 from doedesign.tolerancing import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
 from doedesign.tolerancing.analysis import good_plates, obeys, statistics, table_of, worst_plate, yield_of
 from doedesign.tolerancing.budget import budget_of
-from doedesign.tolerancing.pool import OutOfModel, Rows, Work
+from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
 from fab.errors import InputError
 from fab.process import Normal, Process, Variation
 
@@ -26,10 +26,10 @@ def fakes():
         yield import_module("tolerance_fakes")
 
 
-def one_after_another(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
+def one_after_another(model: DrawModel, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
     """Evaluate in this process; how plates are handed to workers is tested elsewhere."""
     for key, variation in plates.items():
-        yield key, work.evaluate(work.design, work.process, variation)
+        yield key, model.evaluate(model.design, model.process, variation)
 
 
 @pytest.fixture(scope="module")
@@ -332,9 +332,9 @@ def test_plates_as_rows_and_without_limits(ask: Callable[..., Study]):
 def test_a_plate_is_evaluated_once(ask: Callable[..., Study], fakes):
     counted: list[str] = []
 
-    def counting(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
+    def counting(model: DrawModel, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
         counted.extend(plates)
-        yield from one_after_another(work, plates)
+        yield from one_after_another(model, plates)
 
     asked = dataclasses.replace(ask(limits=["strehl >= 0.9"]), run=counting)
     asked.monte_carlo(20)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from doedesign.tolerancing import Study, study
-from doedesign.tolerancing.pool import Rows, Work
+from doedesign.tolerancing.pool import DrawModel, Rows
 from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import Variation, variation_of
@@ -43,7 +43,8 @@ class Cluster:
 
     def _start(self, kind: str, *arguments: str) -> subprocess.Popen[bytes]:
         allowed = str(self.allowed_failures)
-        settings = {"PYTHONPATH": str(HERE), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": allowed}
+        paths = os.pathsep.join([str(HERE), str(HERE.parents[1])])  # the fakes, and the packages under test
+        settings = {"PYTHONPATH": paths, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": allowed}
         command = [sys.executable, "-m", "dask", kind, "--host", "127.0.0.1", "--no-dashboard", *arguments]
         with open(self.folder / f"{kind}{len(self.workers)}.log", "wb") as log:
             return subprocess.Popen(command, env={**os.environ, **settings}, stdout=log, stderr=log, cwd=self.folder)
@@ -104,8 +105,8 @@ def test_a_lost_worker_loses_no_plate(ask: Callable[..., Study], fakes: ModuleTy
     first, _ = cluster.staff(2)
     asked = ask(out=tmp_path / "out")
 
-    def lossy(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
-        for count, finished in enumerate(asked.run(work, plates)):
+    def lossy(model: DrawModel, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
+        for count, finished in enumerate(asked.run(model, plates)):
             yield finished
             if count == 9:
                 first.kill()
@@ -123,8 +124,8 @@ def test_the_loss_of_the_only_worker_is_made_good_by_a_new_one(
     (only,) = cluster.staff(1)
     asked = ask()
 
-    def replaced(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
-        for count, finished in enumerate(asked.run(work, plates)):
+    def replaced(model: DrawModel, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
+        for count, finished in enumerate(asked.run(model, plates)):
             yield finished
             if count == 4:
                 only.kill()  # with it goes the design that it held
@@ -190,7 +191,7 @@ sys.modules["distributed"] = None
 sys.path.insert(0, {str(HERE)!r})
 import tolerance_fakes as fakes
 from doedesign.tolerancing import study
-study(fakes.drawn(), process=fakes.process(), evaluate=fakes.rows, scheduler="tcp://127.0.0.1:9").monte_carlo(1)
+study(fakes.design(), process=fakes.process(), evaluate=fakes.rows, scheduler="tcp://127.0.0.1:9").monte_carlo(1)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert "a cluster is reached through Dask" in done.stderr
@@ -202,8 +203,8 @@ def test_a_scheduler_that_ends_keeps_what_was_finished(ask: Callable[..., Study]
     short.staff(1)
     asked = ask(scheduler=short.address, out=tmp_path / "out")
 
-    def cut(work: Work, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
-        for count, finished in enumerate(asked.run(work, plates)):
+    def cut(model: DrawModel, plates: Mapping[str, Variation]) -> Iterator[tuple[str, Rows]]:
+        for count, finished in enumerate(asked.run(model, plates)):
             yield finished
             if count == 2:
                 short.scheduler.kill()
