@@ -54,12 +54,12 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
         report = verify(order)
         report.require()
     else:
-        order, report = write_masks(drawing_from(folder, design.levels.count), order, say=say)
+        order, report = write_masks(drawing_from(folder, design.levels.count), order)
 
     light = folder / "psf"
     say(f"3/3 PSFs of the continuous, the quantised and the drawn design into {light}")
     if not (light / "from_masks.exr").is_file():
-        psf(folder, order, say=say)
+        psf(folder, order)
     return summary(folder, order, light, len(report.checks))
 
 

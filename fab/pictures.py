@@ -164,13 +164,22 @@ def read_display(path: str | Path, most_px: int | None = None) -> NDArray[np.uin
         return np.ascontiguousarray(np.asarray(upright, np.uint8)[::-1])
 
 
-def write_pixels(path: str | Path, values: NDArray[Any], compression: int | None = None) -> None:
+def write_pixels(
+    path: str | Path,
+    values: NDArray[Any],
+    compression: int | None = None,
+    *,
+    about: str = "",
+    pitch_m: float | None = None,
+) -> None:
     """Write a PNG or TIFF; the file appears whole or not at all, and the same values give the same bytes.
 
     Args:
         path: the file; its ending says which of the two it becomes.
         values: uint8 or uint16, for a TIFF floats too, `[y, x]` or `[y, x, 3]`.
         compression: zlib's level for a PNG of 16 bits, 0 to 9; its usual one if None.
+        about: a description that goes into the file; a TIFF with one is compressed.
+        pitch_m: edge of a pixel, metres, for the resolution tags of a TIFF.
 
     Raises:
         InputError: the system refuses the path.
@@ -178,11 +187,21 @@ def write_pixels(path: str | Path, values: NDArray[Any], compression: int | None
     import imageio.v3 as imageio
 
     rows = np.ascontiguousarray(values[::-1])
+    options: dict[str, Any] = {}
     if Path(path).suffix.lower() in TIFF_FILES:
         options = {"photometric": "rgb" if rows.ndim == 3 else "minisblack", "metadata": None, "software": "doedesign"}
+        if about:
+            options |= {"compression": "zlib", "description": about}
+        if pitch_m is not None:
+            options |= {"resolution": (0.01 / pitch_m, 0.01 / pitch_m), "resolutionunit": "CENTIMETER"}
         write_atomic(path, imageio.imwrite("<bytes>", rows, extension=".tif", **options))
-    elif rows.dtype == np.uint8:
-        write_atomic(path, imageio.imwrite("<bytes>", rows, extension=".png"))
+    elif rows.dtype == np.uint8 or about:
+        if about:
+            from PIL.PngImagePlugin import PngInfo
+
+            options["pnginfo"] = PngInfo()
+            options["pnginfo"].add_text("Description", about)
+        write_atomic(path, imageio.imwrite("<bytes>", rows, extension=".png", **options))
     else:
         import png
 

@@ -71,7 +71,7 @@ def masks(
             raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
         from doedesign.commands.asbuilt import as_built as work
 
-        folder = work(source, as_built, order, process=process, say=say)
+        folder = work(source, as_built, order, process=process)
         print_paths([folder, *sorted(folder.iterdir())], json_)
         return
     if order is not None:
@@ -99,7 +99,6 @@ def masks(
         patch=window,
         process_file=process,
         wafer_file=wafer,
-        say=say,
     )
     say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
     print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))

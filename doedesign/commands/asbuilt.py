@@ -1,11 +1,12 @@
 """`doedesign masks RUN --as-built FILE`: what the plate does that the lab measured, and what the run sheet foretold."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from doedesign.build import resolve_process
-from doedesign.commands.psf import Say, require_own
+from doedesign.commands.psf import require_own
 from doedesign.design.design import Design
 from doedesign.lab.as_built import AsBuiltDoe, compared, gratings_compared, plate_of
 from doedesign.prediction import predict
@@ -20,6 +21,8 @@ from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.store import write_bank
 
 FORMAT = "doedesign as-built 1"
+
+log = logging.getLogger("doedesign")
 
 _TITLES = {
     "strehl": "Strehl ratio",
@@ -36,7 +39,6 @@ def as_built(
     masks: Path | None = None,
     *,
     process: Path | None = None,
-    say: Say = lambda _: None,
 ) -> Path:
     """Predict the plate of a filled run sheet and write what was found into RUN/as-built.
 
@@ -45,7 +47,6 @@ def as_built(
         file: the JSON of its run sheet, with measured numbers; what is null is taken at the process's mean.
         masks: its mask order, whose files are read; `masks/NAME` if there is one, else the run's own map.
         process: TOML file with a [process] table; the run's own process by default.
-        say: told what was found.
 
     Returns:
         the folder: the PSF bank `as-built.exr` and its picture, `as-built.json` with every error, where it comes from
@@ -60,13 +61,13 @@ def as_built(
     made_by = resolve_process(process, design.levels, run.spec.process)
     measured = read_as_built(file, design.level_map)
     plate = plate_of(measured, made_by)
-    say(_told(plate))
+    log.info(_told(plate))
     folder = run.path("as-built")
     require_own(folder)
     with alone_in(run.folder), atomic_folder(folder) as fresh:
         rows = _write(fresh, design, made_by, measured, plate, file)
     for line in _lines(rows):
-        say(line)
+        log.info(line)
     return folder
 
 

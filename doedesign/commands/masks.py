@@ -1,6 +1,6 @@
 """`doedesign masks`: a level map becomes a mask order."""
 
-from collections.abc import Callable
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +28,7 @@ from fab.runsheet.write import write_run_sheet
 from fab.solids.patch import Patch
 from fab.verification.verify import VerificationReport
 
-Say = Callable[[str], None]
+log = logging.getLogger("doedesign")
 
 
 def write_masks(
@@ -40,7 +40,6 @@ def write_masks(
     patch: Patch | None = None,
     process_file: Path | None = None,
     wafer_file: Path | None = None,
-    say: Say = lambda _: None,
 ) -> tuple[Path, VerificationReport]:
     """Write and prove the mask order of a level map.
 
@@ -52,7 +51,6 @@ def write_masks(
         patch: a window to write as a solid at full resolution, too.
         process_file: TOML with the process to make it with; that of the run, or an ideal one, if left out.
         wafer_file: TOML with the wafer to fill; that of the run, or the usual one, if left out.
-        say: told what is going on.
 
     Returns:
         the folder and the report of its proof.
@@ -77,10 +75,9 @@ def write_masks(
         source=drawing.origin,
         on_violation=on_violation,
         waves_per_metre=None if spec is None else _waves_per_metre(spec),
-        say=say,
     )
     if order.repair is not None and design is not None:
-        repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map, say)}
+        repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}
         order = replace(order, source={**order.source, "repair": repair})
 
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
@@ -89,8 +86,8 @@ def write_masks(
         draw_wafer(fresh / plate, order.wafer, frame, aperture_m, dbu_m, f"{order.stem}: what lies where")
         site = alignment_site(order.plates, dbu_m)
         draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
-        say("writing the run sheet")
-        sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m, say))
+        log.info("writing the run sheet")
+        sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m))
         found = order.rules
         if found.clean:
             return [plate, marks, *sheets]
@@ -98,7 +95,7 @@ def write_masks(
         draw_rules(fresh / name, found, title)
         return [plate, marks, *sheets, name]
 
-    written = write_planned(folder, order, add=add, say=say)
+    written = write_planned(folder, order, add=add)
     return folder, written.report
 
 
@@ -107,11 +104,11 @@ def _waves_per_metre(spec: Spec) -> float:
 
 
 def _run_sheet(
-    design: Design | None, folder: Path, order: Order, frame: Frame, probe_m: float, say: Say
+    design: Design | None, folder: Path, order: Order, frame: Frame, probe_m: float
 ) -> tuple[RunSheet, bytes | None]:
     """The run sheet of an order in the making, and the picture of what the lab should see."""
     moves_m = [move * order.dbu_m for move in order.edge_moves()]
-    told = None if design is None else _foretold(design, order, moves_m, probe_m, say)
+    told = None if design is None else _foretold(design, order, moves_m, probe_m)
     files = {
         plate.name: PhotomaskFile(
             file=f"{order.plate_stem(plate)}.gds",
@@ -139,13 +136,13 @@ def _run_sheet(
     return sheet, None if told is None else told.picture
 
 
-def _foretold(design: Design, order: Order, moves_m: list[float], probe_m: float, say: Say) -> SheetPrediction | None:
+def _foretold(design: Design, order: Order, moves_m: list[float], probe_m: float) -> SheetPrediction | None:
     assert design.spec is not None  # a run has one
     drawn = replace(design, level_map=order.level_map)
     try:
         return predict_sheet(drawn, order.process, design.spec.optics.design_wavelength_m, probe_m, moves_m)
     except InputError as error:
-        say(f"warning: the run sheet says nothing of the light: {error}")
+        log.warning("the run sheet says nothing of the light: %s", error)
         return None
 
 
@@ -162,7 +159,7 @@ def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     return Process(levels, name=made.name, **said)
 
 
-def _psf_cost(design: Design, repaired: LevelMap, say: Say) -> list[dict[str, Any]]:
+def _psf_cost(design: Design, repaired: LevelMap) -> list[dict[str, Any]]:
     """Compare what light does with a map before and after a repair, colour by colour and depth by depth."""
     from doedesign.prediction import predict
 
@@ -174,5 +171,5 @@ def _psf_cost(design: Design, repaired: LevelMap, say: Say) -> list[dict[str, An
         told.append({"colour": old["colour"], "depth_m": old["depth_m"], **numbers})
     worst = max((t for t in told if "far_spot" in t), key=lambda t: t["far_spot"][0] - t["far_spot"][1], default=None)
     if worst is not None:
-        say(f"far spot of {worst['colour']}: {worst['far_spot'][0]:.3f} before, {worst['far_spot'][1]:.3f} after")
+        log.info("far spot of %s: %.3f before, %.3f after", worst["colour"], *worst["far_spot"])
     return told

@@ -1,7 +1,8 @@
 """A mask order in numbers, before it becomes files: what is drawn, for whom, and what everything is called."""
 
+import logging
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
 __all__ = ["OnViolation", "Order", "order_id", "plan_order"]
+
+log = logging.getLogger("doedesign")
 
 OnViolation = Literal["warn", "fail", "fix"]
 
@@ -118,7 +121,6 @@ def plan_order(
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
-    say: Callable[[str], None] = lambda _: None,
 ) -> Order:
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`.
 
@@ -128,17 +130,17 @@ def plan_order(
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
     for headline in report.headlines():
-        say(f"warning: {headline}")
+        log.warning(headline)
     if on_violation == "fail" and not report.printable:
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
     order = Order(report, made_by, wafer or Wafer(), chrome or Chrome(), source or {}, patch)
     if on_violation == "fix" and not report.clean:
-        say("repairing the level map")
+        log.info("repairing the level map")
         repair = repaired(report, waves_per_metre)
         source = {**order.source, "repair": asdict(repair.cost)}
         order = replace(order, rules=repair.rules, repair=repair, source=source)
-        say(f"repaired: {repair.cost}")
+        log.info("repaired: %s", repair.cost)
     if patch is not None:
         patch.require(order.level_map)
     return order

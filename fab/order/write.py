@@ -13,6 +13,7 @@ The folder appears at its final path only after everything in it was read back a
 level map.
 """
 
+import logging
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -53,8 +54,9 @@ from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_en
 from fab.order.order import OnViolation, Order, plan_order
 from fab.order.preview import preview_png
 from fab.process import Process
+from fab.solids.model import DoeModel
 from fab.solids.patch import Patch
-from fab.solids.write import PlateModel, write_models
+from fab.solids.write import write_models
 from fab.units import MM, NM, UM
 from fab.verification.verify import VerificationReport, verify
 
@@ -64,6 +66,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Add", "WrittenOrder", "mask_file", "write_order", "write_planned"]
 
+log = logging.getLogger("doedesign")
 _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 
 
@@ -144,10 +147,9 @@ def _write_masks(
     doe_layers: list[Layer],
     gds: str,
     oasis: str,
-    say: Callable[[str], None],
 ) -> list[FileContent]:
     """Write the review files and one file per mask."""
-    say("writing GDSII")
+    log.info("writing GDSII")
     write_gds(folder / gds, layout)
     contents = [FileContent(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
     for plate in order.plates:
@@ -156,7 +158,7 @@ def _write_masks(
         write_gds(folder / f"{name}.gds", one)
         on = [layer] if layer in doe_layers else []
         contents.append(FileContent(f"{name}.gds", "GDSII", name, on, _around(order, one)))
-    say("writing OASIS")
+    log.info("writing OASIS")
     write_oasis(folder / oasis, folder / gds, layout.layers)
     return [*contents, FileContent(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
 
@@ -174,11 +176,11 @@ def _file_entry(folder: Path, content: FileContent) -> FileEntry:
     )
 
 
-def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None]) -> Manifest:
+def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     """Write everything but the manifest, and return it."""
     level_map = order.level_map
     levels, grid = level_map.levels, level_map.grid
-    say("drawing the masks")
+    log.info("drawing the masks")
     drawn = _drawn_does(order)
     frame = _frame(order, drawn.dbu_m)
     splits = [
@@ -194,19 +196,19 @@ def _write_files(folder: Path, order: Order, add: Add, say: Callable[[str], None
     gds, oasis, levels_file, preview = (
         f"{order.stem}_{end}" for end in ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
     )
-    contents = _write_masks(folder, order, layout, doe_layers, gds, oasis, say)
+    contents = _write_masks(folder, order, layout, doe_layers, gds, oasis)
     dbu_m = layout.dbu_m
     del layout
-    say("drawing the preview")
+    log.info("drawing the preview")
     _write_map(folder / levels_file, level_map.level)
     title = f"{order.stem}: {levels.told}, level map {level_map.digest[:12]}"
     picture = preview_png(title, level_map, order.chrome.radii_m(level_map))
     (folder / preview).write_bytes(picture)
-    say("drawing the solids")
-    shown = PlateModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
+    log.info("drawing the solids")
+    model = DoeModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
     # What is added takes long where it follows light; the solids are drawn meanwhile.
     with ThreadPoolExecutor(1) as pool:
-        solids = pool.submit(write_models, folder, order.stem, shown)
+        solids = pool.submit(write_models, folder, order.stem, model)
         added = add(folder, order, frame)
         models = solids.result()
     others = [*(model.file for model in models), *added, levels_file, preview]
@@ -288,7 +290,6 @@ def write_order(
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
-    say: Callable[[str], None] = lambda _: None,
 ) -> WrittenOrder:
     """Write a mask order and prove it; the folder appears only if the proof holds.
 
@@ -303,7 +304,6 @@ def write_order(
         source: where the level map came from, for the manifest; JSON values only.
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
-        say: told the name of each step as it begins.
 
     Raises:
         InputError: an argument is out of range; the folder holds anything else than an earlier order;
@@ -319,29 +319,25 @@ def write_order(
         source=source,
         on_violation=on_violation,
         waves_per_metre=waves_per_metre,
-        say=say,
     )
-    return write_planned(folder, order, say=say)
+    return write_planned(folder, order)
 
 
-def write_planned(
-    folder: str | Path, order: Order, *, add: Add = lambda *_: (), say: Callable[[str], None] = lambda _: None
-) -> WrittenOrder:
+def write_planned(folder: str | Path, order: Order, *, add: Add = lambda *_: ()) -> WrittenOrder:
     """Write an order that `plan_order` made, and prove it; see `write_order`.
 
     Args:
         folder: the final folder.
         order: what is drawn.
         add: writes further files into the folder and returns their names; what needs light to be written.
-        say: told the name of each step as it begins.
     """
     folder = Path(folder)
     _require_own(folder)
     with atomic_folder(folder) as fresh:
-        manifest = _write_files(fresh, order, add, say)
+        manifest = _write_files(fresh, order, add)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
-        say("reading everything back")
+        log.info("reading everything back")
         report = verify(fresh)
         report.require()
-        say("moving the folder into place")
+        log.info("moving the folder into place")
     return WrittenOrder(folder, order, manifest, report)

@@ -7,6 +7,9 @@ step          the STEP file, and its reader
 columns       level map -> columns of a block-reduced relief
 mesh          columns -> a closed mesh
 meshfile      3MF, GLB and STL files, and their readers
-height_files  TIFF, NPY, grid sag and greyscale heights
-write         all of them for one order
+height_files  TIFF, NPY, grid sag and greyscale heights, and their proof
+model         what they all show, and what a kind of file is
+step_files    the STEP files of an order, and their proof
+mesh_files    its meshes, and their proof
+write         all of them for one order: the list of kinds
 """

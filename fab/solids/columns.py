@@ -16,7 +16,7 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 
-__all__ = ["Columns", "Window", "reduced_cells", "whole", "window_cells"]
+__all__ = ["Columns", "PixelWindow", "reduced_cells", "whole", "window_cells"]
 
 _MOST_CELLS = 4_000_000
 # Heights that differ by less than this part of the relief are one height that was rounded differently.
@@ -24,7 +24,7 @@ _CLOSEST = 1e-9
 
 
 @dataclass(frozen=True)
-class Window:
+class PixelWindow:
     """A rectangle of pixels of a grid.
 
     Attributes:
@@ -78,9 +78,9 @@ class Window:
         return x, (2 * self.row + self.rows - ny) / 2 * grid.pitch_m
 
 
-def whole(grid: Grid) -> Window:
+def whole(grid: Grid) -> PixelWindow:
     """Return the window that covers a grid."""
-    return Window(0, 0, *grid.shape)
+    return PixelWindow(0, 0, *grid.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def _heights_m(levels: Levels) -> NDArray[np.float64]:
     return _joined(heights, _CLOSEST * float(heights.max()))
 
 
-def window_cells(level_map: LevelMap, window: Window) -> Columns:
+def window_cells(level_map: LevelMap, window: PixelWindow) -> Columns:
     """Take a window of a map at full resolution: one column per pixel, where the window lies on the DOE.
 
     Raises:

@@ -2,7 +2,8 @@
 
 Pictures (.tif, .png) are stored from the top row down, so what is up in the picture is +y; `fab.height`
 turns them back. Arrays (.npy) are metres, ``[y, x]``, row 0 at the lowest y. Every file comes from a level
-map, so that a height is one of the levels and never a rounded neighbour of it.
+map, so that a height is one of the levels and never a rounded neighbour of it. In an order every single height of each
+is read back.
 
 The grid sag of Zemax OpticStudio is the text that its manual describes: one line ``nx ny delx dely unitflag
 xdec ydec`` (unit flag 0: millimetres), then one line ``z dz/dx dz/dy d2z/dxdy nodata`` per point, from the
@@ -12,8 +13,10 @@ that it turns a vertical wall into a slope one pixel wide.
 """
 
 import io
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +25,21 @@ from fab.errors import InputError
 from fab.files import write_atomic
 from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.solids.columns import Window, whole
+from fab.manifest.records import ModelEntry
+from fab.pictures import read_pixels, write_pixels
+from fab.solids.columns import PixelWindow, whole
+from fab.solids.model import DoeModel, ModelKind, Stated, window_of
 from fab.units import MM, format_length
 
-__all__ = ["write_greymap", "write_npy", "write_tiff", "write_zemax_sag"]
+__all__ = ["KINDS", "write_greymap", "write_npy", "write_tiff", "write_zemax_sag"]
 
 # OpticStudio's manual asks for this many points along either axis.
 _FEWEST_ZEMAX = 5
+_SAG_CELLS = 500
 _ROWS = 256
 
 
-def _said(level_map: LevelMap, metres_per_count: float, counts: NDArray[np.int64]) -> str:
+def _description(level_map: LevelMap, metres_per_count: float, counts: NDArray[np.int64]) -> str:
     levels = level_map.levels
     rounding_m = float(np.abs(counts * metres_per_count - levels.heights_m()).max())
     close = "exact" if rounding_m < 1e-15 else f"rounded by at most {rounding_m:.2e} m"
@@ -63,39 +70,18 @@ def _exact_scale(levels: Levels) -> tuple[NDArray[np.int64], float]:
 
 
 def write_tiff(path: str | Path, level_map: LevelMap) -> float:
-    """Write the heights as a 16-bit grey TIFF, first row at the highest y.
+    """Write the heights as a 16-bit grey TIFF, first row at the highest y; return the metres per count.
 
     Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded
-    to the nearest of 65535 counts. The description in the file says metres per count, rounding, pitch and
-    orientation; the resolution tags hold the pitch too.
-
-    Args:
-        path: the file.
-        level_map: the DOE.
-
-    Returns:
-        Metres per count; count times this is the height above the deepest floor.
+    to the nearest of 65535 counts. Count times metres per count is the height above the deepest floor. The description
+    in the file says metres per count, rounding, pitch and orientation; the resolution tags hold the pitch too.
 
     Raises:
         InputError: the file cannot be written.
     """
-    import tifffile
-
     counts, scale_m = _exact_scale(level_map.levels)
-    per_cm = 0.01 / level_map.grid.pitch_m
-    stream = io.BytesIO()
-    tifffile.imwrite(
-        stream,
-        counts.astype(np.uint16)[level_map.level[::-1]],
-        photometric="minisblack",
-        compression="zlib",
-        description=_said(level_map, scale_m, counts),
-        resolution=(per_cm, per_cm),
-        resolutionunit="CENTIMETER",
-        metadata=None,
-        software="doedesign",
-    )
-    write_atomic(path, stream.getvalue())
+    about = _description(level_map, scale_m, counts)
+    write_pixels(path, counts.astype(np.uint16)[level_map.level], about=about, pitch_m=level_map.grid.pitch_m)
     return scale_m
 
 
@@ -111,38 +97,23 @@ def write_npy(path: str | Path, level_map: LevelMap) -> None:
 
 
 def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
-    """Write the picture that greyscale and two-photon writers expose: PNG, white highest, linear in height.
+    """Write the picture that greyscale and two-photon writers expose: PNG, white highest; return the metres per count.
 
-    Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is rounded to
-    the nearest count, and exact for 2, 4 and 16 even levels. The first row is at the highest y. The text
+    Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is linear in height,
+    rounded to the nearest count, and exact for 2, 4 and 16 even levels. The first row is at the highest y. The text
     chunk "Description" says metres per count, rounding, pitch and orientation.
-
-    Args:
-        path: the file.
-        level_map: the DOE.
-        bits: per pixel, 8 or 16.
-
-    Returns:
-        Metres per count.
 
     Raises:
         InputError: the file cannot be written.
     """
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
     counts, scale_m = _full_scale(level_map.levels, 2**bits - 1)
-    pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level[::-1]]
-    text = PngInfo()
-    text.add_text("Description", _said(level_map, scale_m, counts))
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, format="PNG", pnginfo=text)
-    write_atomic(path, stream.getvalue())
+    pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level]
+    write_pixels(path, pixels, about=_description(level_map, scale_m, counts))
     return scale_m
 
 
 def write_zemax_sag(
-    path: str | Path, level_map: LevelMap, window: Window | None = None, side: Literal["exit", "entry"] = "exit"
+    path: str | Path, level_map: LevelMap, window: PixelWindow | None = None, side: Literal["exit", "entry"] = "exit"
 ) -> None:
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
@@ -175,9 +146,8 @@ def write_zemax_sag(
     sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
     lines = [f"{sag + 0.0:12.9f} 0 0 0 0\r\n".encode() for sag in sag_mm]  # + 0.0: no minus before a zero
     if len({len(line) for line in lines}) != 1:  # pragma: no cover - a relief deeper than a centimetre
-        raise InputError(
-            "grid sag", "the relief must be less than 10 mm deep", format_length(heights.max()), "Check it."
-        )
+        deepest = format_length(heights.max())
+        raise InputError("grid sag", "the relief must be less than 10 mm deep", deepest, "Check it.")
     table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(heights.size, -1)
     x_mm, y_mm = (value / MM for value in window.centre_m(grid))
     pitch_mm = f"{grid.pitch_m / MM:.12g}"
@@ -185,3 +155,84 @@ def write_zemax_sag(
     pixels = window.cut(level_map.level)[::-1]
     body = (table[pixels[start : start + _ROWS]].tobytes() for start in range(0, window.rows, _ROWS))
     write_atomic(path, b"".join([header.encode(), *body]))
+
+
+def _write_tif(path: Path, model: DoeModel) -> Stated:
+    per_count = write_tiff(path, model.level_map)
+    return Stated("height above the deepest floor, first row at the highest y", metres_per_count=per_count)
+
+
+def _write_npy(path: Path, model: DoeModel) -> Stated:
+    write_npy(path, model.level_map)
+    return Stated("height above the deepest floor, row 0 at the lowest y", metres_per_count=1.0)
+
+
+def _write_png(path: Path, model: DoeModel) -> Stated:
+    per_count = write_greymap(path, model.level_map)
+    return Stated("white is the blank surface, first row at the highest y", metres_per_count=per_count)
+
+
+def _write_sag(path: Path, model: DoeModel) -> Stated | None:
+    """Write the middle of the map, if it has enough points."""
+    (ny, nx), (rows, columns) = model.level_map.shape, (min(n, _SAG_CELLS) for n in model.level_map.shape)
+    if min(rows, columns) < _FEWEST_ZEMAX:
+        return None
+    window = PixelWindow((ny - rows) // 2, (nx - columns) // 2, rows, columns)
+    write_zemax_sag(path, model.level_map, window)
+    about = f"sag from the blank surface, the middle {rows} x {columns} pixels, seen as an exit face"
+    return Stated(about, metres_per_count=MM, window=window)
+
+
+def _problems(path: Path, entry: ModelEntry, level_map: LevelMap, read: Callable[[Path], NDArray[Any]]) -> list[str]:
+    window, per_count = window_of(entry) or whole(level_map.grid), entry.metres_per_count or 1.0
+    try:
+        found = read(path) * per_count
+    # Each library raises what it likes on a damaged file.
+    except Exception as error:
+        return [f"it cannot be read: {error}"]
+    wanted = level_map.levels.heights_m()[window.cut(level_map.level)]
+    problems = []
+    if path.suffix == ".DAT":
+        wanted = wanted - level_map.levels.total_m
+        problems = _header_problems(path, level_map, window)
+    if found.shape != wanted.shape:
+        return [*problems, f"{found.shape} heights instead of {wanted.shape}"]
+    # Grey values are rounded to half a count; text and floating point to far less.
+    most = 0.5001 * per_count if path.suffix in (".png", ".tif") else 1e-12
+    wrong = int(np.count_nonzero(np.abs(found - wanted) > most))
+    return [*problems, f"{wrong} heights differ from the level map"] if wrong else problems
+
+
+def _header_problems(path: Path, level_map: LevelMap, window: PixelWindow) -> list[str]:
+    """Compare the unit, the pitch and the place of a grid sag."""
+    grid = level_map.grid
+    with open(path) as lines:
+        *_, pitch_x, pitch_y, unit, x, y = lines.readline().split()
+    found = [float(pitch_x), float(pitch_y), float(x), float(y)]
+    wanted = [value / MM for value in (grid.pitch_m, grid.pitch_m, *window.centre_m(grid))]
+    if unit != "0" or not np.allclose(found, wanted, rtol=1e-9, atol=1e-9):
+        return [f"pitch and place {found} in unit {unit} instead of {wanted} in unit 0 (millimetres)"]
+    return []
+
+
+def _read_npy(path: Path) -> NDArray[np.float64]:
+    return np.load(path, allow_pickle=False)
+
+
+def _read_sag(path: Path) -> NDArray[np.float64]:
+    with open(path) as lines:
+        columns, rows = (int(word) for word in lines.readline().split()[:2])
+        sag = np.loadtxt(lines, usecols=0)
+    # The first point is at the lowest x and the highest y.
+    return sag.reshape(rows, columns)[::-1]
+
+
+KINDS = tuple(
+    ModelKind(ending, write, partial(_problems, read=read))
+    for ending, write, read in (
+        ("_HEIGHT.tif", _write_tif, read_pixels),
+        ("_HEIGHT.npy", _write_npy, _read_npy),
+        ("_GREY.png", _write_png, read_pixels),
+        ("_SAG.DAT", _write_sag, _read_sag),
+    )
+)

@@ -16,7 +16,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles
 from fab.level_map import LevelMap
-from fab.solids.columns import Columns, Window, window_cells
+from fab.solids.columns import Columns, PixelWindow, window_cells
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
@@ -44,7 +44,7 @@ class Patch:
     width_m: float
     step: bool = True
 
-    def window(self, grid: Grid) -> Window:
+    def window(self, grid: Grid) -> PixelWindow:
         """Return the pixels nearest to the patch.
 
         Raises:
@@ -60,7 +60,7 @@ class Patch:
             got = f"{format_length(self.width_m)} about {format_length(self.x_m)}, {format_length(self.y_m)}"
             raise InputError("patch", rule, got, 'Give its middle and its edge, such as "0 um, 100 um, 50 um".')
         row, column = (round(at / pitch_m + (n - count) / 2) for at, n in ((self.y_m, ny), (self.x_m, nx)))
-        window = Window(row, column, count, count)
+        window = PixelWindow(row, column, count, count)
         window.require(grid)
         return window
 
@@ -83,7 +83,7 @@ class Patch:
         return window_cells(level_map, self.window(level_map.grid))
 
 
-def _tops(level_map: LevelMap, window: Window, most_boxes: int) -> dict[int, NDArray[np.int32]]:
+def _tops(level_map: LevelMap, window: PixelWindow, most_boxes: int) -> dict[int, NDArray[np.int32]]:
     """Return the rectangles of every level in a window, or refuse too many."""
     cut = window.cut(level_map.level)
     tops = {int(level): rectangles((cut == level).astype(np.uint8)) for level in np.unique(cut)}
@@ -95,7 +95,7 @@ def _tops(level_map: LevelMap, window: Window, most_boxes: int) -> dict[int, NDA
     return tops
 
 
-def patch_body(level_map: LevelMap, window: Window, base_m: float = _BASE_M) -> Body:
+def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M) -> Body:
     """Return volume and centre of all the boxes that `patch_step` writes."""
     levels, grid = level_map.levels, level_map.grid
     heights_m = levels.heights_m()[window.cut(level_map.level)] + base_m
@@ -111,7 +111,7 @@ def patch_body(level_map: LevelMap, window: Window, base_m: float = _BASE_M) -> 
 
 
 def patch_step(
-    path: str | Path, level_map: LevelMap, window: Window, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
+    path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
 ) -> None:
     """Write a window of a map as STEP. The part is named PATCH and lies where the window does.
 

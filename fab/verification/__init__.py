@@ -3,5 +3,4 @@
 verify        every check of an order, and the report
 compare       what was read against what should be there
 shop_checks   what a mask shop looks at, whatever is drawn
-models        solids, meshes and height maps against the level map
 """

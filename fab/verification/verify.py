@@ -36,8 +36,8 @@ from fab.layout.polygons import paint
 from fab.level_map import level_digest
 from fab.levels import Levels
 from fab.manifest.records import FileEntry, Manifest, plane_digest, read_manifest
+from fab.solids.write import model_problems
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
-from fab.verification.models import model_problems
 from fab.verification.shop_checks import drawing_problems, number_problems
 
 if TYPE_CHECKING:

@@ -1,6 +1,7 @@
 """From measured numbers to the plate: what is filled in comes back as the errors it was made from."""
 
 import json
+import logging
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -247,12 +248,12 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
 
 
 @pytest.mark.slow
-def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, design, tmp_path):
+def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, design, tmp_path, caplog):
     wanted = predict(design, IDEAL, PLATE)
     before = [seen._asdict() for seen in seen_of(predict(design, IDEAL, Variation()).rows)]
     file = write_sheet(tmp_path / "s.json", design, numbers_of(PLATE, LEVELS), {"as_drawn": before, "expected": before})
-    said = []
-    folder = as_built(run, file, say=said.append)
+    caplog.set_level(logging.INFO)
+    folder = as_built(run, file)
     assert folder == run / "as-built"
     bank = read_bank(folder / "as-built.exr")
     # The lag comes out of differences of pads good to 1e-7, and all is float32.
@@ -266,7 +267,7 @@ def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run
             assert told["as_drawn"] == told["expected"] == old[quantity]
     assert [row["measured"] for row in found["gratings"]] == [0.5, 0.25]
     assert found["notes"] == {"wafer": "W1"}
-    assert any("ring:disc" in line and "as drawn" in line for line in said)
+    assert any("ring:disc" in line and "as drawn" in line for line in caplog.messages)
     # What it wrote is what `psf --fabricated --variation` reads.
     variation = load_variation(folder / "variation.toml")
     assert variation.depth_scale == pytest.approx(PLATE.depth_scale)

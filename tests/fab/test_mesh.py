@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from fab.errors import CheckFailed, InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.solids.columns import Window, reduced_cells, whole, window_cells
+from fab.solids.columns import PixelWindow, reduced_cells, whole, window_cells
 from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.meshfile import Unit, read_mesh, write_3mf, write_glb, write_stl
 from fab.units import NM, UM
@@ -95,7 +95,7 @@ def test_the_mesh_stands_where_the_map_does():
     assert np.allclose(np.unique(top[:, 0]), [-2 * PITCH, -PITCH], rtol=1e-15)
     assert np.allclose(np.unique(top[:, 1]), [PITCH, 2 * PITCH], rtol=1e-15)
     assert mesh.vertices_m[:, 2].min() == pytest.approx(-1125 * NM - UM, rel=1e-15)
-    part = relief_mesh(window_cells(level_map, Window(2, 0, 2, 3)), UM)
+    part = relief_mesh(window_cells(level_map, PixelWindow(2, 0, 2, 3)), UM)
     assert np.allclose(part.vertices_m.min(axis=0)[:2], [-3 * PITCH, 0], rtol=1e-15)
     assert part.vertices_m[:, 2].max() == 0
 
@@ -140,7 +140,7 @@ def test_meshes_too_large_for_any_viewer_are_refused():
     with pytest.raises(InputError, match="1 to 2000"):
         reduced_cells(level_map, 2001)
     with pytest.raises(InputError, match="lie on"):
-        window_cells(level_map, Window(2000, 0, 2, 1))
+        window_cells(level_map, PixelWindow(2000, 0, 2, 1))
 
 
 @pytest.mark.parametrize("defect", ["missing", "turned", "inside out", "moved"])

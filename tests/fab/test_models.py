@@ -1,5 +1,6 @@
 """The solids of an order: rings where the map is radial, the wafer, and a patch on request."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +14,11 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
-from fab.solids.columns import Window
+from fab.solids.columns import PixelWindow
+from fab.solids.model import DoeModel
 from fab.solids.patch import Patch
 from fab.solids.step import step_bodies
-from fab.solids.write import PlateModel, write_models
+from fab.solids.write import model_problems, write_models
 from fab.units import MM, NM, UM
 from fab.verification.verify import verify
 from tests.fab.maps import level_map_from
@@ -80,7 +82,7 @@ def test_the_wafer_of_an_order(written_order):
 def test_wafers_have_the_usual_flat_or_none(tmp_path, diameter_m, dies, words):
     wafer = Wafer(diameter_m, blank_m=diameter_m + 25 * MM)
     level_map = level_map_from(np.zeros((8, 8)), LEVELS, UM, 8 * UM)
-    shown = PlateModel(level_map, Chrome(UM), wafer, 5 * MM, dies)
+    shown = DoeModel(level_map, Chrome(UM), wafer, 5 * MM, dies)
     found = {entry.file: entry for entry in write_models(tmp_path, "A", shown)}
     assert words in found["A_WAFER.step"].content
 
@@ -101,7 +103,7 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
         assert entry.window_px == [12, 7, 8, 8]
         assert "8 x 8 pixels of 1.85 um about -8.325 um, 7.4 um of the DOE" in entry.content
     level_map = np.load(patched / "DOE_PATCH_LEVELS.npy")
-    heights = Window(12, 7, 8, 8).cut(level_map) * 75e-9 + 10e-6
+    heights = PixelWindow(12, 7, 8, 8).cut(level_map) * 75e-9 + 10e-6
     volume = heights.sum() * 1.85e-6**2 / MM**3
     assert found["PATCH.step"].volumes_mm3["PATCH"] == pytest.approx(volume, rel=1e-12)
     assert found["PATCH.glb"].volumes_mm3["RELIEF"] == pytest.approx(volume, rel=1e-12)
@@ -111,8 +113,6 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
 
 def test_a_patch_of_another_place_is_told(patched):
     """The same files, but said to be a pixel farther: neither the centre of the boxes nor a column fits."""
-    from fab.verification.models import model_problems
-
     manifest = read_manifest(patched)
     level_map = manifest.level_map(np.load(patched / manifest.level_map_file))
     for name, entry in entries(patched).items():
@@ -127,13 +127,14 @@ def test_a_patch_of_another_place_is_told(patched):
         assert any(words in problem for problem in model_problems(patched, other, level_map))
 
 
-def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path):
-    level_map, said = level_map_from(np.indices((60, 60)).sum(axis=0) % 2, LEVELS, UM, 60 * UM, "p"), []
+def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    level_map = level_map_from(np.indices((60, 60)).sum(axis=0) % 2, LEVELS, UM, 60 * UM, "p")
     for width in (50 * UM, 61 * UM):
         patch = Patch(0.0, 0.0, width)
         with pytest.raises(InputError, match=r"boxes|must .*lie on the 60 x 60 pixels"):
-            write_order(tmp_path / "o", level_map, patch=patch, say=said.append)
-    assert said == []
+            write_order(tmp_path / "o", level_map, patch=patch)
+    assert caplog.messages == []
     assert not (tmp_path / "o").exists()
     write_order(tmp_path / "o", level_map, patch=Patch(0.0, 0.0, 50 * UM, step=False))
     names = {name for name in entries(tmp_path / "o") if name.startswith("PATCH")}

@@ -5,7 +5,7 @@ import pytest
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.solids.columns import Window
+from fab.solids.columns import PixelWindow
 from fab.solids.patch import Patch, patch_body, patch_step
 from fab.solids.step import step_bodies, step_volumes_m3
 from fab.units import NM, UM
@@ -25,7 +25,7 @@ PATCHES = {
 @pytest.mark.parametrize("level_map", PATCHES.values(), ids=PATCHES.keys())
 def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
     level_map = level_map_from(level_map, SIXTEEN, 1.85 * UM)
-    window = Window(0, 0, *level_map.shape)
+    window = PixelWindow(0, 0, *level_map.shape)
     patch_step(tmp_path / "p.step", level_map, window, UM)
     want = (height_of(level_map.level, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
     assert patch_body(level_map, window, UM).volume_m3 == pytest.approx(want, rel=1e-14)
@@ -36,7 +36,7 @@ def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
 def test_a_patch_lies_where_its_window_does(tmp_path):
     level_map = np.random.default_rng(2).integers(0, 16, (20, 30)).astype(np.uint8)
     level_map[5, 8] = 15
-    level_map, window = level_map_from(level_map), Window(5, 8, 4, 6)
+    level_map, window = level_map_from(level_map), PixelWindow(5, 8, 4, 6)
     patch_step(tmp_path / "p.step", level_map, window)
     (shape,) = [shape for shape, *_ in cadquery.Assembly.importStep(str(tmp_path / "p.step"))]
     bounds = shape.BoundingBox(1e-9)
@@ -52,21 +52,21 @@ def test_a_patch_lies_where_its_window_does(tmp_path):
 def test_patches_too_large_for_step_are_refused_with_the_number_of_boxes(tmp_path):
     level_map = level_map_from(np.indices((50, 50)).sum(axis=0) % 2)
     with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2500 in 50 x 50 pixels.*mesh"):
-        patch_step(tmp_path / "p.step", level_map, Window(0, 0, 50, 50))
+        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 0, 50, 50))
     with pytest.raises(InputError, match="1 to 20000 boxes"):
-        patch_step(tmp_path / "p.step", level_map, Window(0, 0, 5, 5), most_boxes=20_001)
+        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 0, 5, 5), most_boxes=20_001)
     with pytest.raises(InputError, match="window"):
-        patch_step(tmp_path / "p.step", level_map, Window(0, 46, 5, 5))
+        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 46, 5, 5))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("patch", "window"),
     [
-        (Patch(0.0, 0.0, 4 * UM), Window(8, 13, 4, 4)),
+        (Patch(0.0, 0.0, 4 * UM), PixelWindow(8, 13, 4, 4)),
         (Patch(-15 * UM, 10 * UM, 1 * UM), None),
-        (Patch(-14.5 * UM, 9.5 * UM, 1 * UM), Window(19, 0, 1, 1)),
-        (Patch(5 * UM, -4 * UM, 3.4 * UM), Window(4, 18, 3, 3)),
+        (Patch(-14.5 * UM, 9.5 * UM, 1 * UM), PixelWindow(19, 0, 1, 1)),
+        (Patch(5 * UM, -4 * UM, 3.4 * UM), PixelWindow(4, 18, 3, 3)),
         (Patch(5 * UM, -4 * UM, 0.4 * UM), None),
         (Patch(0.0, 0.0, 21 * UM), None),
         (Patch(float("nan"), 0.0, 1 * UM), None),

@@ -7,7 +7,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import read_height
 from fab.levels import Levels, height_of
-from fab.solids.columns import Window, whole
+from fab.solids.columns import PixelWindow, whole
 from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_sag
 from fab.units import NM, UM
 from tests.fab.maps import level_map_from
@@ -110,7 +110,7 @@ def test_a_grid_sag_is_the_etch_depth_below_the_blank_surface(tmp_path, side, si
 
 
 def test_a_window_of_a_grid_sag_lies_where_it_is_on_the_plate(tmp_path):
-    window = Window(1, 4, 6, 5)
+    window = PixelWindow(1, 4, 6, 5)
     level_map = some_map()
     write_zemax_sag(tmp_path / "s.dat", level_map, window)
     header = np.loadtxt(tmp_path / "s.dat", max_rows=1)
@@ -130,11 +130,11 @@ def test_a_window_of_a_grid_sag_lies_where_it_is_on_the_plate(tmp_path):
 @pytest.mark.parametrize(
     ("window", "words"),
     [
-        (Window(0, 0, 4, 10), "at least 5 points"),
-        (Window(0, 6, 7, 4), "at least 5 points"),
-        (Window(0, 0, 8, 10), "must be filled and lie on"),
-        (Window(-1, 0, 5, 5), "must be filled and lie on"),
-        (Window(0, 0, 0, 5), "must be filled and lie on"),
+        (PixelWindow(0, 0, 4, 10), "at least 5 points"),
+        (PixelWindow(0, 6, 7, 4), "at least 5 points"),
+        (PixelWindow(0, 0, 8, 10), "must be filled and lie on"),
+        (PixelWindow(-1, 0, 5, 5), "must be filled and lie on"),
+        (PixelWindow(0, 0, 0, 5), "must be filled and lie on"),
     ],
 )
 def test_windows_that_no_program_can_read_are_refused(tmp_path, window, words):

@@ -1,0 +1,89 @@
+"""The meshes of an order: the relief, and on request a window at full resolution, as 3MF, GLB and STL.
+
+A mesh must have the stated volume, and above every column of the map a top of the right height and area.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from fab.level_map import LevelMap
+from fab.manifest.records import ModelEntry
+from fab.solids.columns import Columns, reduced_cells, window_cells
+from fab.solids.mesh import Mesh
+from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
+from fab.solids.model import BASE_M, MESH_CELLS, DoeModel, MeshedRelief, ModelKind, Stated, window_of
+from fab.solids.step_files import volume_problems
+from fab.units import MM
+
+__all__ = ["PATCHES", "RELIEFS"]
+
+# What is left of a volume: picometres as text or single precision.
+_RELATIVE_ERROR, _SINGLE = 1e-6, 2.0**-23
+
+_Shown = Callable[[DoeModel], MeshedRelief | None]
+
+
+def _write(path: Path, model: DoeModel, shown: _Shown, unit: str, write: Callable[[Path, Mesh], None]) -> Stated | None:
+    relief = shown(model)
+    if relief is None:
+        return None
+    write(path, relief.mesh)
+    cells, off = relief.cells, _RELATIVE_ERROR
+    if relief.window is not None and write is not write_3mf:
+        # In single precision walls stand aside, the more so the farther out; over a whole map that cancels out.
+        edges, closest = (np.concatenate([f(cells.x_edges_m), f(cells.y_edges_m)]) for f in (np.abs, np.diff))
+        off += _SINGLE * float(edges.max() / closest.min())
+    volume = {"RELIEF": (cells.volume_m3 + cells.area_m2 * BASE_M) / MM**3}
+    return Stated(f"{unit}; {relief.about}", volume, relative_error=off, window=relief.window)
+
+
+def _problems(path: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
+    mesh, window = read_mesh(path, "mm" if path.suffix == ".stl" else None), window_of(entry)
+    cells = reduced_cells(level_map, MESH_CELLS) if window is None else window_cells(level_map, window)
+    return volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3}) + _top_problems(mesh, cells)
+
+
+def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
+    """Look at what faces up: it must cover every column once, at the height of that column."""
+    a, b, c = (mesh.vertices_m[mesh.triangles[:, corner]] for corner in range(3))
+    along, across = b - a, c - a
+    areas = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2
+    widths, depths = np.diff(cells.x_edges_m), np.diff(cells.y_edges_m)
+    # The top of a column is two triangles, and walls stand upright but for the rounding of their corners.
+    up = areas > 0.1 * widths.min() * depths.min()
+    middles = (a[up] + b[up] + c[up]) / 3
+    shape = cells.height_m.shape
+    column = np.searchsorted(cells.x_edges_m, middles[:, 0], side="right") - 1
+    row = np.searchsorted(cells.y_edges_m, middles[:, 1], side="right") - 1
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    place = np.where(inside, row * shape[1] + column, 0)
+    tops = np.stack([a[up, 2], b[up, 2], c[up, 2]], axis=1) - (cells.height_m - cells.blank_m).ravel()[place][:, None]
+    far = float(max(np.abs(cells.x_edges_m).max(), np.abs(cells.y_edges_m).max()))
+    # Numbers in the files are rounded to single precision or to a picometre.
+    level = np.abs(tops).max(axis=1) <= _SINGLE * max(1e-6, cells.blank_m) + 2e-12
+    sound = np.bincount(place, weights=areas[up] * (inside & level), minlength=cells.height_m.size).reshape(shape)
+    rounding = 4 * (1e-12 + _SINGLE * far) / min(widths.min(), depths.min())
+    wrong = np.abs(sound / (depths[:, None] * widths) - 1) > rounding
+    problems = []
+    if wrong.any():
+        count, (row, column) = np.count_nonzero(wrong), np.unravel_index(int(np.argmax(wrong)), shape)
+        problems.append(
+            f"{count} columns have no top of the height of the level map, the first at row {row}, column {column}"
+        )
+    stray = int(np.count_nonzero(~inside))
+    return problems + ([f"{stray} triangles face up outside the map"] if stray else [])
+
+
+def _kinds(name: str, shown: _Shown) -> tuple[ModelKind, ...]:
+    formats = ((".3mf", "millimetres", write_3mf), (".glb", "metres", write_glb), ("_MM.stl", "millimetres", write_stl))
+    return tuple(
+        ModelKind(f"{name}{ending}", partial(_write, shown=shown, unit=unit, write=write), _problems)
+        for ending, unit, write in formats
+    )
+
+
+RELIEFS = _kinds("_RELIEF", lambda model: model.relief)
+PATCHES = _kinds("_PATCH", lambda model: model.detail)

@@ -1,0 +1,124 @@
+"""What the solids, meshes and height maps of an order show, and what a kind of file is."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+from fab.layout.geometry import Chrome
+from fab.layout.wafer import Wafer
+from fab.level_map import LevelMap
+from fab.manifest.records import ModelEntry
+from fab.solids.columns import Columns, PixelWindow, reduced_cells
+from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
+from fab.solids.patch import Patch
+from fab.units import format_length
+
+__all__ = ["BASE_M", "MESH_CELLS", "DoeModel", "MeshedRelief", "ModelKind", "Stated", "window_of"]
+
+MESH_CELLS = 400
+# Glass below the deepest floor of a mesh or a patch.
+BASE_M = 10e-6
+
+
+class MeshedRelief(NamedTuple):
+    """Columns of a relief, their closed mesh, what it shows in words, and the window it was cut from, if any."""
+
+    cells: Columns
+    mesh: Mesh
+    about: str
+    window: PixelWindow | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DoeModel:
+    """A DOE on its glass, as all models show it.
+
+    Attributes:
+        level_map: the DOE.
+        chrome: how the chrome is drawn.
+        wafer: the glass.
+        die_m: edge of the die, metres.
+        dies: middles of the dies on the wafer x, y, metres.
+        patch: the window that is wanted at full resolution, if any.
+    """
+
+    level_map: LevelMap
+    chrome: Chrome
+    wafer: Wafer
+    die_m: float
+    dies: Sequence[tuple[float, float]]
+    patch: Patch | None = None
+
+    @cached_property
+    def relief(self) -> MeshedRelief:
+        """The whole relief, block-reduced where it is large."""
+        cells = reduced_cells(self.level_map, MESH_CELLS)
+        blocks = f"mean height of {cells.block} x {cells.block} pixels"
+        return _meshed(cells, f"relief on {format_length(BASE_M)} of glass, {blocks}")
+
+    @cached_property
+    def detail(self) -> MeshedRelief | None:
+        """The patch at full resolution; None if none is wanted."""
+        if self.patch is None:
+            return None
+        grid, window = self.level_map.grid, self.patch.window(self.level_map.grid)
+        middle = ", ".join(format_length(value) for value in window.centre_m(grid))
+        about = (
+            f"{window.rows} x {window.columns} pixels of {format_length(grid.pitch_m)} about {middle} of the DOE, "
+            f"on {format_length(BASE_M)} of glass"
+        )
+        return _meshed(self.patch.cells(self.level_map), about, window)
+
+
+def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> MeshedRelief:
+    mesh = relief_mesh(cells, BASE_M)
+    closed_volume_m3(mesh)
+    return MeshedRelief(cells, mesh, about, window)
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the manifest says of a model's file; the fields are those of `fab.manifest.records.ModelEntry`."""
+
+    content: str
+    volumes_mm3: Mapping[str, float] = field(default_factory=dict)
+    centres_mm: Mapping[str, list[float]] = field(default_factory=dict)
+    relative_error: float = 0.0
+    metres_per_count: float | None = None
+    window: PixelWindow | None = None
+
+    def entry(self, file: str) -> ModelEntry:
+        """Return the manifest's entry of the file."""
+        pixels = None if self.window is None else list(astuple(self.window))
+        return ModelEntry(
+            file,
+            self.content,
+            dict(self.volumes_mm3),
+            dict(self.centres_mm),
+            self.relative_error,
+            self.metres_per_count,
+            pixels,
+        )
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """One kind of file that an order holds besides its masks: how it is written, and how it is proved.
+
+    Attributes:
+        ending: what its name ends with after that of the order, such as "_HEIGHT.tif".
+        write: writes the file and says what the manifest states of it; None if this DOE has no such file.
+        problems: reads a file back, whose bytes are known to be those of the manifest, and returns one sentence per
+            difference from its entry and from the level map.
+    """
+
+    ending: str
+    write: Callable[[Path, DoeModel], Stated | None]
+    problems: Callable[[Path, ModelEntry, LevelMap], list[str]]
+
+
+def window_of(entry: ModelEntry) -> PixelWindow | None:
+    """Return the window that a file shows; None for the whole map."""
+    return None if entry.window_px is None else PixelWindow(*entry.window_px)

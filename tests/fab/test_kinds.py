@@ -1,0 +1,57 @@
+"""A new kind of file in an order is a module of its own and one line in `fab.solids.write.KINDS`."""
+
+import numpy as np
+import pytest
+
+from fab.manifest.records import read_manifest
+from fab.order.write import write_order
+from fab.solids import write
+from fab.solids.model import ModelKind, Stated
+from fab.verification.verify import verify
+from tests.fab.maps import level_map_from
+from tests.fab.mended import mend, told
+
+
+def write_counts(path, model):
+    path.write_text(" ".join(map(str, np.bincount(model.level_map.level.ravel()))))
+    return Stated("how many pixels have each level")
+
+
+def count_problems(path, entry, level_map):
+    found = [int(word) for word in path.read_text().split()]
+    return [] if found == np.bincount(level_map.level.ravel()).tolist() else ["other numbers of pixels"]
+
+
+def not_for_this_doe(path, model):
+    return None
+
+
+@pytest.fixture
+def order(tmp_path, monkeypatch):
+    kinds = (
+        ModelKind("_COUNTS.txt", write_counts, count_problems),
+        ModelKind("_NONE.txt", not_for_this_doe, count_problems),
+    )
+    monkeypatch.setattr(write, "KINDS", (*write.KINDS, *kinds))
+    level = np.random.default_rng(0).integers(0, 16, (19, 18))
+    return write_order(tmp_path / "o", level_map_from(level, aperture_m=18e-6, name="toy"))
+
+
+def test_it_is_written_listed_and_proved(order):
+    manifest = read_manifest(order.folder)
+    listed = {entry.file: entry for entry in manifest.files}
+    assert listed["DOE_TOY_COUNTS.txt"].format == "TXT"
+    assert not any("NONE" in file for file in listed)
+    assert {model.file: model.content for model in manifest.models}["DOE_TOY_COUNTS.txt"].startswith("how many")
+    assert [c.passed for c in verify(order).checks if c.file == "DOE_TOY_COUNTS.txt"] == [True, True]
+
+
+def test_what_is_wrong_in_it_is_told(order):
+    (order.folder / "DOE_TOY_COUNTS.txt").write_text("1 2 3")
+    mend(order.folder, "DOE_TOY_COUNTS.txt")
+    assert "other numbers of pixels" in told(order.folder, "DOE_TOY_COUNTS.txt")
+
+
+def test_a_kind_that_nobody_knows_is_told(order, monkeypatch):
+    monkeypatch.setattr(write, "KINDS", write.KINDS[:-2])
+    assert "a kind of file that is not known" in told(order.folder, "DOE_TOY_COUNTS.txt")
