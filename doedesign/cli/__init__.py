@@ -13,7 +13,7 @@ from doedesign.cli.design import masks, optimize, verify
 from doedesign.cli.light import psf, simulate
 from doedesign.cli.network import finetune, reconstruct, train
 from doedesign.cli.process import calibrate, tolerance
-from doedesign.cli.talk import exit_code
+from doedesign.cli.console import exit_code
 
 __all__ = ["app", "exit_code", "main"]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from doedesign.cli.options import AsJson, Overrides, length_of
-from doedesign.cli.talk import print_paths, print_text, say
+from doedesign.cli.console import print_paths, print_text, say
 from fab.errors import InputError
 
 

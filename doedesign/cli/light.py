@@ -1,4 +1,4 @@
-"""What a design does with light: psf, simulate."""
+"""PSFs and captures of a design: psf, simulate."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from doedesign.cli.options import AsJson, Overrides, length_of
-from doedesign.cli.talk import print_paths, say
+from doedesign.cli.console import print_paths, say
 from fab.errors import InputError
 
 

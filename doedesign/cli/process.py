@@ -1,4 +1,4 @@
-"""What the errors of a process do, and which there were: tolerance, calibrate."""
+"""Tolerances and calibration: tolerance, calibrate."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from doedesign.cli.options import AsJson, length_of
-from doedesign.cli.talk import print_paths, print_text, say
+from doedesign.cli.console import print_paths, print_text, say
 from fab.errors import InputError
 
 

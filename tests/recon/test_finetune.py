@@ -133,7 +133,7 @@ def tuned(model: Path, pairs: Path, out: Path, *, drawn: bool = False, **options
     said: list[str] = []
     request = FinetuneSettings(**{"steps": STEPS, "validation": 2, **options})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("doedesign.cli.talk.say", said.append)
+        patch.setattr("doedesign.cli.console.say", said.append)
         for name in () if drawn else ("draw_training", "draw_validation"):
             patch.setattr(command, name, lambda path, *_: write_atomic(path, b"picture"))
         code = exit_code(lambda: finetune(model, pairs, out, request, said.append))

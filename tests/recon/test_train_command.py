@@ -131,7 +131,7 @@ def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> t
     said: list[str] = []
     request = TrainingSettings(images=images, overrides=changes, **more)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("doedesign.cli.talk.say", said.append)
+        patch.setattr("doedesign.cli.console.say", said.append)
         code = exit_code(lambda: train(run, out, request, said.append))
     return code, "\n".join(said)
 

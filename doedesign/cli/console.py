@@ -1,4 +1,4 @@
-"""What commands print, and how they end. stdout is data (paths, or JSON with --json), stderr is talk."""
+"""Output and exit codes of commands: stdout is data (paths, or JSON on request), stderr is messages."""
 
 import contextlib
 import json
@@ -16,12 +16,12 @@ from fab.errors import CheckFailed, InputError
 
 
 def say(text: str) -> None:
-    """Tell what is going on."""
+    """Print a message to stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 class _Stderr(logging.Handler):
-    """Shows what the library logs: plain lines, warnings as such."""
+    """Show records of the library: plain lines, warnings as such."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say(f"warning: {record.getMessage()}" if record.levelno >= logging.WARNING else record.getMessage())
@@ -29,7 +29,7 @@ class _Stderr(logging.Handler):
 
 @contextlib.contextmanager
 def shown_log() -> Iterator[None]:
-    """Show on stderr what the library logs meanwhile."""
+    """Show the log of the library on stderr meanwhile."""
     log, handler = logging.getLogger("doedesign"), _Stderr()
     before, propagate = log.level, log.propagate
     log.addHandler(handler)
@@ -62,7 +62,7 @@ def print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
 
 
 def exit_code(work: Callable[[], Any]) -> int:
-    """Run a command's work; tell a user's mistake in one message instead of a traceback.
+    """Run the work of a command; a mistake of the user becomes one message instead of a traceback.
 
     Returns:
         0 done, 1 a check failed, 2 bad input, 130 interrupted.
