@@ -5,15 +5,16 @@ that --help answers at once.
 """
 
 from collections.abc import Sequence
+from inspect import signature
 
 from cyclopts import App
 
 from doedesign import __version__
+from doedesign.cli.console import exit_code
 from doedesign.cli.design import masks, optimize, verify
 from doedesign.cli.light import psf, simulate
 from doedesign.cli.network import finetune, reconstruct, train
 from doedesign.cli.process import calibrate, tolerance
-from doedesign.cli.console import exit_code
 
 __all__ = ["app", "exit_code", "main"]
 
@@ -32,4 +33,11 @@ app.command(reconstruct, usage="Usage: doedesign reconstruct [OPTIONS] [RUN] CAP
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `doedesign` command."""
-    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False))
+    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False), _option_names())
+
+
+def _option_names() -> frozenset[str]:
+    """Names of the arguments that commands take as options."""
+    functions = (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate, reconstruct)
+    given = (p for function in functions for p in signature(function).parameters.values())
+    return frozenset(p.name.rstrip("_") for p in given if p.kind is p.KEYWORD_ONLY)

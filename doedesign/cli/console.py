@@ -5,7 +5,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ def print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
     print_text(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(names))
 
 
-def exit_code(work: Callable[[], Any]) -> int:
+def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
     """Run the work of a command; a mistake of the user becomes one message instead of a traceback.
 
     Returns:
@@ -71,7 +71,7 @@ def exit_code(work: Callable[[], Any]) -> int:
         with shown_log():
             work()
     except InputError as error:
-        say(f"doedesign: {in_options(error)}")
+        say(f"doedesign: {in_options(error, options)}")
         return 2
     except CheckFailed as error:
         say(f"doedesign: check failed\n{error}")

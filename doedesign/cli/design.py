@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.cli.options import AsJson, Overrides, length_of
 from doedesign.cli.console import print_paths, print_text, say
+from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
 
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from doedesign.cli.options import AsJson, Overrides, length_of
 from doedesign.cli.console import print_paths, say
+from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
 
 

@@ -1,5 +1,6 @@
 """Options that several commands share, and how their values are read."""
 
+from collections.abc import Collection
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -38,9 +39,16 @@ _OPTIONS = {
 }
 
 
-def in_options(error: InputError) -> str:
-    """The message of an error, with the options that its cure asks for."""
+def in_options(error: InputError, options: Collection[str] = ()) -> str:
+    """Message of an error with command-line options in place of the library's arguments.
+
+    Args:
+        error: the error.
+        options: names of arguments that are options.
+    """
     text = str(error)
+    if error.where in options:
+        text = f"--{error.where.replace('_', '-')}{text.removeprefix(error.where)}"
     for words, option in _OPTIONS.items():
         text = text.replace(words, option)
     return text

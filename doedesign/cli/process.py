@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from doedesign.cli.options import AsJson, length_of
 from doedesign.cli.console import print_paths, print_text, say
+from doedesign.cli.options import AsJson, length_of
 from fab.errors import InputError
 
 
