@@ -21,21 +21,20 @@ Files are found relative to the folder of the TOML file. What a lab may say besi
 
 import math
 import re
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field
 
 from doedesign.calibration.target import MeasuredImage
-from doedesign.spec import explain, spec_error
-from doedesign.spec.errors import SpecMistake
+from doedesign.spec import read_toml, spec_error
+from doedesign.spec.errors import validated
 from doedesign.spec.table import SpecTable
-from doedesign.spec.values import FROM_TOML, FarDepth, Pitch, Positive, Wavelength, broken, length
+from doedesign.spec.values import FarDepth, Pitch, Positive, Wavelength, broken, length
 from fab.errors import InputError
-from fab.files import explain_os_error, sha256_file
+from fab.files import sha256_file
 from fab.units import MM
 from sim.camera import Camera
 from sim.frames import CameraFrame, Channel, read_frame
@@ -161,42 +160,33 @@ def load_measurement(path: Path) -> MeasurementSpec:
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
-    try:
-        raw = tomllib.loads(path.read_bytes().decode())
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        cure = "The start of doedesign/calibrate/measurement.py shows one."
-        raise InputError(str(path), "a measurement must be valid TOML", f'"{error}"', cure) from error
-    try:
-        spec = MeasurementSpec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
-    except ValidationError as error:
-        raise spec_error(str(path), explain(error, raw, MeasurementSpec)) from None
+    raw = read_toml(path, "a measurement", "the one at the head of doedesign/calibration/measurement.py")
+    spec = validated(MeasurementSpec, raw, str(path))
     if problems := list(_problems(spec)):
         raise spec_error(str(path), problems)
     return spec
 
 
-def _problems(spec: MeasurementSpec) -> list[SpecMistake]:
+def _problems(spec: MeasurementSpec) -> list[InputError]:
     found, names = [], [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)
         if len(image.exposures) != count and not (count == 1 and not image.exposures):
             rule = f"must have one entry per file, {count} here"
-            found.append(SpecMistake(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
+            found.append(InputError(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
         if len(image.dark) not in (0, 1, count):
             rule = f"must name one dark frame per file, {count} here, or one for all"
-            found.append(SpecMistake(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
+            found.append(InputError(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
         if image.dark and image.black_level is not None:
-            found.append(SpecMistake(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
+            found.append(InputError(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
         if names.index(image.called) != i:
             cure = "Add `name` to one of them."
             found.append(
-                SpecMistake(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure)
+                InputError(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure)
             )
         if image.incident is not None and not image.exposures:
             rule = "counts per second mean nothing without an exposure"
-            found.append(SpecMistake(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
+            found.append(InputError(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
     return found
 
 

@@ -26,7 +26,7 @@ from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
 from doedesign.design.starts import start_heights
 from doedesign.runtime.compiling import compiled_step
-from doedesign.spec import START_NAMES, Spec
+from doedesign.spec import STARTS, Spec
 from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -91,7 +91,7 @@ def initial_state(
         InputError: a start that does not fit the grid or is no raster of rings where rings are optimised.
     """
     camera = problem.camera
-    if spec.optimize.start in START_NAMES:
+    if spec.optimize.start in STARTS:
         heights = start_heights(
             spec.optimize.start,
             spec.optimize.start_options,

@@ -1,104 +1,65 @@
-"""Specs: what the user asks for, read from TOML, checked, and compared by digest.
+"""Specs: a design task as the user states it, read from TOML, checked, and compared by digest.
 
     spec = load_spec("examples/automotive.toml", ["process.levels=8"])
     spec.optics.focal_length_m      # 0.008
     spec_digest(spec)               # the same for the same content, however it was written
 
 Every mistake in a file is an `InputError` that names the file, the key, the rule, the value and the cure; several
-are told together. `spec_warnings` returns what is allowed but probably not meant.
+are reported together. `spec_warnings` returns what is allowed but probably not meant.
 
-    values      the kinds of value a spec holds: lengths, names, options
-    table       what all tables have in common
+    values      the types of value in a spec: lengths, names, options; the built-in objectives and starts
+    table       common ground of all tables
     models      the tables, one per section of the TOML
     scene       the tables of scene, obstruction and sensor
     response    colours of a camera from its spectral response
-    process     the tables of the process: errors, defects, limits of a good plate
+    process     the tables of the process: errors, defects, limits of a good DOE
     wafer       the table of the wafer: dies, mask blanks, chrome
     training    the tables of the network and its training
-    variation   files of their own: a process, the errors of one plate
+    variation   files of their own: a process, the errors of one DOE
     checks      rules that join several tables, and warnings; process_checks those of the process
-    errors      what was wrong, in words a user can act on
+    errors      mistakes in words a user can act on
     text        a spec as TOML and as JSON
 """
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import ValidationError
+from typing import Any, NamedTuple
 
 from doedesign.spec.checks import find_problems, spec_warnings
-from doedesign.spec.errors import SpecError, SpecMistake, explain, key_as_written, spec_error
-from doedesign.spec.models import (
-    ColourSpec,
-    DoeSpec,
-    ObjectiveSpec,
-    ObstructionSpec,
-    OpticsSpec,
-    OptimizeSpec,
-    SceneSpec,
-    SensorSpec,
-    Spec,
-)
-from doedesign.spec.process import DefectsSpec, ErrorsSpec, EtchSpec, LimitSpec, ProcessSpec, SpreadSpec
+from doedesign.spec.errors import SpecError, Table, explain, key_as_written, spec_error, validated
+from doedesign.spec.models import Spec
+from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
-from doedesign.spec.table import SpecTable, toml_key
+from doedesign.spec.table import toml_key
 from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
-from doedesign.spec.training import NetworkSpec, TrainSpec, training_problems
-from doedesign.spec.values import FROM_TOML, HEIGHT_FILES, OBJECTIVE_NAMES, START_NAMES, Options
+from doedesign.spec.training import NetworkSpec, TrainSpec
+from doedesign.spec.values import HEIGHT_FILES, STARTS, Options
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError
 from fab.files import explain_os_error
 from fab.process import Variation
 
-__all__ = [
-    "HEIGHT_FILES",
-    "OBJECTIVE_NAMES",
-    "START_NAMES",
-    "ColourSpec",
-    "DefectsSpec",
-    "DoeSpec",
-    "ErrorsSpec",
-    "EtchSpec",
-    "LimitSpec",
-    "NetworkSpec",
-    "ObjectiveSpec",
-    "ObstructionSpec",
-    "OpticsSpec",
-    "OptimizeSpec",
-    "Options",
-    "ProcessSpec",
-    "SceneSpec",
-    "SensorSpec",
-    "Spec",
-    "SpecError",
-    "SpreadSpec",
-    "TrainSpec",
-    "WaferSpec",
-    "explain",
-    "input_files",
-    "load_process",
-    "load_spec",
-    "load_variation",
-    "load_wafer",
-    "process_from_json",
-    "process_to_toml",
-    "spec_digest",
-    "spec_error",
-    "spec_from_json",
-    "spec_to_json",
-    "spec_to_toml",
-    "spec_warnings",
-    "variation_to_toml",
-]
-
-_Model = TypeVar("_Model", bound=SpecTable)
-
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
+
+
+class _File(NamedTuple):
+    what: str
+    example: str
+    problems: Callable[[Any], Iterable[InputError]] = lambda _: ()
+
+
+_FILES: dict[type, _File] = {
+    Spec: _File("a spec", "examples/quick.toml", find_problems),
+    ProcessFile: _File(
+        "a process", "the [process] table of examples/automotive.toml", lambda file: process_problems(file.process)
+    ),
+    WaferFile: _File("a wafer", "`[wafer]` with `dies = [2, 2]`"),
+    VariationFile: _File("a variation", "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`", variation_problems),
+}
 
 
 def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) -> Spec:
@@ -119,35 +80,23 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
     path = Path(path)
-    raw = _read_toml(path, "a spec")
+    raw = read_toml(path, *_FILES[Spec][:2])
     keys = [_override(raw, text) for text in overrides]
     for name, value in values.items():
         keys.append(key := name.replace("__", ".") if "__" in name else f"optimize.{name}")
         _put(raw, key, value)
-    raw = with_response(raw, path)
-    try:
-        spec = Spec.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
-    except ValidationError as error:
-        raise spec_error(str(path), explain(error, raw), keys) from None
+    spec = _checked(Spec, with_response(raw, path), str(path), keys)
     spec._file = path  # pyright: ignore[reportAttributeAccessIssue]
-    return _checked(spec, raw, str(path), keys)
+    return spec
 
 
 def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
-    """Rebuild a spec from what `spec_to_json` returned.
-
-    Args:
-        data: the JSON object.
-        source: where it came from, for the message.
+    """Rebuild a spec from the JSON object that `spec_to_json` returned; `source` names it in messages.
 
     Raises:
         InputError: the object is not a spec of this version.
     """
-    try:
-        spec = Spec.model_validate(data)
-    except ValidationError as error:
-        raise spec_error(source, explain(error, data)) from None
-    return _checked(spec, data, source, [])
+    return _checked(Spec, data, source, si=True)
 
 
 def load_process(path: str | Path) -> ProcessSpec:
@@ -159,11 +108,7 @@ def load_process(path: str | Path) -> ProcessSpec:
     Raises:
         InputError: the file cannot be read, is no TOML, has no process, or breaks a rule.
     """
-    raw = _alone(_read_toml(Path(path), "a process"), "process")
-    process = _model_of_toml(ProcessFile, raw, str(path)).process
-    if problems := [p._replace(key=key_as_written(p.key, raw)) for p in process_problems(process)]:
-        raise spec_error(str(path), problems)
-    return process
+    return _load(ProcessFile, path, "process").process
 
 
 def load_wafer(path: str | Path) -> WaferSpec:
@@ -175,13 +120,7 @@ def load_wafer(path: str | Path) -> WaferSpec:
     Raises:
         InputError: the file cannot be read, is no TOML, has no wafer, or breaks a rule.
     """
-    return _model_of_toml(WaferFile, _alone(_read_toml(Path(path), "a wafer"), "wafer"), str(path)).wafer
-
-
-def _alone(raw: Mapping[str, Any], table: str) -> dict[str, Any]:
-    """What was read without the other tables of a spec."""
-    others = {toml_key(name) for name in Spec.model_fields} - {table}
-    return {key: raw[key] for key in raw if key not in others}
+    return _load(WaferFile, path, "wafer").wafer
 
 
 def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
@@ -194,33 +133,36 @@ def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
     Raises:
         InputError: the values are not those of a process, or break a rule.
     """
-    raw = {"process": data}
-    try:
-        process = ProcessFile.model_validate(raw).process
-    except ValidationError as error:
-        raise spec_error(source, explain(error, raw, ProcessFile)) from None
-    if problems := list(process_problems(process)):
-        raise spec_error(source, problems)
-    return process
+    return _checked(ProcessFile, {"process": data}, source, si=True).process
 
 
 def load_variation(path: str | Path) -> Variation:
-    """Read the errors of one plate from TOML, as `variation_to_toml` writes them.
+    """Read the errors of one DOE from TOML, as `variation_to_toml` writes them.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
-    file = _model_of_toml(VariationFile, _read_toml(Path(path), "a variation"), str(path))
-    if problems := list(variation_problems(file)):
-        raise spec_error(str(path), problems)
-    return file.value()
+    return _load(VariationFile, path).value()
 
 
-def _model_of_toml(model: type[_Model], raw: Mapping[str, Any], source: str) -> _Model:
-    try:
-        return model.model_validate(raw, by_alias=True, by_name=False, context=FROM_TOML)
-    except ValidationError as error:
-        raise spec_error(source, explain(error, raw, model)) from None
+def _load(model: type[Table], path: str | Path, table: str | None = None) -> Table:
+    """Read a file; with a `table`, pass over the other tables of a spec."""
+    raw = read_toml(Path(path), *_FILES[model][:2])
+    others = {toml_key(name) for name in Spec.model_fields if table} - {table}
+    return _checked(model, {key: value for key, value in raw.items() if key not in others}, str(path))
+
+
+def _checked(
+    model: type[Table], raw: Mapping[str, Any], source: str, overridden: Collection[str] = (), *, si: bool = False
+) -> Table:
+    """Return the tables of a file as a model that obeys the rules between its values, too; see `validated`."""
+    value = validated(model, raw, source, overridden, si=si)
+    mistakes = list(_FILES[model].problems(value))
+    for mistake in mistakes:
+        mistake.where = mistake.where if si else key_as_written(mistake.where, raw)
+    if mistakes:
+        raise spec_error(source, mistakes, overridden)
+    return value
 
 
 def input_files(spec: Spec) -> dict[str, Path]:
@@ -232,16 +174,14 @@ def input_files(spec: Spec) -> dict[str, Path]:
     Raises:
         InputError: a file is missing.
     """
-    named = {}
-    if spec.optimize.start not in START_NAMES:
-        named["optimize.start"] = spec.optimize.start
+    named = {} if spec.optimize.start in STARTS else {"optimize.start": spec.optimize.start}
     for index, objective in enumerate(spec.objectives):
         if "image" in objective.options:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
     folder = Path() if spec.file is None else spec.file.parent
     files = {key: folder / name for key, name in named.items()}
     missing = [
-        SpecMistake(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
+        InputError(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
         for key, file in files.items()
         if not file.is_file()
     ]
@@ -250,37 +190,28 @@ def input_files(spec: Spec) -> dict[str, Path]:
     return files
 
 
-def _checked(spec: Spec, raw: Mapping[str, Any], source: str, overridden: Sequence[str]) -> Spec:
-    of_training = training_problems(spec.network, spec.train, len(spec.optics.colours))
-    found = [*find_problems(spec), *(SpecMistake(*told) for told in of_training)]
-    problems = [problem._replace(key=key_as_written(problem.key, raw)) for problem in found]
-    if problems:
-        raise spec_error(source, problems, overridden)
-    return spec
+def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
+    """Read the tables of a TOML file.
 
+    Args:
+        path: the file.
+        what: what it should hold, for messages: "a spec".
+        example: one that exists, for messages.
 
-def _read_toml(path: Path, what: str) -> dict[str, Any]:
-    cure = f"Give {what} such as {_EXAMPLES[what]}."
+    Raises:
+        InputError: the file cannot be read or is no TOML.
+    """
+    cure = f"Give {what} such as {example}."
     try:
-        content = path.read_bytes()
+        return tomllib.loads(path.read_bytes().decode())
     except OSError as error:
         raise explain_os_error(error, path) from error
-    try:
-        return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(str(path), f"{what} must be valid TOML", f'"{error}"', "Mend that line.") from error
+        raise InputError(str(path), f"{what} must be valid TOML", f'"{error}"', "Fix that line.") from error
     except RecursionError as error:
         raise InputError(str(path), f"{what} must be valid TOML", "brackets without end", cure) from error
-
-
-_EXAMPLES = {
-    "a spec": "examples/quick.toml",
-    "a process": "the [process] table of examples/automotive.toml",
-    "a wafer": "`[wafer]` with `dies = [2, 2]`",
-    "a variation": "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`",
-}
 
 
 def _override(raw: dict[str, Any], text: str) -> str:
@@ -288,7 +219,13 @@ def _override(raw: dict[str, Any], text: str) -> str:
     found = _OVERRIDE.fullmatch(text)
     if not found:
         raise InputError("--set", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
-    _put(raw, found[1], _override_value(found[2].strip()))
+    value = found[2].strip()
+    try:
+        table = tomllib.loads(f"value = {value}")
+    except tomllib.TOMLDecodeError:
+        table = {}
+    # Anything that is no TOML value is text, so that `sensor.pitch=1.85 um` needs no quotes.
+    _put(raw, found[1], table["value"] if len(table) == 1 else value)
     return found[1]
 
 
@@ -296,25 +233,12 @@ def _put(raw: dict[str, Any], key: str, value: Any) -> None:
     *parents, last = key.split(".")
     place: Any = raw
     for part in parents:
-        place = place.setdefault(part, {}) if isinstance(place, dict) else _entry(place, part, key)
-    if isinstance(place, dict):
-        place[last] = value
-    else:
-        _entry(place, last, key)
-        place[int(last)] = value
+        place = place.setdefault(part, {}) if isinstance(place, dict) else place[_index(place, part, key)]
+    place[last if isinstance(place, dict) else _index(place, last, key)] = value
 
 
-def _entry(place: Any, part: str, key: str) -> Any:
+def _index(place: Any, part: str, key: str) -> int:
     if isinstance(place, list) and part.isdecimal() and int(part) < len(place):
-        return place[int(part)]
+        return int(part)
     count = f"a list of {len(place)}" if isinstance(place, list) else "a single value"
-    raise InputError(f"--set: {key}", f"`{part}` must be an entry of what the spec holds there", count, "Mend the key.")
-
-
-def _override_value(text: str) -> Any:
-    """Read a TOML value; what is none is text, so that `sensor.pitch=1.85 um` needs no quotes."""
-    try:
-        table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
-        return text
-    return table["value"] if len(table) == 1 else text
+    raise InputError(f"--set: {key}", f"`{part}` must be an entry of what the spec holds there", count, "Fix the key.")

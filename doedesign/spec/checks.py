@@ -1,13 +1,12 @@
-"""Rules that join several values of a spec: the optics must be possible, and what is doubtful is said aloud.
+"""Rules that join several values of a spec, so that the optics are possible, and warnings of what is doubtful.
 
-A broken rule is a `SpecMistake`; a doubt is a sentence. Neither changes the spec.
+A broken rule is an `InputError` whose `where` is the key; a warning is a sentence. Neither changes the spec.
 """
 
 import math
 import operator
 from collections.abc import Iterator
 
-from doedesign.spec.errors import SpecMistake
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import (
     limit_problems,
@@ -16,18 +15,17 @@ from doedesign.spec.process_checks import (
     process_problems,
     wafer_problem,
 )
+from doedesign.spec.training import training_problems
+from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
 
-__all__ = ["find_problems", "spec_warnings"]
-
-_NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 _WAVE_TOLERANCE = 0.02
 
 
-def find_problems(spec: Spec) -> list[SpecMistake]:
-    """Return every rule between tables that a spec breaks.
+def find_problems(spec: Spec) -> list[InputError]:
+    """Return every rule between values that a spec breaks.
 
     Args:
         spec: a spec whose single values are valid.
@@ -44,62 +42,48 @@ def find_problems(spec: Spec) -> list[SpecMistake]:
         _source_sampling,
         _fresnel_sampling,
         _objectives,
-        _process,
+        lambda spec: process_problems(spec.process),
         wafer_problem,
         limit_problems,
+        lambda spec: training_problems(spec.network, spec.train, len(spec.optics.colours)),
     )
     return [problem for rule in rules for problem in rule(spec)]
 
 
-def _process(spec: Spec) -> Iterator[SpecMistake]:
-    return process_problems(spec.process)
-
-
-def _opening(spec: Spec) -> Iterator[SpecMistake]:
+def _opening(spec: Spec) -> Iterator[InputError]:
     overlap, aperture = spec.process.chrome_overlap_m, spec.doe.aperture_m
     if aperture - 2 * overlap < 2 * spec.doe.pitch_m:
-        yield SpecMistake(
-            "process.chrome_overlap",
-            f"twice the overlap must leave an opening in an aperture of {format_length(aperture)}",
-            format_length(overlap),
-            "Choose a smaller overlap.",
-        )
+        rule = f"twice the overlap must leave an opening in an aperture of {format_length(aperture)}"
+        yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
 
 
-def _sensor(spec: Spec) -> Iterator[SpecMistake]:
+def _sensor(spec: Spec) -> Iterator[InputError]:
     focal, defocus = spec.optics.focal_length_m, spec.sensor.defocus_m
     if defocus <= -focal / 2:
-        yield SpecMistake(
-            "sensor.defocus",
-            f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens",
-            format_length(defocus),
-            "Choose a smaller defocus.",
-        )
+        rule = f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens"
+        yield InputError("sensor.defocus", rule, format_length(defocus), "Choose a smaller defocus.")
 
 
-def _efficiencies(spec: Spec) -> Iterator[SpecMistake]:
-    given, colours = len(spec.sensor.quantum_efficiency), len(spec.optics.colours)
-    if given not in (0, 1, colours):
+def _efficiencies(spec: Spec) -> Iterator[InputError]:
+    count, colours = len(spec.sensor.quantum_efficiency), len(spec.optics.colours)
+    if count not in (0, 1, colours):
         rule = f"must be one number or one per colour, {colours} here"
-        yield SpecMistake("sensor.quantum_efficiency", rule, f"{given}", "Add or remove numbers.")
+        yield InputError("sensor.quantum_efficiency", rule, f"{count}", "Add or remove numbers.")
 
 
-def _mosaic(spec: Spec) -> Iterator[SpecMistake]:
+def _mosaic(spec: Spec) -> Iterator[InputError]:
     means = [sum(map(operator.mul, c.wavelengths_m, c.weights)) for c in spec.optics.colours]
     if spec.sensor.bayer and not (len(means) == 3 and means[0] > means[1] > means[2]):
-        yield SpecMistake(
-            "sensor.bayer",
-            "a mosaic needs three colours, from the longest wavelength to the shortest",
-            ", ".join(colour.name for colour in spec.optics.colours),
-            "State the colours as red, green, blue, or leave `bayer` out.",
-        )
+        rule = "a mosaic needs three colours, from the longest wavelength to the shortest"
+        got = ", ".join(colour.name for colour in spec.optics.colours)
+        yield InputError("sensor.bayer", rule, got, "State the colours as red, green, blue, or leave `bayer` out.")
 
 
-def _wavelengths(spec: Spec) -> list[float]:
-    return sorted({w for colour in spec.optics.colours for w in colour.wavelengths_m})
+def _shortest_m(spec: Spec) -> float:
+    return min(wavelength_m for colour in spec.optics.colours for wavelength_m in colour.wavelengths_m)
 
 
-def _materials(spec: Spec) -> Iterator[SpecMistake]:
+def _materials(spec: Spec) -> Iterator[InputError]:
     named = [("optics.design_wavelength", spec.optics.design_wavelength_m)]
     for index, colour in enumerate(spec.optics.colours):
         named += [(f"optics.colours[{index}].wavelengths", wavelength_m) for wavelength_m in colour.wavelengths_m]
@@ -107,106 +91,83 @@ def _materials(spec: Spec) -> Iterator[SpecMistake]:
         try:
             refractive_index(spec.doe.material, wavelength_m)
         except InputError as error:
-            yield SpecMistake(key, f"{error.rule} ({spec.doe.material})", str(error.got), error.cure)
+            yield InputError(key, f"{error.rule} ({spec.doe.material})", str(error.got), error.cure)
 
 
-def _colours(spec: Spec) -> Iterator[SpecMistake]:
+def _colours(spec: Spec) -> Iterator[InputError]:
     names = [colour.name for colour in spec.optics.colours]
     for index, name in enumerate(names):
         if name in names[:index]:
-            yield SpecMistake(
-                f"optics.colours[{index}].name",
-                "every colour channel must have its own name",
-                f"{name!r} twice",
-                "Rename or remove one of them.",
-            )
+            key, rule = f"optics.colours[{index}].name", "every colour channel must have its own name"
+            yield InputError(key, rule, f"{name!r} twice", "Rename or remove one of them.")
 
 
-def _aperture(spec: Spec) -> Iterator[SpecMistake]:
+def _aperture(spec: Spec) -> Iterator[InputError]:
     doe = spec.doe
     span_m = doe.samples * doe.pitch_m
     # One part in a million of slack, for values that lie on the limit in decimal.
     if abs(doe.aperture_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
-        yield SpecMistake(
-            "doe.aperture",
-            f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {format_length(span_m)} "
-            "to within half a pitch",
-            format_length(doe.aperture_m),
-            f'Set aperture = "{format_length(span_m)}" or samples = {max(2, round(doe.aperture_m / doe.pitch_m))}.',
-        )
+        span = format_length(span_m)
+        rule = f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {span}"
+        cure = f'Set aperture = "{span}" or samples = {max(2, round(doe.aperture_m / doe.pitch_m))}.'
+        yield InputError("doe.aperture", f"{rule} to within half a pitch", format_length(doe.aperture_m), cure)
 
 
-def _depth_order(spec: Spec) -> Iterator[SpecMistake]:
+def _depth_order(spec: Spec) -> Iterator[InputError]:
     near, far = spec.scene.near_m, spec.scene.far_m
     if near and max(near) >= min(far):
-        yield SpecMistake(
-            "scene.near",
-            "every near depth must be smaller than every far depth",
-            f"{format_length(max(near))} near and {_depth_text(min(far))} far",
-            "Move the obstruction closer or the scene away.",
-        )
+        farthest = "inf" if math.isinf(min(far)) else format_length(min(far))
+        got = f"{format_length(max(near))} near and {farthest} far"
+        rule = "every near depth must be smaller than every far depth"
+        yield InputError("scene.near", rule, got, "Move the obstruction closer or the scene away.")
 
 
-def _depth_text(depth_m: float) -> str:
-    return "inf" if math.isinf(depth_m) else format_length(depth_m)
+def _nyquist_length_m(spec: Spec) -> float:
+    """Radius of the strongest wavefront curvature the cells can sample (paper eq. 6), at the shortest wavelength."""
+    return spec.doe.samples * spec.doe.pitch_m**2 / _shortest_m(spec)
 
 
-def _nyquist_length_m(spec: Spec, wavelength_m: float) -> float:
-    """Return N pitch^2 / lambda: the shortest radius of curvature the cells can sample (paper eq. 6)."""
-    return spec.doe.samples * spec.doe.pitch_m**2 / wavelength_m
-
-
-def _source_sampling(spec: Spec) -> Iterator[SpecMistake]:
+def _source_sampling(spec: Spec) -> Iterator[InputError]:
     """Check that neighbouring cells see a source less than half a wave apart: the bound of eq. 6 for the depth."""
-    shortest_m = _nyquist_length_m(spec, _wavelengths(spec)[0])
+    least_m = _nyquist_length_m(spec)
     for key, depths in (("scene.near", spec.scene.near_m), ("scene.far", spec.scene.far_m)):
-        if depths and min(depths) < shortest_m:
-            yield SpecMistake(
-                key,
-                f"every depth must be at least samples x pitch^2 / wavelength = {_round_length(shortest_m)}, "
-                "or the cells cannot follow the wave of the source",
-                format_length(min(depths)),
-                "Move the source away or choose a finer pitch for the same aperture.",
-            )
+        if depths and min(depths) < least_m:
+            rule = f"every depth must be at least samples x pitch^2 / wavelength = {_rounded(least_m)}, "
+            rule += "or the cells cannot follow the wave of the source"
+            cure = "Move the source away or choose a finer pitch for the same aperture."
+            yield InputError(key, rule, format_length(min(depths)), cure)
 
 
-def _round_length(length_m: float) -> str:
+def _rounded(length_m: float) -> str:
     """Write a derived length with four digits."""
     return format_length(float(f"{length_m:.4g}"))
 
 
-def _fresnel_sampling(spec: Spec) -> Iterator[SpecMistake]:
-    if spec.optics.propagation != "fresnel":
-        return
-    wavelength_m, focal_m = _wavelengths(spec)[0], spec.optics.focal_length_m
-    needed_m = _nyquist_length_m(spec, wavelength_m)
-    if needed_m <= focal_m:
+def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
+    wavelength_m, focal_m, needed_m = _shortest_m(spec), spec.optics.focal_length_m, _nyquist_length_m(spec)
+    if spec.optics.propagation != "fresnel" or needed_m <= focal_m:
         return
     span_m = spec.doe.samples * spec.doe.pitch_m
     samples = math.ceil(span_m**2 / (wavelength_m * focal_m))
     samples += samples % 2
-    yield SpecMistake(
+    yield InputError(
         "optics.propagation",
         '"fresnel" needs samples x pitch^2 / wavelength <= focal_length at every wavelength (eq. 6)',
-        f"{_round_length(needed_m)} > {format_length(focal_m)} at {format_length(wavelength_m)}",
-        f"For this aperture the pitch may be at most {_round_length(wavelength_m * focal_m / span_m)} "
-        f'(samples = {samples}, pitch = "{_round_length(span_m / samples)}"); or set propagation = "far_field".',
+        f"{_rounded(needed_m)} > {format_length(focal_m)} at {format_length(wavelength_m)}",
+        f"For this aperture the pitch may be at most {_rounded(wavelength_m * focal_m / span_m)} "
+        f'(samples = {samples}, pitch = "{_rounded(span_m / samples)}"); or set propagation = "far_field".',
     )
 
 
-def _objectives(spec: Spec) -> Iterator[SpecMistake]:
+def _objectives(spec: Spec) -> Iterator[InputError]:
     if not spec.objectives and spec.optimize.steps > 0:
-        yield SpecMistake(
-            "objective", "an optimisation must have something to improve", "no [[objective]]", "Add one, or steps = 0."
-        )
+        rule = "an optimisation must have something to improve"
+        yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
     for index, objective in enumerate(spec.objectives):
-        if objective.name in _NEAR_OBJECTIVES and not spec.scene.near_m:
-            yield SpecMistake(
-                f"objective[{index}].name",
-                f'"{objective.name}" looks at near depths, so scene.near must hold one',
-                "an empty scene.near",
-                "Add a depth to scene.near or remove the objective.",
-            )
+        if objective.name in OBJECTIVES and OBJECTIVES[objective.name].near and not spec.scene.near_m:
+            rule = f'"{objective.name}" looks at near depths, so scene.near must hold one'
+            cure = "Add a depth to scene.near or remove the objective."
+            yield InputError(f"objective[{index}].name", rule, "an empty scene.near", cure)
 
 
 def spec_warnings(spec: Spec) -> list[str]:
@@ -221,21 +182,18 @@ def spec_warnings(spec: Spec) -> list[str]:
 
 def _level_warning(spec: Spec) -> Iterator[str]:
     process, material = spec.process, spec.doe.material
-    design_m = spec.optics.design_wavelength_m
     height_m = process.levels * process.level_step_m
-    wave_m = full_wave_height_m(material, design_m)
+    wave_m = full_wave_height_m(material, spec.optics.design_wavelength_m)
     waves = height_m / wave_m
     if abs(waves - 1) <= _WAVE_TOLERANCE:
         return
-    product = f"{process.levels} x {format_length(process.level_step_m)} = {_round_length(height_m)}"
     try:
-        exact_m = full_wave_wavelength_m(material, height_m)
+        exact = f"of {material} is one wave at {full_wave_wavelength_m(material, height_m) / NM:.0f} nm"
     except InputError:
         exact = f"is one wave at no wavelength {material} is known for"
-    else:
-        exact = f"of {material} is one wave at {exact_m / NM:.0f} nm"
     yield (
-        f"process.level_step: {product} {exact}; at the design wavelength of {format_length(design_m)} it is "
+        f"process.level_step: {process.levels} x {format_length(process.level_step_m)} = {_rounded(height_m)} {exact}; "
+        f"at the design wavelength of {format_length(spec.optics.design_wavelength_m)} it is "
         f"{waves:.4f} waves, {100 * (waves - 1):+.1f} % off, so the top of the staircase does not meet its foot. "
         f'A level_step of "{wave_m / process.levels / NM:.2f} nm" would.'
     )
@@ -252,23 +210,21 @@ def _sensor_warning(spec: Spec) -> Iterator[str]:
 
 
 def _reach_warning(spec: Spec) -> Iterator[str]:
-    wavelength_m = _wavelengths(spec)[0]
+    wavelength_m, half_m = _shortest_m(spec), spec.sensor.window_m / 2
     reach_m = spec.optics.focal_length_m * wavelength_m / (2 * spec.doe.pitch_m)
-    if spec.sensor.window_m / 2 > reach_m:
+    if half_m > reach_m:
         yield (
-            f"sensor.window: it ends {spec.sensor.window_m / 2 / UM:.0f} um from the axis, but cells of "
+            f"sensor.window: it ends {half_m / UM:.0f} um from the axis, but cells of "
             f"{format_length(spec.doe.pitch_m)} steer {format_length(wavelength_m)} only {reach_m / UM:.0f} um far; "
             f"beyond that the PSF repeats. At most {int(2 * reach_m / spec.sensor.pixel_m)} pixels avoid it."
         )
 
 
 def _disc_warning(spec: Spec) -> Iterator[str]:
-    if not spec.scene.near_m:
-        return
-    depth_m = min(spec.scene.near_m)
+    depth_m = min(spec.scene.near_m, default=math.inf)
     disc_m = spec.doe.aperture_m * spec.optics.focal_length_m / depth_m
     if disc_m > spec.sensor.window_m:
         yield (
-            f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_round_length(disc_m)} wide, "
-            f"more than the window's {_round_length(spec.sensor.window_m)}; its rim is cut off."
+            f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
+            f"more than the window's {_rounded(spec.sensor.window_m)}; its rim is cut off."
         )

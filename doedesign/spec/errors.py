@@ -1,11 +1,12 @@
-"""What was wrong with a spec, in words a user can act on: file, key, rule, value, cure.
+"""Mistakes of a spec in words a user can act on: file, key, rule, value, cure.
 
-Pydantic finds the mistakes; this file says them. Several mistakes are told at once, as one `SpecError`.
+Pydantic finds the mistakes, this file words them. A mistake is an `InputError` whose `where` is the dotted key;
+`spec_error` puts the file before the key, and joins several mistakes in one `SpecError`.
 """
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
@@ -14,10 +15,11 @@ from pydantic_core import ErrorDetails
 from doedesign.spec.models import Spec
 from doedesign.spec.response import RESPONSE_KEYS
 from doedesign.spec.table import SpecTable, toml_key
-from doedesign.spec.values import nearest
+from doedesign.spec.values import FROM_TOML, nearest
 from fab.errors import InputError
 
-__all__ = ["SpecError", "SpecMistake", "explain", "key_as_written", "spec_error"]
+Location = Sequence[int | str]
+Table = TypeVar("Table", bound=SpecTable)
 
 _SHORT_FORM = 'For example `wavelengths = ["656 nm", "589 nm", "486 nm"]`.'
 _COLOURS_KEY = re.compile(r"optics\.colours(\[\d+\])?.*")
@@ -39,22 +41,6 @@ _RULES = {
 }
 
 
-class SpecMistake(NamedTuple):
-    """One broken rule of a spec.
-
-    Attributes:
-        key: dotted TOML key, such as "doe.aperture".
-        rule: what must hold.
-        got: what came instead.
-        cure: what to do, a full sentence.
-    """
-
-    key: str
-    rule: str
-    got: str
-    cure: str
-
-
 class SpecError(InputError):
     """Several mistakes in one spec; its text lists them, one per line.
 
@@ -73,28 +59,43 @@ class SpecError(InputError):
         return "\n".join(str(mistake) for mistake in self.mistakes)
 
 
-def spec_error(source: str, problems: Sequence[SpecMistake], overridden: Collection[str] = ()) -> InputError:
-    """Make the error to raise for a list of problems.
+def validated(
+    model: type[Table], raw: Mapping[str, Any], source: str, overridden: Collection[str] = (), *, si: bool = False
+) -> Table:
+    """Return the tables of a file as a model.
 
     Args:
-        source: the spec file, as the user named it.
-        problems: at least one.
+        model: the model of the whole file.
+        raw: the tables as they were read.
+        source: where they came from, for the message.
         overridden: dotted keys whose value came from the command line, not from the file.
+        si: whether keys are attributes and lengths numbers in SI units, as in JSON, instead of those of TOML.
+
+    Raises:
+        InputError: a value that the model refuses.
     """
-    mistakes = [
-        InputError(f"{'--set' if _covered(p.key, overridden) else source}: {p.key}", p.rule, p.got, p.cure)
-        for p in problems
+    try:
+        return model.model_validate(raw, by_alias=not si, by_name=si, context=None if si else FROM_TOML)
+    except ValidationError as error:
+        raise spec_error(source, explain(error, raw, model), overridden) from None
+
+
+def spec_error(source: str, mistakes: Sequence[InputError], overridden: Collection[str] = ()) -> InputError:
+    """Return the error to raise for at least one mistake; see `validated` for the other arguments."""
+    named = [
+        InputError(f"{'--set' if _covers(overridden, m.where) else source}: {m.where}", m.rule, m.got, m.cure)
+        for m in mistakes
     ]
-    return mistakes[0] if len(mistakes) == 1 else SpecError(mistakes)
+    return named[0] if len(named) == 1 else SpecError(named)
 
 
-def _covered(key: str, overridden: Collection[str]) -> bool:
+def _covers(overridden: Collection[str], key: str) -> bool:
     dotted = key.replace("[", ".").replace("]", "")
     return any(f"{dotted}.".startswith(f"{k}.") or k.startswith(f"{dotted}.") for k in overridden)
 
 
-def explain(error: ValidationError, raw: Mapping[str, Any], root: type[SpecTable] = Spec) -> list[SpecMistake]:
-    """Translate what pydantic found.
+def explain(error: ValidationError, raw: Mapping[str, Any], root: type[SpecTable] = Spec) -> list[InputError]:
+    """Translate the findings of pydantic.
 
     Args:
         error: the failed validation.
@@ -102,38 +103,32 @@ def explain(error: ValidationError, raw: Mapping[str, Any], root: type[SpecTable
         root: the model of the whole file.
     """
     found = error.errors(include_url=False)
-    # A list whose entries are wrong is also called too short by pydantic; that says nothing new.
+    # Pydantic also calls a list with wrong entries too short, which would only repeat them.
     inner = {details["loc"][:length] for details in found for length in range(len(details["loc"]))}
-    return [_problem(d, raw, root) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
+    return [_mistake(d, raw, root) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
 
 
-def _problem(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable]) -> SpecMistake:
+def _mistake(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable]) -> InputError:
     location, kind, context = details["loc"], details["type"], details.get("ctx", {})
-    key = key_as_written(_dotted(location), raw)
+    key = key_as_written("".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in location).removeprefix("."), raw)
     if kind == "extra_forbidden":
         return _unknown(key, location, root)
+    got, example = _value_text(details["input"]), _example(location, root)
+    if key == "optics.wavelengths":
+        example = _SHORT_FORM
     if kind == "missing":
-        return _missing(key, location, root)
-    got = _shown(details["input"])
+        if isinstance(location[-1], int):
+            return InputError(key, "must be given", "a shorter list", example or "Add the entry.")
+        return InputError(key, "must be given", "nothing", example or f"Add a table [{key}].")
     if kind == "spec":
-        return SpecMistake(key, context["rule"], got, context["cure"])
+        return InputError(key, context["rule"], got, context["cure"])
     if kind == "literal_error":
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ",").split(",")]
-        return SpecMistake(key, f"must be one of {', '.join(choices)}", got, nearest(details["input"], choices))
+        return InputError(key, f"must be one of {', '.join(choices)}", got, nearest(details["input"], choices))
+    if kind == "tuple_type" and key != "optics.wavelengths" and _table_at(location, root):
+        example = f"Write [[{key}]] tables."
     rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
-    cure = _example(location, root) or "Change the value."
-    if key == "optics.wavelengths":
-        cure = _SHORT_FORM
-    elif kind == "tuple_type" and _table_at(location, root):
-        cure = f"Write [[{key}]] tables."
-    return SpecMistake(key, rule, got, cure)
-
-
-def _dotted(location: Sequence[int | str]) -> str:
-    text = ""
-    for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return text.removeprefix(".")
+    return InputError(key, rule, got, example or "Change the value.")
 
 
 def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
@@ -148,35 +143,31 @@ def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
     optics = raw.get("optics")
     if isinstance(optics, Mapping) and "colours" not in optics:
         key = _COLOURS_KEY.sub(r"optics.wavelengths\1", key)
-    return _SIGMA_KEY.sub(lambda found: found[1] + found[3] if _said_as_sigma_alone(found, raw) else found[0], key)
+    found = _SIGMA_KEY.match(key)
+    return f"{found[1]}{found[3]}" if found and not _is_table(raw, "process", "errors", found[2]) else key
 
 
-def _said_as_sigma_alone(found: re.Match[str], raw: Mapping[str, Any]) -> bool:
-    value: Any = raw
-    for part in ("process", "errors", found[2]):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return not isinstance(value, Mapping)
+def _is_table(raw: Any, *keys: str) -> bool:
+    for key in keys:
+        raw = raw.get(key) if isinstance(raw, Mapping) else None
+    return isinstance(raw, Mapping)
 
 
-def _shown(value: object) -> str:
-    if isinstance(value, str):
-        return f'"{value}"' if len(value) <= 60 else f'"{value[:57]}..."'
-    if isinstance(value, bool):
-        return str(value).lower()
+def _value_text(value: object) -> str:
     if isinstance(value, Mapping):
         return "a table"
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    text = text if len(text) <= 60 else f"{text[:57]}..."
+    return f'"{text}"' if isinstance(value, str) else text
 
 
-def _table_at(location: Sequence[int | str], root: type[SpecTable]) -> type[SpecTable] | None:
+def _table_at(location: Location, root: type[SpecTable]) -> type[SpecTable] | None:
     """Return the model of the table a location leads into, None where it leads to a value."""
     table: type[SpecTable] | None = root
     for part in location:
-        if isinstance(part, int):
-            continue
-        field = _field(table, part) if table else None
-        table = _model_of(field) if field else None
+        if isinstance(part, str):
+            field = _field(table, part) if table else None
+            table = _model(field) if field else None
     return table
 
 
@@ -184,7 +175,7 @@ def _field(table: type[SpecTable], key: str) -> FieldInfo | None:
     return next((f for name, f in table.model_fields.items() if key in (name, toml_key(name))), None)
 
 
-def _model_of(field: FieldInfo) -> type[SpecTable] | None:
+def _model(field: FieldInfo) -> type[SpecTable] | None:
     candidates = (field.annotation, *get_args(field.annotation))
     return next((c for c in candidates if isinstance(c, type) and issubclass(c, SpecTable)), None)
 
@@ -196,36 +187,28 @@ def _keys(table: type[SpecTable]) -> list[str]:
 
 def _tables(root: type[SpecTable], path: str = "") -> Iterator[tuple[str, type[SpecTable]]]:
     """Yield every table below one with its dotted key, outer ones first."""
-    inner = [(f"{path}.{toml_key(name)}".removeprefix("."), _model_of(f)) for name, f in root.model_fields.items()]
+    inner = [(f"{path}.{toml_key(name)}".removeprefix("."), _model(f)) for name, f in root.model_fields.items()]
     found = [(key, model) for key, model in inner if model and not model.inline]
     yield from found
     for key, model in found:
         yield from _tables(model, key)
 
 
-def _unknown(key: str, location: Sequence[int | str], root: type[SpecTable]) -> SpecMistake:
+def _unknown(key: str, location: Location, root: type[SpecTable]) -> InputError:
+    if key == "optics.wavelengths":
+        rule, got = "the colours must be stated once", "`wavelengths` and `colours`"
+        return InputError(key, rule, got, "Remove one of the two.")
     parent = _table_at(location[:-1], root)
     name, keys = str(location[-1]), _keys(parent) if parent else []
-    if key == "optics.wavelengths":
-        return SpecMistake(
-            key, "the colours must be stated once", "`wavelengths` and `colours`", "Remove one of the two."
-        )
-    homes = [home for home, model in _tables(root) if name in _keys(model)]
     cure = nearest(name, keys)
+    homes = [home for home, model in _tables(root) if name in _keys(model)]
     if homes and not cure.startswith("Did"):
         cure = f"It belongs to [{homes[0]}]."
     where = f"[{key.rpartition('.')[0]}]" if "." in key else "the spec"
-    return SpecMistake(key, f"must be a known key of {where}", f"`{name}`", cure)
+    return InputError(key, f"must be a known key of {where}", f"`{name}`", cure)
 
 
-def _missing(key: str, location: Sequence[int | str], root: type[SpecTable]) -> SpecMistake:
-    if isinstance(location[-1], int):
-        return SpecMistake(key, "must be given", "a shorter list", _example(location, root) or "Add the entry.")
-    cure = _SHORT_FORM if key == "optics.wavelengths" else _example(location, root) or f"Add a table [{key}]."
-    return SpecMistake(key, "must be given", "nothing", cure)
-
-
-def _example(location: Sequence[int | str], root: type[SpecTable]) -> str:
+def _example(location: Location, root: type[SpecTable]) -> str:
     """Return a sentence with an example of the value at a location, empty where there is none."""
     names = [part for part in location if isinstance(part, str)]
     parent = _table_at(names[:-1], root) if names else None

@@ -1,4 +1,4 @@
-"""The spec: one frozen table per section of the TOML, without arrays, paths opened or defaults hidden elsewhere.
+"""The spec: one frozen table per section of the TOML, without arrays and without defaults hidden elsewhere.
 
 An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
 (`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
-from doedesign.spec.table import SpecTable, unsaid
+from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
@@ -35,25 +35,13 @@ from doedesign.spec.values import (
 from doedesign.spec.wafer import WaferSpec
 from fab.units import NM, parse_length
 
-__all__ = [
-    "ColourSpec",
-    "DoeSpec",
-    "ObjectiveSpec",
-    "ObstructionSpec",
-    "OpticsSpec",
-    "OptimizeSpec",
-    "SceneSpec",
-    "SensorSpec",
-    "Spec",
-]
-
 
 class ColourSpec(SpecTable, frozen=True):
-    """One colour channel of the camera.
+    """Colour channel of the camera.
 
     Attributes:
         name: channel name, also in the files of PSF banks.
-        wavelengths_m: vacuum wavelengths the channel sees.
+        wavelengths_m: vacuum wavelengths of the channel.
         weights: share of each wavelength; equal shares if none are given, and scaled to sum to 1.
     """
 
@@ -75,7 +63,7 @@ class ColourSpec(SpecTable, frozen=True):
 
 
 class OpticsSpec(SpecTable, frozen=True):
-    """The lens and the light.
+    """Lens and light.
 
     Attributes:
         focal_length_m: focal length of the camera lens the DOE sits on.
@@ -106,7 +94,7 @@ class OpticsSpec(SpecTable, frozen=True):
 
 
 def _colour_name(wavelength: object, index: int) -> str:
-    """Name a channel after its wavelength, "656nm" or "532p5nm"; text that is no length is reported later."""
+    """Name of a channel after its wavelength, "656nm" or "532p5nm"; text that is no length is reported later."""
     try:
         nanometres = parse_length(str(wavelength)) / NM
     except ValueError:
@@ -115,7 +103,7 @@ def _colour_name(wavelength: object, index: int) -> str:
 
 
 class DoeSpec(SpecTable, frozen=True):
-    """The plate.
+    """The DOE.
 
     Attributes:
         samples: cells per side, N.
@@ -131,7 +119,7 @@ class DoeSpec(SpecTable, frozen=True):
 
 
 class OptimizeSpec(SpecTable, frozen=True):
-    """How the height map is found.
+    """Optimisation of the height map.
 
     Attributes:
         parametrization: "freeform" (every cell) or "radial" (a profile over the radius).
@@ -160,11 +148,11 @@ class OptimizeSpec(SpecTable, frozen=True):
 
 
 class ObjectiveSpec(SpecTable, frozen=True):
-    """One term of the objective.
+    """Term of the objective.
 
     Attributes:
         name: a built-in objective, or a function of the user's own as "module:function".
-        weight: factor of the term; negative turns it round.
+        weight: factor of the term; a negative one maximises it.
         options: keyword arguments of the term. `image` is a path relative to the spec file.
     """
 
@@ -174,22 +162,22 @@ class ObjectiveSpec(SpecTable, frozen=True):
 
 
 class Spec(SpecTable, frozen=True):
-    """Everything that a design depends on.
+    """All that a design depends on.
 
     Attributes:
         name: name of the design; runs and mask sets are called after it.
         optics: the lens and the light.
-        doe: the plate.
-        process: what the fab lab makes.
+        doe: the DOE.
+        process: the levels that the fab lab makes, and its errors.
         scene: where light comes from.
         sensor: the sensor behind the lens.
-        obstruction: what stands before the scene.
+        obstruction: the obstruction in front of the scene.
         optimize: how the height map is found.
-        objectives: what it is judged by; `[[objective]]` in TOML.
-        limits: when a plate is good; `[[limit]]` in TOML.
-        wafer: what the masks are filled with.
-        network: what reconstructs pictures from captures.
-        train: how that network is trained, and the optics with it.
+        objectives: terms of the loss; `[[objective]]` in TOML.
+        limits: conditions of a good DOE; `[[limit]]` in TOML.
+        wafer: layout of the wafer.
+        network: the network that reconstructs pictures from captures.
+        train: training of that network, and of the optics with it.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -198,18 +186,18 @@ class Spec(SpecTable, frozen=True):
     process: ProcessSpec
     scene: SceneSpec
     sensor: SensorSpec
-    obstruction: ObstructionSpec | None = unsaid()
+    obstruction: ObstructionSpec | None = optional()
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
-    limits: tuple[LimitSpec, ...] = unsaid(())
-    wafer: WaferSpec = unsaid(WaferSpec())
-    network: NetworkSpec = unsaid(NetworkSpec())
-    train: TrainSpec = unsaid(TrainSpec())
+    limits: tuple[LimitSpec, ...] = optional(())
+    wafer: WaferSpec = optional(WaferSpec())
+    network: NetworkSpec = optional(NetworkSpec())
+    train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)
 
     @property
     def file(self) -> Path | None:
-        """The file it was read from, against which the paths in it are resolved; no part of its content."""
+        """File it was read from, to which its paths are relative; no part of its content."""
         return self._file
 
     def __eq__(self, other: object) -> bool:

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from doedesign.spec.table import SpecTable, unsaid
+from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import (
     ChromeOverlap,
     ColourName,
@@ -82,7 +82,7 @@ class EtchSpec(SpecTable, frozen=True):
     inline: ClassVar[bool] = True
 
     mask: Annotated[int, Field(strict=True, ge=0, le=5, examples=["0"])]
-    depth_m: Etch | None = unsaid()
+    depth_m: Etch | None = optional()
 
 
 class SpreadSpec(SpecTable, frozen=True):
@@ -97,8 +97,8 @@ class SpreadSpec(SpecTable, frozen=True):
 
     inline: ClassVar[bool] = True
 
-    mean: float | tuple[float, ...] = unsaid(0.0)
-    sigma: float | tuple[float, ...] = unsaid(0.0)
+    mean: float | tuple[float, ...] = optional(0.0)
+    sigma: float | tuple[float, ...] = optional(0.0)
 
     @model_validator(mode="before")
     @classmethod
@@ -143,22 +143,18 @@ def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:
     of = _for_masks if error.per_mask else _for_plate
     mean = of(quantity_of(error, 0.0 if error.one_sided else -largest, largest))
     sigma = of(quantity_of(error, 0.0, largest))
-    fields: dict[str, Any] = {"mean": (mean, unsaid(0.0)), "sigma": (sigma, unsaid(0.0))}
+    fields: dict[str, Any] = {"mean": (mean, optional(0.0)), "sigma": (sigma, optional(0.0))}
     model = create_model(f"_spread_of_{name}", __base__=SpreadSpec, __module__=__name__, **fields)
     globals()[model.__name__] = model  # a spec is found again by its classes' names where it is sent to another process
     return model
 
 
-_SPREADS: dict[str, Any] = {name: (_spread_type(name, error) | None, unsaid()) for name, error in DEVIATIONS.items()}
+_SPREADS: dict[str, Any] = {name: (_spread_type(name, error) | None, optional()) for name, error in DEVIATIONS.items()}
 _Errors = create_model("_Errors", __base__=SpecTable, __module__=__name__, **_SPREADS)
 
 
 class ErrorsSpec(_Errors, frozen=True):
     """How far the process strays: a `SpreadSpec` or None for each error of `fab.process.DEVIATIONS`, under its name."""
-
-    def given(self) -> dict[str, SpreadSpec]:
-        """Return the errors that are given, by their name in `DEVIATIONS`."""
-        return self.said()
 
 
 # Densities are per mm2 in a spec, where one per cm2 is 0.01, and per m2 elsewhere.
@@ -177,12 +173,12 @@ class DefectsSpec(SpecTable, frozen=True):
         doubled: chance that an etch is done twice.
     """
 
-    particles_per_mm2: Density | None = unsaid()
-    particle_radius_m: DefectRadius | None = unsaid()
-    pinholes_per_mm2: Density | None = unsaid()
-    pinhole_radius_m: DefectRadius | None = unsaid()
-    missed: Chance | None = unsaid()
-    doubled: Chance | None = unsaid()
+    particles_per_mm2: Density | None = optional()
+    particle_radius_m: DefectRadius | None = optional()
+    pinholes_per_mm2: Density | None = optional()
+    pinhole_radius_m: DefectRadius | None = optional()
+    missed: Chance | None = optional()
+    doubled: Chance | None = optional()
 
     @classmethod
     def from_si(cls, values: Mapping[str, float]) -> "DefectsSpec":
@@ -192,7 +188,7 @@ class DefectsSpec(SpecTable, frozen=True):
 
     def in_si(self) -> dict[str, float]:
         """Return what is given, by its name in `fab.process.Defects`."""
-        said = self.said()
+        said = self.given()
         per_m2 = {name: said.pop(key) * 1e6 for name, key in _PER_MM2.items() if key in said}
         return per_m2 | said
 
@@ -226,17 +222,17 @@ class ProcessSpec(SpecTable, frozen=True):
 
     levels: LevelCount = Field(examples=["16"])
     level_step_m: LevelStep = Field(examples=['"75 nm"'])
-    etch_depths_m: _EtchDepths = unsaid()
+    etch_depths_m: _EtchDepths = optional()
     chrome_overlap_m: ChromeOverlap = 5e-6
-    stock: Annotated[str, AfterValidator(_stock_name)] | None = unsaid()
-    etches: tuple[EtchSpec, ...] = unsaid(())
-    tone: Literal["clear", "dark"] | None = unsaid()
-    minimum_line_m: Feature | None = unsaid()
-    minimum_space_m: Feature | None = unsaid()
-    die_m: tuple[Place, Place] | None = unsaid()
-    wafer_radius_m: Radius | None = unsaid()
-    errors: ErrorsSpec = unsaid(ErrorsSpec())
-    defects: DefectsSpec = unsaid(DefectsSpec())
+    stock: Annotated[str, AfterValidator(_stock_name)] | None = optional()
+    etches: tuple[EtchSpec, ...] = optional(())
+    tone: Literal["clear", "dark"] | None = optional()
+    minimum_line_m: Feature | None = optional()
+    minimum_space_m: Feature | None = optional()
+    die_m: tuple[Place, Place] | None = optional()
+    wafer_radius_m: Radius | None = optional()
+    errors: ErrorsSpec = optional(ErrorsSpec())
+    defects: DefectsSpec = optional(DefectsSpec())
 
     @property
     def masks(self) -> int:
@@ -268,7 +264,7 @@ class ProcessSpec(SpecTable, frozen=True):
             "etches": tuple(EtchSpec(mask=mask) for mask in sorted(range(self.masks), key=self.depth_m)),
         }
         tables = {"errors": _filled_errors(self.errors, stock), "defects": _filled_defects(self.defects, stock)}
-        return self.model_copy(update=usual | self.said() | tables)
+        return self.model_copy(update=usual | self.given() | tables)
 
 
 def _filled_errors(errors: ErrorsSpec, stock: Stock) -> ErrorsSpec:
@@ -278,7 +274,7 @@ def _filled_errors(errors: ErrorsSpec, stock: Stock) -> ErrorsSpec:
 
 def _filled_defects(defects: DefectsSpec, stock: Stock) -> DefectsSpec:
     usual = DefectsSpec.from_si({name: figure.value for name, figure in stock.defects.items()})
-    return usual.model_copy(update=defects.said())
+    return usual.model_copy(update=defects.given())
 
 
 class LimitSpec(SpecTable, frozen=True):
@@ -293,10 +289,10 @@ class LimitSpec(SpecTable, frozen=True):
     """
 
     quantity: Quantity = Field(examples=['"zeroth_order"'])
-    min: Annotated[float, Field(strict=True, ge=0)] | None = unsaid()
-    max: Annotated[float, Field(strict=True, ge=0)] | None = unsaid()
-    colour: ColourName | None = unsaid()
-    depth_m: FarDepth | None = unsaid()
+    min: Annotated[float, Field(strict=True, ge=0)] | None = optional()
+    max: Annotated[float, Field(strict=True, ge=0)] | None = optional()
+    colour: ColourName | None = optional()
+    depth_m: FarDepth | None = optional()
 
     @field_validator("min", "max")
     @classmethod

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from doedesign.spec.table import SpecTable, unsaid
+from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import (
     Count,
     Defocus,
@@ -75,7 +75,7 @@ class SceneSpec(SpecTable, frozen=True):
 
     near_m: tuple[NearDepth, ...] = ()
     far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
-    occlusion: Occlusion | None = unsaid()
+    occlusion: Occlusion | None = optional()
 
 
 class ObstructionSpec(SpecTable, frozen=True):
@@ -89,7 +89,7 @@ class ObstructionSpec(SpecTable, frozen=True):
     """
 
     kind: Annotated[str, AfterValidator(_kind)] = Field(examples=['"dirt"'])
-    options: OptionsTable = unsaid(Options())
+    options: OptionsTable = optional(Options())
 
 
 class SensorSpec(SpecTable, frozen=True):
@@ -120,15 +120,15 @@ class SensorSpec(SpecTable, frozen=True):
     window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
     fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
     defocus_m: Defocus = 0.0
-    full_well_e: Positive | None = unsaid()
-    exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = unsaid()
-    quantum_efficiency: Efficiencies = unsaid(())
-    read_noise_e: Electrons | None = unsaid()
-    dark_e: Electrons | None = unsaid()
-    black_level: Electrons | None = unsaid()
-    bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = unsaid()
-    bayer: Bayer | None = unsaid()
-    noise: Noise | None = unsaid()
+    full_well_e: Positive | None = optional()
+    exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = optional()
+    quantum_efficiency: Efficiencies = optional(())
+    read_noise_e: Electrons | None = optional()
+    dark_e: Electrons | None = optional()
+    black_level: Electrons | None = optional()
+    bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = optional()
+    bayer: Bayer | None = optional()
+    noise: Noise | None = optional()
 
     @property
     def pixel_m(self) -> float:

@@ -1,16 +1,14 @@
-"""What all tables of a spec have in common: frozen, strict about keys, units in the names of attributes.
+"""Common ground of all tables of a spec: frozen, strict about keys, units in the names of attributes.
 
 An attribute that holds a length ends in `_m` and is metres, one that holds an angle ends in `_rad`; its TOML key has no
-suffix and is text with a unit. A number of electrons ends in `_e`, which its TOML key has not. What a table need not
-say (`unsaid`) leaves no trace in JSON or TOML where it is not said, so a spec that knows nothing of a newer key keeps
-its digest.
+suffix and is text with a unit. A number of electrons ends in `_e`, which its TOML key has not. An optional key
+(`optional`) that is not given leaves no trace in JSON or TOML, so that newer keys leave the digests of older specs
+as they are.
 """
 
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
-
-__all__ = ["SpecTable", "toml_key", "unsaid"]
 
 # Arrays of tables: one entry is one [[objective]].
 _SINGULAR = {"objectives": "objective", "limits": "limit", "particles": "particle", "pinholes": "pinhole"}
@@ -21,13 +19,13 @@ def toml_key(attribute: str) -> str:
     return _SINGULAR.get(attribute, attribute.removesuffix("_m").removesuffix("_rad").removesuffix("_e"))
 
 
-def unsaid(default: Any = None) -> Any:
+def optional(default: Any = None) -> Any:
     """Return a field that is written only where it differs from its default."""
     return Field(default=default, exclude_if=lambda value: value == default)
 
 
 class SpecTable(BaseModel, frozen=True):
-    """One table of a spec. Unknown keys are refused, values never change.
+    """Table of a spec. Unknown keys are refused, values never change.
 
     Attributes:
         inline: whether it is written on one line, as `{ key = value }`.
@@ -43,8 +41,8 @@ class SpecTable(BaseModel, frozen=True):
         validate_by_alias=False,
     )
 
-    def said(self) -> dict[str, Any]:
-        """Return the attributes that are to be written: all but those left `unsaid`."""
-        fields = type(self).model_fields.items()
-        values = {name: (field, getattr(self, name)) for name, field in fields}
-        return {name: value for name, (field, value) in values.items() if not (f := field.exclude_if) or not f(value)}
+    def given(self) -> dict[str, Any]:
+        """Return the attributes to be written, by name: all but the `optional` ones at their default."""
+        fields = {name: field.exclude_if for name, field in type(self).model_fields.items()}
+        values = {name: getattr(self, name) for name in fields}
+        return {name: value for name, value in values.items() if not ((left_out := fields[name]) and left_out(value))}

@@ -13,13 +13,11 @@ from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
 from fab.units import format_length, parse_angle, parse_length
 
-__all__ = ["process_to_toml", "spec_digest", "spec_to_json", "spec_to_toml", "variation_to_toml"]
-
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
     """Return a spec as plain dictionaries, lists, text and numbers in SI units.
 
-    Defaults are filled in, except of keys that may be left unsaid.
+    Defaults are filled in, except those of optional keys.
     """
     return spec.model_dump(mode="json")
 
@@ -29,34 +27,30 @@ def spec_digest(spec: Spec) -> str:
     return sha256_bytes(canonical_json(spec_to_json(spec)))
 
 
-def spec_to_toml(spec: Spec, comments: Sequence[str] = ()) -> str:
+def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
     """Write a spec with every default and override filled in, as TOML that reads back to the same spec.
 
     Args:
         spec: the spec.
         comments: lines for the head of the file, for example the overrides that led to it.
     """
-    return _document(spec, comments)
+    lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
+    return "\n".join(lines + _table_lines(spec, "")).strip() + "\n"
 
 
 def process_to_toml(process: ProcessSpec, comments: Sequence[str] = ()) -> str:
     """Write a process as a TOML file of its own, which `load_process` reads back to the same process."""
-    return _document(ProcessFile(process=process), comments)
+    return spec_to_toml(ProcessFile(process=process), comments)
 
 
 def variation_to_toml(variation: Variation, comments: Sequence[str] = ()) -> str:
-    """Write the errors of one plate as TOML, which `load_variation` reads back to the last bit; zeros are left out."""
-    return _document(variation_file(variation), comments)
-
-
-def _document(table: SpecTable, comments: Sequence[str]) -> str:
-    lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
-    return "\n".join(lines + _table_lines(table, "")).strip() + "\n"
+    """Write the errors of one DOE as TOML, which `load_variation` reads back to the last bit; zeros are left out."""
+    return spec_to_toml(variation_file(variation), comments)
 
 
 def _table_lines(table: SpecTable, path: str) -> list[str]:
     values, tables = [], []
-    for name, value in table.said().items():
+    for name, value in table.given().items():
         key = toml_key(name)
         inner = f"{path}.{key}".removeprefix(".")
         if isinstance(value, SpecTable) and not value.inline:
@@ -64,9 +58,7 @@ def _table_lines(table: SpecTable, path: str) -> list[str]:
         elif isinstance(value, tuple) and value and isinstance(value[0], SpecTable) and not value[0].inline:
             for item in value:
                 tables += ["", f"[[{inner}]]", *_table_lines(item, inner)]
-        elif name == "objectives":
-            continue  # an array of tables that is empty is said by saying nothing
-        else:
+        elif name != "objectives":  # an empty array of tables is written as none
             values.append(f"{key} = {_text(name, value)}")
     return values + tables
 
@@ -77,10 +69,10 @@ def _text(name: str, value: Any) -> str:
         return f"[{', '.join(_text(name, item) for item in value)}]"
     if isinstance(value, SpreadSpec):
         # Its parts have the unit of the error they belong to.
-        parts = [f"{key} = {_text(name, part)}" for key, part in value.said().items()]
-        return f"{{ {', '.join(parts)} }}" if "mean" in value.said() else _text(name, value.sigma)
+        parts = [f"{key} = {_text(name, part)}" for key, part in value.given().items()]
+        return f"{{ {', '.join(parts)} }}" if "mean" in value.given() else _text(name, value.sigma)
     if isinstance(value, SpecTable):
-        return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.said().items())} }}"
+        return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.given().items())} }}"
     if isinstance(value, str):
         return _value_text(value)
     if name.endswith("_m"):
@@ -90,8 +82,8 @@ def _text(name: str, value: Any) -> str:
     return _value_text(value)
 
 
-def _quantity_text(value: float, unit: str, text_of: Callable[[float], str], parse: Callable[[str], float]) -> str:
-    text = text_of(value)
+def _quantity_text(value: float, unit: str, write: Callable[[float], str], parse: Callable[[str], float]) -> str:
+    text = write(value)
     # Twelve digits are for people; a number with more of them is written in full.
     return f'"{text}"' if parse(text) == value else f'"{value!r} {unit}"'
 
@@ -105,6 +97,4 @@ def _value_text(value: Any) -> str:
     if isinstance(value, str):
         # A JSON string is a TOML string, except that TOML wants DEL escaped as well.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value)
+    return str(value).lower() if isinstance(value, bool) else repr(value)

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from doedesign.spec.table import SpecTable
 from doedesign.spec.values import Count, Positive
+from fab.errors import InputError
 
 __all__ = ["NetworkSpec", "TrainSpec", "training_problems"]
 
@@ -101,8 +102,8 @@ class TrainSpec(SpecTable, frozen=True):
         return self.freeze != "network"
 
 
-def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> Iterator[tuple[str, str, str, str]]:
-    """Yield key, rule, value and cure of every broken rule that joins several values.
+def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> Iterator[InputError]:
+    """Yield every broken rule that joins several values.
 
     Args:
         network: the network.
@@ -113,21 +114,21 @@ def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> I
     if network != NetworkSpec() and network.width % colours:
         nearest = max(1, round(network.width / colours)) * colours
         rule = f"must be a multiple of the camera's {colours} colours"
-        yield "network.width", rule, str(network.width), f"Set width = {nearest}."
+        yield InputError("network.width", rule, str(network.width), f"Set width = {nearest}.")
     if not (network.features or network.wiener):
         cure = "Keep one of the two blocks."
-        yield "network.features", "features or wiener must be kept", "neither", cure
+        yield InputError("network.features", "features or wiener must be kept", "neither", cure)
     # Two pixels at the coarsest scale: reflection at its border needs a neighbour.
     coarsest = 2**network.depth
     if train.size % coarsest or train.size < 2 * coarsest:
         nearest = max(2, round(train.size / coarsest)) * coarsest
         rule = f"must be a multiple of 2^network.depth = {coarsest}, and at least twice that"
-        yield "train.size", rule, str(train.size), f"Set size = {nearest}, or another depth of the network."
+        yield InputError("train.size", rule, str(train.size), f"Set size = {nearest}, or another depth of the network.")
     if not (train.moves_optics or train.moves_network):
         got = 'freeze = "network" with ' + (
             'camera = "conventional"' if train.camera == "conventional" else "optics_learning_rate = 0"
         )
-        yield "train.freeze", "something must be left to train", got, "Let the network or the optics learn."
+        yield InputError("train.freeze", "something must be left to train", got, "Let the network or the optics learn.")
     if train.l1 == train.perceptual == train.masked == 0:
         rule = "one of l1, perceptual and masked must be above 0"
-        yield "train.l1", rule, "0 for all of them", "Give a weight, such as l1 = 1.0."
+        yield InputError("train.l1", rule, "0 for all of them", "Give a weight, such as l1 = 1.0.")

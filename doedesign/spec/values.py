@@ -1,13 +1,13 @@
-"""The kinds of value a spec holds, each with its range and the message for a value outside it.
+"""Types of the values in a spec, each with its range and the message for a value outside it.
 
-In TOML a length is text with a unit ("1.85 um"); in Python and JSON it is a number in metres, and likewise for angles.
-Which of the two is being read is told by the validation context: `FROM_TOML` for the former, nothing for the latter.
+In TOML a length is text with a unit ("1.85 um"); in Python and JSON it is a number of metres, and likewise for angles.
+The validation context tells which of the two is read: `FROM_TOML`, or none for numbers.
 """
 
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Annotated, Any, NamedTuple
@@ -18,62 +18,49 @@ from pydantic_core import PydanticCustomError
 from fab.units import MM, NM, UM, format_length, parse_angle, parse_length
 from sim.material import MATERIALS
 
-__all__ = [
-    "FROM_TOML",
-    "HEIGHT_FILES",
-    "OBJECTIVE_NAMES",
-    "START_NAMES",
-    "Aperture",
-    "ChromeOverlap",
-    "ColourName",
-    "Count",
-    "Defocus",
-    "FarDepth",
-    "FocalLength",
-    "LevelCount",
-    "LevelStep",
-    "Material",
-    "NearDepth",
-    "ObjectiveName",
-    "Options",
-    "OptionsTable",
-    "Pitch",
-    "Positive",
-    "SpecName",
-    "Start",
-    "Wavelength",
-    "angle",
-    "angle_text",
-    "broken",
-    "length",
-    "nearest",
-    "share",
-]
-
 FROM_TOML = "toml"
 HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
-START_NAMES = ("flat", "random", "fresnel", "ring")
-OBJECTIVE_NAMES = ("far_spot", "near_spread", "window_loss", "handcrafted", "target_pattern")
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_COLOUR = re.compile(r"[A-Za-z0-9_-]{1,32}")
-_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+class ObjectiveTraits(NamedTuple):
+    """Requirements of a built-in objective.
+
+    Attributes:
+        near: whether it needs a near depth in the scene.
+    """
+
+    near: bool = False
+
+
+# The built-in objectives; each is a function of the same name in `doedesign.design.objectives`.
+OBJECTIVES = {
+    "far_spot": ObjectiveTraits(),
+    "near_spread": ObjectiveTraits(near=True),
+    "window_loss": ObjectiveTraits(),
+    "handcrafted": ObjectiveTraits(near=True),
+    "target_pattern": ObjectiveTraits(),
+}
+
+# The built-in starts with their options; each is a function of the same name in `doedesign.design.starts`.
+STARTS = {
+    "flat": (),
+    "random": ("feature",),
+    "fresnel": ("focal_length", "evaluations"),
+    "ring": ("far_energy", "period", "roughness"),
+}
 
 
 def broken(rule: str, cure: str) -> PydanticCustomError:
-    """Make the error of a broken rule, for a validator to raise.
+    """Return the error of a broken rule, for a validator to raise.
 
     Args:
         rule: what must hold ("must be a power of two").
         cure: what to do about it, a full sentence.
-
-    Returns:
-        An error of the type "spec", which `doedesign.spec.errors` knows how to tell.
     """
     return PydanticCustomError("spec", "{rule}", {"rule": rule, "cure": cure})
 
 
-def nearest(name: object, choices: Sequence[str]) -> str:
+def nearest(name: object, choices: Collection[str]) -> str:
     """Return "Did you mean `x`?" for the choice most like `name`, or the whole list where none is."""
     close = get_close_matches(str(name), choices, n=1, cutoff=0.6)
     return f"Did you mean `{close[0]}`?" if close else f"Choose one of {', '.join(choices)}."
@@ -83,12 +70,12 @@ class _Unit(NamedTuple):
     name: str
     plural: str
     parse: Callable[[str], float]
-    text: Callable[[float], str]
+    format: Callable[[float], str]
 
     def read(self, text: Any) -> float:
         value = self.parse(text)
         number, _, name = text.strip().partition(" ")
-        # `parse` rounds to fifteen digits what a prefix has changed; without a prefix every digit counts.
+        # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
         return float(number) if name.strip() == self.name else value
 
 
@@ -108,8 +95,6 @@ def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
 
 
 def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
-    """Return the validator of a length or an angle between two bounds, in SI units."""
-
     def validate(value: Any, info: ValidationInfo) -> float:
         if infinite and value == "inf":
             return math.inf
@@ -125,7 +110,7 @@ def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) ->
         slack = 1e-12  # a bound itself, rounded on its way from text, is inside
         inside = low - slack * abs(low) <= number <= high + slack * abs(high)
         if not (inside or (infinite and number == math.inf)):
-            rule = _range_rule(low, high, unit.text) + (', or be "inf"' if infinite else "")
+            rule = _range_rule(low, high, unit.format) + (', or be "inf"' if infinite else "")
             raise broken(rule, "Check the unit.")
         return number
 
@@ -143,21 +128,31 @@ def angle(low_rad: float, high_rad: float) -> BeforeValidator:
 
 
 def share(low: float, high: float) -> BeforeValidator:
-    """Return the validator of a plain number between two bounds, such as a share of something."""
+    """Return the validator of a plain number between two bounds, such as a fraction."""
 
     def validate(value: Any) -> float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise broken("must be a number", "Write 5 % as 0.05.")
-        if not low <= value <= high:
-            raise broken(_range_rule(low, high, "{:g}".format), "Write 5 % as 0.05.")
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and low <= value <= high):
+            raise broken(_range_rule(low, high, "{:g}".format) if number else "must be a number", "Write 5 % as 0.05.")
         return float(value)
 
     return BeforeValidator(validate)
 
 
-def _infinity_as_text(depth_m: float) -> float | str:
-    # JSON has no infinity.
-    return "inf" if math.isinf(depth_m) else depth_m
+def known(what: str, names: Collection[str]) -> AfterValidator:
+    """Return the validator of a name that must be one of `names`; `what` is what they are names of."""
+    return _accepted(names.__contains__, f"must be a known {what}", names)
+
+
+def _accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] = ()) -> AfterValidator:
+    """Return the validator of text that `accept` takes."""
+
+    def validate(text: str) -> str:
+        if not accept(text):
+            raise broken(rule, nearest(text, choices) if choices else "Choose a plainer name.")
+        return text
+
+    return AfterValidator(validate)
 
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
@@ -172,7 +167,8 @@ FarDepth = Annotated[
     float,
     Field(allow_inf_nan=True),
     length(10 * UM, 1e12, infinite=True),
-    PlainSerializer(_infinity_as_text, when_used="json"),
+    # JSON has no infinity.
+    PlainSerializer(lambda depth_m: "inf" if math.isinf(depth_m) else depth_m, when_used="json"),
 ]
 
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -185,50 +181,44 @@ def _level_count(count: int) -> int:
     return count
 
 
-def _matching(pattern: re.Pattern[str], rule: str) -> Callable[[str], str]:
-    def validate(text: str) -> str:
-        if not pattern.fullmatch(text):
-            raise broken(rule, "Choose a plainer name.")
-        return text
-
-    return validate
-
-
-def _material(name: str) -> str:
-    if name not in MATERIALS:
-        raise broken("must be a known material", nearest(name, tuple(MATERIALS)))
-    return name
-
-
-def _objective_name(name: str) -> str:
-    if name not in OBJECTIVE_NAMES and not _FUNCTION.fullmatch(name):
-        raise broken('must be a known objective or a function as "module:function"', nearest(name, OBJECTIVE_NAMES))
-    return name
-
-
-def _start(name: str) -> str:
-    if name not in START_NAMES and not name.lower().endswith(HEIGHT_FILES):
-        raise broken(
-            f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})", nearest(name, START_NAMES)
-        )
-    return name
-
-
 LevelCount = Annotated[int, Field(strict=True), AfterValidator(_level_count)]
 SpecName = Annotated[
-    str, AfterValidator(_matching(_NAME, "must be a file name of at most 64 letters, digits, dots, dashes"))
+    str,
+    _accepted(
+        re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}").fullmatch,
+        "must be a file name of at most 64 letters, digits, dots, dashes",
+    ),
 ]
 ColourName = Annotated[
-    str, AfterValidator(_matching(_COLOUR, "must be a name of at most 32 letters, digits, dashes, underscores"))
+    str,
+    _accepted(
+        re.compile(r"[A-Za-z0-9_-]{1,32}").fullmatch,
+        "must be a name of at most 32 letters, digits, dashes, underscores",
+    ),
 ]
-Material = Annotated[str, AfterValidator(_material)]
-ObjectiveName = Annotated[str, AfterValidator(_objective_name)]
-Start = Annotated[str, AfterValidator(_start)]
+Material = Annotated[str, known("material", MATERIALS)]
+_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+ObjectiveName = Annotated[
+    str,
+    _accepted(
+        lambda name: name in OBJECTIVES or _FUNCTION.fullmatch(name),
+        'must be a known objective or a function as "module:function"',
+        OBJECTIVES,
+    ),
+]
+Start = Annotated[
+    str,
+    _accepted(
+        lambda name: name in STARTS or name.lower().endswith(HEIGHT_FILES),
+        f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})",
+        STARTS,
+    ),
+]
 
 
 @dataclass(frozen=True)
 class Options(Mapping[str, Any]):
-    """A free table of options: immutable and hashable, used like a dictionary (`**spec.optimize.start_options`).
+    """Free table of options: immutable and hashable, used like a dictionary (`**spec.optimize.start_options`).
 
     Values are text, numbers, booleans, and lists of these (held as tuples).
     """
@@ -239,7 +229,7 @@ class Options(Mapping[str, Any]):
         return dict(self.entries)[key]
 
     def __iter__(self) -> Iterator[str]:
-        return (key for key, _ in self.entries)
+        return iter(dict(self.entries))
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -261,9 +251,9 @@ def _options(value: Any) -> Options:
     return Options(tuple(sorted((key, _frozen_option(key, item)) for key, item in value.items())))
 
 
-def _options_as_dict(options: Options) -> dict[str, Any]:
+OptionsTable = Annotated[
+    Options,
+    BeforeValidator(_options),
     # Through JSON, so that tuples at any depth become the lists they were read from.
-    return json.loads(json.dumps(dict(options)))
-
-
-OptionsTable = Annotated[Options, BeforeValidator(_options), PlainSerializer(_options_as_dict)]
+    PlainSerializer(lambda options: json.loads(json.dumps(dict(options)))),
+]

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 
 from doedesign.spec.process import ProcessSpec, quantity_of
-from doedesign.spec.table import SpecTable, unsaid
+from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import length
 from fab.process import DEVIATIONS, Deviation, Disc, MaskDisc, Variation
 
@@ -42,7 +42,7 @@ class ProcessFile(SpecTable, frozen=True):
 
 def _error_type(error: Deviation) -> tuple[Any, Any]:
     value = quantity_of(error, 0.0 if error.one_sided else -math.inf, math.inf)
-    return (tuple[value, ...], unsaid(())) if error.per_mask else (value, unsaid(0.0))
+    return (tuple[value, ...], optional(())) if error.per_mask else (value, optional(0.0))
 
 
 _VALUES: dict[str, Any] = {name: _error_type(error) for name, error in DEVIATIONS.items()}
@@ -57,8 +57,8 @@ class VariationSpec(_Values, frozen=True):
         seed: which roughness, of all with the same statistics.
     """
 
-    repeats: tuple[Annotated[int, Field(strict=True, ge=-1, le=9)], ...] = unsaid(())
-    seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = unsaid(0)
+    repeats: tuple[Annotated[int, Field(strict=True, ge=-1, le=9)], ...] = optional(())
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)] = optional(0)
 
 
 class PinholeSpec(SpecTable, frozen=True):
@@ -88,13 +88,13 @@ class VariationFile(SpecTable, frozen=True):
     """
 
     variation: VariationSpec
-    particles: tuple[ParticleSpec, ...] = unsaid(())
-    pinholes: tuple[PinholeSpec, ...] = unsaid(())
+    particles: tuple[ParticleSpec, ...] = optional(())
+    pinholes: tuple[PinholeSpec, ...] = optional(())
 
     def value(self) -> Variation:
         """Return the errors as the physics takes them."""
         return Variation(
-            **self.variation.said(),
+            **self.variation.given(),
             particles=tuple(MaskDisc(p.mask, p.y_m, p.x_m, p.radius_m) for p in self.particles),
             pinholes=tuple(Disc(p.y_m, p.x_m, p.radius_m) for p in self.pinholes),
         )

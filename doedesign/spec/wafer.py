@@ -1,15 +1,13 @@
-"""The wafer in a spec: what the masks of an order are filled with. What is left out is usual for a wafer of 100 mm."""
+"""Table of the wafer on which an order is laid out; a key that is left out is that of a usual wafer of 100 mm."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import SpecTable, unsaid
+from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import length
 from fab.layout.wafer import Wafer
 from fab.units import MM, UM
-
-__all__ = ["WaferFile", "WaferSpec"]
 
 Size = Annotated[float, length(1 * MM, 0.5)]
 Thickness = Annotated[float, length(0.01 * MM, 50 * MM)]
@@ -20,7 +18,7 @@ _USUAL = Wafer()
 
 
 class WaferSpec(SpecTable, frozen=True):
-    """The wafer, its mask blanks, and how it is filled; see `fab.layout.wafer.Wafer`.
+    """Wafer, mask blanks and dies; see `fab.layout.wafer.Wafer`.
 
     Attributes:
         diameter_m: diameter of the wafer.
@@ -35,23 +33,19 @@ class WaferSpec(SpecTable, frozen=True):
         order_control: whether one die draws the planes in the opposite order of depths.
     """
 
-    diameter_m: Size = unsaid(_USUAL.diameter_m)
-    thickness_m: Thickness = unsaid(_USUAL.thickness_m)
-    blank_m: Size = unsaid(_USUAL.blank_m)
-    dies: tuple[Dies, Dies] | None = unsaid()
-    pitch_m: Size | None = unsaid()
-    zero_layer: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.zero_layer)
-    chrome: Literal["liftoff", "etch"] = unsaid(_USUAL.chrome)
-    compensate: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.compensate)
-    line_splits_m: tuple[Move, ...] = unsaid(_USUAL.line_splits_m)
-    order_control: Annotated[bool, Field(strict=True)] = unsaid(_USUAL.order_control)
+    diameter_m: Size = optional(_USUAL.diameter_m)
+    thickness_m: Thickness = optional(_USUAL.thickness_m)
+    blank_m: Size = optional(_USUAL.blank_m)
+    dies: tuple[Dies, Dies] | None = optional()
+    pitch_m: Size | None = optional()
+    zero_layer: Annotated[bool, Field(strict=True)] = optional(_USUAL.zero_layer)
+    chrome: Literal["liftoff", "etch"] = optional(_USUAL.chrome)
+    compensate: Annotated[bool, Field(strict=True)] = optional(_USUAL.compensate)
+    line_splits_m: tuple[Move, ...] = optional(_USUAL.line_splits_m)
+    order_control: Annotated[bool, Field(strict=True)] = optional(_USUAL.order_control)
 
 
 class WaferFile(SpecTable, frozen=True):
-    """A file that holds a wafer.
-
-    Attributes:
-        wafer: the wafer.
-    """
+    """TOML file of a wafer."""
 
     wafer: WaferSpec
