@@ -1,224 +1,313 @@
-"""A trained network with the camera that it was trained for, and the PSFs that it is told of.
+"""A trained network with the camera that it was trained for, and the PSFs that it is given.
 
     FOLDER/
         network.npz     the network, and which camera it was trained for (`doedesign.recon.weights`)
-        psf.exr         PSFs of its plate
+        psf.exr         PSFs of its DOE
 
-A model is such a folder: RUN/trained, RUN/finetuned, or a released one. Its PSFs can be replaced by others, of the
-plate as fabricated or as measured, without training anew.
+A model is such a folder: RUN/trained, RUN/finetuned, or a released one. Its PSFs can be replaced by others, of the DOE
+as fabricated or as measured, without training anew.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 import doedesign
+from doedesign.capture.from_spec import LUMINANCE, longest_first
+from doedesign.capture.simulate import SimulatedCapture
 from doedesign.recon.network import Network
-from doedesign.recon.photos import Photo
+from doedesign.recon.photos import photo_from_array, read_capture
+from doedesign.recon.reconstruction import Reconstruction
+from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
 from fab.files import sha256_file
 from sim.imaging.formation import psf_at
+from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import read_bank
 
-__all__ = ["Model", "ModelPsfs", "PsfChoice", "in_camera", "open_model", "psfs_of", "released_model", "shown"]
+__all__ = ["RELEASED", "Model", "PsfPair"]
 
 RELEASED = Path("masks/released")
 
 _PITCH_TOLERANCE = 1e-3  # a ring of 500 pixels is then off by half a pixel
+_WAVELENGTH_TOLERANCE_M = 5e-9
 _MEASURED = ("R", "G", "B")
-# Luminance of linear sRGB (IEC 61966-2-1).
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_log = logging.getLogger("doedesign")
 
 
-@dataclass(frozen=True)
-class PsfChoice:
-    """Which PSFs a network is told of.
+class PsfPair(NamedTuple):
+    """The PSFs that a network is given.
 
     Attributes:
-        files: PSFs other than the model's: one bank, or two files, of the scene and of the obstruction. A file of
-            another program (channels R, G, B, or one) is taken as measured, and scaled to the energy of the model's own
-            PSF.
-        pixel_m: pixel pitch of measured PSFs, metres.
-        near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
-        far_m: distance of the scene; what the network was trained for, or the farthest of other PSFs if None.
+        far: `[c, y, x]` PSFs of the scene, energy per pixel, odd windows.
+        near: `[c, y, x]` PSFs of the obstruction.
+        far_m: distance of the scene, metres.
+        near_m: distance of the obstruction, metres.
+        bank: PSFs at these depths and others; of two files, these two alone, in the larger window.
+        digests: SHA-256 of the files that they were read from, if not the model's own, by name.
     """
 
-    files: Sequence[Path] = ()
-    pixel_m: float | None = None
-    near_m: float | None = None
-    far_m: float | None = None
+    far: Float[np.ndarray, "c ky kx"]
+    near: Float[np.ndarray, "c kv ku"]
+    far_m: float
+    near_m: float
+    bank: PsfBank
+    digests: Mapping[str, str] = {}
 
 
-class Model(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Model:
     """A trained network with its camera.
 
     Attributes:
-        folder: where it was read from.
         network: the network.
+        bank: PSFs of its DOE, colours in the order of `colours`, odd windows.
         colours: names of its channels.
-        wavelengths_m: mean wavelength of each.
+        wavelengths_m: mean wavelength of each channel.
         pixel_m: pixel pitch, metres.
         near_m: depths of obstructions that it was trained on.
         far_m: distance of the scene that it was trained for; None for the farthest of the bank.
-        bank: PSFs of its plate.
-        digests: SHA-256 of its files.
         about: all that the network's file says of it.
+        folder: where it was read from; None for one that was not.
+        digests: SHA-256 of its files.
     """
 
-    folder: Path
     network: Network
+    bank: PsfBank
     colours: tuple[str, ...]
     wavelengths_m: tuple[float, ...]
     pixel_m: float
     near_m: tuple[float, ...]
-    far_m: float | None
-    bank: PsfBank
-    digests: dict[str, str]
-    about: dict[str, Any]
+    far_m: float | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path | None = None
+    digests: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def longest_first(self) -> list[int]:
-        """Channels by wavelength: what is shown as red, green and blue."""
-        return sorted(range(len(self.colours)), key=lambda c: -self.wavelengths_m[c])
+    @classmethod
+    def released(cls) -> "Model":
+        """Open the model that comes with the project, below the current folder or in the checkout.
+
+        Raises:
+            InputError: there is none.
+        """
+        places = (RELEASED, Path(doedesign.__file__).parents[1] / RELEASED)
+        found = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
+        if found is None:
+            rule = "without a model the released one is taken, and must be there"
+            raise InputError(str(RELEASED), rule, "no such folder here or in the checkout", "Give the folder of a model.")
+        return cls.open(found)
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "Model":
+        """Read a model.
+
+        Args:
+            folder: the folder with its files, or a run whose `trained` folder has them.
+
+        Raises:
+            InputError: files that are missing, broken, or do not belong together.
+        """
+        home = next((each for each in (Path(folder) / "trained", Path(folder)) if (each / NETWORK_NAME).is_file()), None)
+        if home is None:
+            cure = "Train one with doedesign train RUN --images DIR, or give the folder of a released model."
+            raise InputError(str(folder), f"must hold a trained network ({NETWORK_NAME})", "none", cure)
+        where = home / NETWORK_NAME
+        network, about = read_network(where)
+        try:
+            colours = tuple(str(name) for name in about["colours"])
+            waves, near = (tuple(float(value) for value in about[key]) for key in ("wavelengths_m", "near_m"))
+            pixel = float(about["pixel_m"])
+            far = None if about.get("far_m") is None else float(about["far_m"])
+        except (KeyError, TypeError, ValueError) as error:
+            rule = "must say colours, wavelengths_m, pixel_m and near_m of its camera"
+            cure = "Write the network again with `camera_facts`."
+            raise InputError(str(where), rule, f'"{error!r}"', cure) from error
+        if not len(colours) == len(waves) == network.layout.colours or not near or min(near) <= 0 or not pixel > 0:
+            got = f"{len(colours)} names and {len(waves)} wavelengths for {network.layout.colours} channels"
+            raise InputError(str(where), "what it says of its camera must fit its layout", got, "Write it again.")
+        digests = {name: sha256_file(home / name) for name in (NETWORK_NAME, BANK_NAME)}
+        bank = read_bank(home / BANK_NAME)
+        model = cls(network, bank, colours, waves, pixel, near, far, about, home, digests)
+        return replace(model, bank=model._fitted(bank, home / BANK_NAME))
+
+    def channels(self, image: Float[np.ndarray, "k y x"], where: str = "capture") -> Float[np.ndarray, "c y x"]:
+        """Bring red, green and blue, or one colour, into the channels of the network; luminance where it has one.
+
+        Raises:
+            InputError: a grey image for a network of several colours.
+        """
+        count, given = len(self.colours), len(image)
+        if given == count:
+            return image[np.argsort(longest_first(self.wavelengths_m))]
+        if count == 1:
+            return np.tensordot(LUMINANCE, image, 1)[None].astype(np.float32)
+        rule = f"a capture must have the {count} colours of the network"
+        raise InputError(where, rule, f"{given}", "Give a capture in colour, or a network trained on one colour.")
+
+    def rgb(self, image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "c y x"]:
+        """Bring the network's channels into red, green and blue, or the one colour that it has."""
+        return np.ascontiguousarray(image[longest_first(self.wavelengths_m)])
+
+    def psfs(
+        self,
+        files: Sequence[Path] = (),
+        *,
+        pixel_m: float | None = None,
+        near_m: float | None = None,
+        far_m: float | None = None,
+    ) -> PsfPair:
+        """PSFs of the scene and of the obstruction, the model's own or those of files.
+
+        Args:
+            files: one bank, or two files, of the scene and of the obstruction. A file of another program (channels R,
+                G, B, or one) is taken as measured, and scaled to the energy of the model's own PSF.
+            pixel_m: pixel pitch of measured PSFs, metres.
+            near_m: distance of the obstruction; the middle, in 1/z, of what the network was trained on if None.
+            far_m: distance of the scene; what the network was trained for, or the farthest of other PSFs if None.
+
+        Raises:
+            InputError: files that cannot be used, or a depth beyond a bank's.
+        """
+        near_m = 2 / (1 / min(self.near_m) + 1 / max(self.near_m)) if near_m is None else near_m
+        if not files:
+            own_m = next((z for z in (far_m, self.far_m) if z is not None), max(self.bank.depths_m))
+            return _pair(self.bank, self.bank, own_m, near_m)
+        if len(files) > 2:
+            rule = "must be one bank, or one file of the scene and one of the obstruction"
+            raise InputError("psf", rule, f"{len(files)} files", "Give one or two.")
+        usual = max(self.bank.depths_m) if far_m is None else far_m
+        banks = [
+            self._fitted(read_bank(path, pixel_m, depth), path, depth)
+            for path, depth in zip(files, (usual, near_m), strict=False)
+        ]
+        if len(banks) == 1 and len(banks[0].depths_m) == 1:
+            rule = "PSFs of the scene and of the obstruction are needed"
+            raise InputError(str(files[0]), rule, "one depth", "Give two files, first that of the scene.")
+        far_m = max(banks[0].depths_m) if far_m is None else far_m
+        digests = {path.name: sha256_file(path) for path in files}
+        return _pair(banks[0], banks[-1], far_m, near_m)._replace(digests=digests)
+
+    def reconstruct(
+        self,
+        capture: str | Path | Num[np.ndarray, "y x *c"] | SimulatedCapture,
+        *,
+        psfs: PsfPair | None = None,
+        linear: bool | None = None,
+        tile: int = TILE,
+        overlap: int = OVERLAP,
+        on_tile: Callable[[int], None] = lambda _: None,
+    ) -> Reconstruction:
+        """Reconstruct what a capture shows behind its obstruction.
+
+        Args:
+            capture: a file (`doedesign.recon.photos`); an array `[y, x, 3]` or `[y, x]`, row 0 at the lowest y; or what
+                `doedesign.simulate` returns, whose own PSFs the network is then given.
+            psfs: PSFs to give to the network instead.
+            linear: whether values are linear light with white 1; by default floats and RAW are, and integers are
+                display values (sRGB), white at their highest count.
+            tile: the most pixels of a tile's side. Time and seams shrink as it grows, memory grows with its square.
+            overlap: pixels that tiles share.
+            on_tile: called after each tile with the number of tiles that are done.
+
+        Raises:
+            InputError: a capture that cannot be read or has other colours than the network.
+            ValueError: see `doedesign.recon.tiles.plan_tiles`.
+        """
+        name = "capture"
+        if isinstance(capture, SimulatedCapture):
+            light, name = capture.rgb(capture.doe), capture.name
+            psfs = psfs or self._psfs_of(capture)
+        elif isinstance(capture, str | Path):
+            light, name = read_capture(capture, linear).light, str(capture)
+        else:
+            light = photo_from_array(capture, linear).light
+        light, psfs = self.channels(light, name), psfs or self.psfs()
+        multiple = self.network.layout.multiple
+        options: Any = {"tile": tile, "overlap": overlap, "multiple": multiple, "on_tile": on_tile}
+        picture = reconstruct_tiled(self.network, light, psfs.far, psfs.near, **options)
+        return Reconstruction(self.rgb(picture), self.rgb(light), psfs.near_m, psfs.far_m, name)
+
+    def _psfs_of(self, capture: SimulatedCapture) -> PsfPair:
+        """The PSFs of a simulated capture's own DOE; warns where its camera is not that of the training."""
+        camera = capture.camera
+        waves = sorted((mean_wavelength_m(colour) for colour in camera.colours), reverse=True)
+        off_m = np.subtract(sorted(self.wavelengths_m, reverse=True), waves) if len(waves) == len(self.colours) else inf
+        if abs(camera.pixel_m / self.pixel_m - 1) > _PITCH_TOLERANCE or np.max(np.abs(off_m)) > _WAVELENGTH_TOLERANCE_M:
+            _log.warning(
+                "the network was trained for another camera (%.4g um pixels, %s nm) than the capture's (%.4g um, %s nm); "
+                "it is given the capture's own PSFs, but one that is trained for this camera may do better",
+                1e6 * self.pixel_m,
+                ", ".join(f"{1e9 * w:.0f}" for w in self.wavelengths_m),
+                1e6 * camera.pixel_m,
+                ", ".join(f"{1e9 * w:.0f}" for w in waves),
+            )
+        far, near = (self.channels(capture.rgb(psf), capture.name) for psf in (capture.psf_far, capture.psf_near))
+        depths_m = (capture.depth_near_m, capture.depth_far_m)
+        bank = PsfBank(np.stack([near, far], axis=1), self.colours, depths_m, camera.pixel_m)
+        return PsfPair(far, near, capture.depth_far_m, capture.depth_near_m, bank)
+
+    def _fitted(self, bank: PsfBank, path: Path, depth_m: float | None = None) -> PsfBank:
+        """A bank in the order of the model's colours; measured ones with the energy of the model's own at `depth_m`."""
+        if abs(bank.pixel_m / self.pixel_m - 1) > _PITCH_TOLERANCE:
+            rule = f"PSFs must have the {1e6 * self.pixel_m:.5g} um pixels that the network was trained with"
+            cure = "Compute or bin them at that pitch, or train for this one."
+            raise InputError(str(path), rule, f"{1e6 * bank.pixel_m:.5g} um", cure)
+        sides = bank.energy.shape[-2:]
+        if even := [side for side in sides if side % 2 == 0]:
+            rule = "PSFs must have an odd window, for in an even one the chief ray hits a corner of four pixels"
+            cure = (
+                f"Compute them with an odd window, such as {even[0] + 1} pixels; cut measured ones to an odd number of "
+                "pixels about the one that the chief ray hits."
+            )
+            raise InputError(str(path), rule, f"{sides[1]} x {sides[0]} pixels", cure)
+        count = len(self.colours)
+        if set(bank.colours) == set(self.colours) and len(bank.colours) == count:
+            order = [bank.colours.index(name) for name in self.colours]
+            return PsfBank(bank.energy[order], self.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
+        measured = depth_m is not None and len(bank.depths_m) == 1
+        if not measured or len(bank.colours) != count or (count == 3 and bank.colours != _MEASURED):
+            rule = f"PSFs must have the colours of the network, {', '.join(self.colours)}"
+            got, cure = ", ".join(bank.colours), "Give PSFs of the camera that the network was trained for."
+            raise InputError(str(path), rule, got, cure)
+        own = _at(self.bank, depth_m, str(path)).sum(axis=(1, 2), dtype=np.float64)
+        energy = bank.energy[np.argsort(longest_first(self.wavelengths_m))]
+        total = energy.sum(axis=(1, 2, 3), dtype=np.float64)
+        if not (total > 0).all():
+            raise InputError(str(path), "a PSF must hold light", f"a sum of {total.min():.3g}", "Check its background.")
+        scaled = (energy * (own / total)[:, None, None, None]).astype(np.float32)
+        return PsfBank(scaled, self.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
 
 
-class ModelPsfs(NamedTuple):
-    """What the network is told of the optics.
-
-    Attributes:
-        far: `[c, y, x]` of the scene, energy per pixel.
-        near: `[c, y, x]` of the obstruction.
-        far_m: distance of the scene, metres.
-        near_m: distance of the obstruction, metres.
-        bank: where both are from, at these depths and others; of two files, these two alone, in the larger window.
-    """
-
-    far: Float[np.ndarray, "c ky kx"]
-    near: Float[np.ndarray, "c ky kx"]
-    far_m: float
-    near_m: float
-    bank: PsfBank
-
-
-def released_model() -> Path:
-    """Folder of the model that comes with the project: below the current folder, or the checkout.
-
-    Raises:
-        InputError: there is none.
-    """
-    places = (RELEASED, Path(doedesign.__file__).parents[1] / RELEASED)
-    found = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
-    if found is None:
-        rule = "without a model the released one is taken, and must be there"
-        cure = "Give a model before the captures: doedesign reconstruct RUN CAPTURE."
-        raise InputError(str(RELEASED), rule, "no such folder here or in the checkout", cure)
-    return found
-
-
-def open_model(folder: Path) -> Model:
-    """Read a model.
-
-    Args:
-        folder: the folder with its files, or a run whose `trained` folder has them.
-
-    Raises:
-        InputError: files that are missing, broken, or do not belong together.
-    """
-    home = next((each for each in (folder / "trained", folder) if (each / NETWORK_NAME).is_file()), None)
-    if home is None:
-        cure = "Train one with doedesign train RUN --images DIR, or give the folder of a released model."
-        raise InputError(str(folder), f"must hold a trained network ({NETWORK_NAME})", "none", cure)
-    network, about = read_network(home / NETWORK_NAME)
-    where = home / NETWORK_NAME
-    try:
-        colours = tuple(str(name) for name in about["colours"])
-        waves, near = (tuple(float(value) for value in about[key]) for key in ("wavelengths_m", "near_m"))
-        pixel = float(about["pixel_m"])
-        far = None if about.get("far_m") is None else float(about["far_m"])
-    except (KeyError, TypeError, ValueError) as error:
-        rule = "must say colours, wavelengths_m, pixel_m and near_m of its camera"
-        raise InputError(str(where), rule, f'"{error!r}"', "Write the network again with `camera_facts`.") from error
-    if not len(colours) == len(waves) == network.layout.colours or not near or min(near) <= 0 or not pixel > 0:
-        got = f"{len(colours)} names and {len(waves)} wavelengths for {network.layout.colours} channels"
-        raise InputError(str(where), "what it says of its camera must fit its layout", got, "Write it again.")
-    digests = {name: sha256_file(home / name) for name in (NETWORK_NAME, BANK_NAME)}
-    bare = Model(home, network, colours, waves, pixel, near, far, read_bank(home / BANK_NAME), digests, about)
-    return bare._replace(bank=_fitted(bare, bare.bank, home / BANK_NAME))
-
-
-def psfs_of(model: Model, choice: PsfChoice) -> ModelPsfs:
-    """PSFs of the scene and of the obstruction.
-
-    Raises:
-        InputError: files that cannot be used, or a depth beyond a bank's.
-    """
-    near_m = 2 / (1 / min(model.near_m) + 1 / max(model.near_m)) if choice.near_m is None else choice.near_m
-    if not choice.files:
-        far_m = next((z for z in (choice.far_m, model.far_m) if z is not None), max(model.bank.depths_m))
-        return _ordered(model.bank, model.bank, far_m, near_m)
-    if len(choice.files) > 2:
-        rule = "must be one bank, or one file of the scene and one of the obstruction"
-        raise InputError("--psf", rule, f"{len(choice.files)} files", "Give one or two.")
-    usual = max(model.bank.depths_m) if choice.far_m is None else choice.far_m
-    banks = [
-        _fitted(model, read_bank(path, choice.pixel_m, depth), path, depth)
-        for path, depth in zip(choice.files, (usual, near_m), strict=False)
-    ]
-    if len(banks) == 1 and len(banks[0].depths_m) == 1:
-        rule = "PSFs of the scene and of the obstruction are needed"
-        raise InputError(str(choice.files[0]), rule, "one depth", "Give two files: --psf FAR --psf NEAR.")
-    far_m = max(banks[0].depths_m) if choice.far_m is None else choice.far_m
-    return _ordered(banks[0], banks[-1], far_m, near_m)
-
-
-def in_camera(photo: Photo, path: Path, model: Model) -> Float[np.ndarray, "c y x"]:
-    """A capture in the channels of the network; luminance where it has one.
-
-    Raises:
-        InputError: a grey capture for a network of several colours.
-    """
-    count, given = len(model.colours), len(photo.light)
-    if given == count:
-        return photo.light[np.argsort(model.longest_first)]
-    if count == 1:
-        return np.tensordot(_LUMINANCE, photo.light, 1)[None].astype(np.float32)
-    rule = f"a capture must have the {count} colours of the network"
-    raise InputError(str(path), rule, f"{given}", "Give a capture in colour, or a network trained on one colour.")
-
-
-def shown(image: Float[np.ndarray, "c y x"], model: Model) -> Float[np.ndarray, "c y x"]:
-    """A picture of the network's channels in red, green and blue, or the one that it has."""
-    return np.ascontiguousarray(image[model.longest_first])
-
-
-def _at(bank: PsfBank, depth_m: float, option: str) -> Float[np.ndarray, "c y x"]:
+def _at(bank: PsfBank, depth_m: float, name: str) -> Float[np.ndarray, "c y x"]:
     if not depth_m > 0:
-        raise InputError(option, "must be a positive distance", f"{depth_m:g} m", "Give metres, or inf.")
+        raise InputError(name, "must be a positive distance", f"{depth_m:g} m", "Give metres, or inf.")
     try:
         return psf_at(bank, depth_m)
     except InputError as error:
-        raise InputError(option, error.rule, error.got, error.cure) from error
+        raise InputError(name, error.rule, error.got, error.cure) from error
 
 
-def _ordered(of_scene: PsfBank, of_obstruction: PsfBank, far_m: float, near_m: float) -> ModelPsfs:
-    """The PSFs of two depths, the obstruction's before the scene's."""
-    far, near = _at(of_scene, far_m, "--far-depth"), _at(of_obstruction, near_m, "--near-depth")
+def _pair(of_scene: PsfBank, of_obstruction: PsfBank, far_m: float, near_m: float) -> PsfPair:
+    """PSFs at two depths of one bank, or one of each of two."""
+    far, near = _at(of_scene, far_m, "far_m"), _at(of_obstruction, near_m, "near_m")
     if not near_m < far_m:
         rule, got = "the obstruction must be nearer than the scene", f"{near_m:g} m before {far_m:g} m"
-        raise InputError("--near-depth", rule, got, "Exchange the two, or give --far-depth.")
+        raise InputError("near_m", rule, got, "Exchange the two, or give both.")
     if of_obstruction is of_scene:
-        return ModelPsfs(far, near, far_m, near_m, of_scene)
+        return PsfPair(far, near, far_m, near_m, of_scene)
     window = max(far.shape[1], near.shape[1]), max(far.shape[2], near.shape[2])
     far, near = _widened(far, window), _widened(near, window)
     energy, depths = np.stack([near, far], axis=1), (near_m, far_m)
     bank = PsfBank(energy, of_scene.colours, depths, of_scene.pixel_m, of_scene.field_rad)
-    return ModelPsfs(far, near, far_m, near_m, bank)
+    return PsfPair(far, near, far_m, near_m, bank)
 
 
 def _widened(psf: Float[np.ndarray, "c y x"], window: tuple[int, int]) -> Float[np.ndarray, "c v u"]:
@@ -226,36 +315,3 @@ def _widened(psf: Float[np.ndarray, "c y x"], window: tuple[int, int]) -> Float[
     (y, x), (v, u) = psf.shape[1:], window
     margins = ((0, 0), ((v - y) // 2,) * 2, ((u - x) // 2,) * 2)
     return np.pad(psf, margins)
-
-
-def _fitted(model: Model, bank: PsfBank, path: Path, depth_m: float | None = None) -> PsfBank:
-    """A bank in the order of the model's colours; measured ones with the energy of the model's own PSF at `depth_m`."""
-    if abs(bank.pixel_m / model.pixel_m - 1) > _PITCH_TOLERANCE:
-        rule = f"PSFs must have the {1e6 * model.pixel_m:.5g} um pixels that the network was trained with"
-        cure = "Compute or bin them at that pitch, or train for this one."
-        raise InputError(str(path), rule, f"{1e6 * bank.pixel_m:.5g} um", cure)
-    sides = bank.energy.shape[-2:]
-    if even := [side for side in sides if side % 2 == 0]:
-        rule = "PSFs must have an odd window, for in an even one the chief ray hits a corner of four pixels"
-        cure = (
-            f"Compute them from a spec with an odd sensor.window, such as {even[0] + 1}; cut measured ones to an odd "
-            "number of pixels about the one that the chief ray hits."
-        )
-        raise InputError(str(path), rule, f"{sides[1]} x {sides[0]} pixels", cure)
-    count = len(model.colours)
-    if set(bank.colours) == set(model.colours) and len(bank.colours) == count:
-        order = [bank.colours.index(name) for name in model.colours]
-        return PsfBank(bank.energy[order], model.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
-    measured = depth_m is not None and len(bank.depths_m) == 1
-    if not measured or len(bank.colours) != count or (count == 3 and bank.colours != _MEASURED):
-        rule = f"PSFs must have the colours of the network, {', '.join(model.colours)}"
-        got, cure = ", ".join(bank.colours), "Give PSFs of the camera that the network was trained for."
-        raise InputError(str(path), rule, got, cure)
-    assert depth_m is not None
-    own = _at(model.bank, depth_m, str(path)).sum(axis=(1, 2), dtype=np.float64)
-    energy = bank.energy[np.argsort(model.longest_first)]
-    total = energy.sum(axis=(1, 2, 3), dtype=np.float64)
-    if not (total > 0).all():
-        raise InputError(str(path), "a PSF must hold light", f"a sum of {total.min():.3g}", "Check its background.")
-    scaled = (energy * (own / total)[:, None, None, None]).astype(np.float32)
-    return PsfBank(scaled, model.colours, bank.depths_m, bank.pixel_m, bank.field_rad)

@@ -26,7 +26,7 @@ from sim.frames import RAW_FILES, open_raw
 from sim.light import linear_from_srgb
 from sim.store import read_picture, write_picture
 
-__all__ = ["PHOTO_FILES", "WRITTEN_FILES", "Photo", "read_capture", "write_reconstruction"]
+__all__ = ["PHOTO_FILES", "WRITTEN_FILES", "Photo", "photo_from_array", "read_capture", "write_reconstruction"]
 
 WRITTEN_FILES = (".png", ".tif", ".tiff", ".exr")
 PHOTO_FILES = (*WRITTEN_FILES, *RAW_FILES)
@@ -73,7 +73,7 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
     elif suffix in RAW_FILES:
         photo = Photo(_raw_light(path), 16, True)
     else:
-        photo = _as_light(_counts(path), linear)
+        photo = photo_from_array(read_pixels(path, most_pixels=_MOST_PIXELS), linear, str(path))
     finite = np.isfinite(photo.light)
     if not finite.all():
         row, column = (int(i) for i in np.argwhere(~finite.all(axis=0))[0])
@@ -143,18 +143,23 @@ def _exr_light(path: Path) -> Float[np.ndarray, "c y x"]:
     raise InputError(str(path), rule, f"the channels {', '.join(sorted(channels))}", "Keep these alone.")
 
 
-def _counts(path: Path) -> Num[np.ndarray, "y x *c"]:
-    values = read_pixels(path, most_pixels=_MOST_PIXELS)
-    if values.ndim == 3 and values.shape[2] not in (1, 3):
+def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None, where: str = "capture") -> Photo:
+    """Take the values of a picture for light.
+
+    Args:
+        values: `[y, x]`, or `[y, x, 3]` for red, green and blue, row 0 at the lowest y; uint8, uint16 or floats.
+        linear: whether they are linear light, white 1 or the highest count; by default floats are, and integers are
+            display values (sRGB).
+        where: what messages begin with.
+
+    Raises:
+        InputError: another shape or another type.
+    """
+    if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (1, 3)):
         rule, got = "must be one picture, grey or in red, green and blue", f"pixels of shape {values.shape}"
-        raise InputError(str(path), rule, got, _CURE)
+        raise InputError(where, rule, got, _CURE)
     if values.dtype.kind not in "fu" or (values.dtype.kind == "u" and values.dtype.itemsize > 2):
-        raise InputError(str(path), "pixels must be 8 or 16 bits, or floats", values.dtype, _CURE)
-    return values
-
-
-def _as_light(values: np.ndarray, linear: bool | None) -> Photo:
-    """Light of the values of a file."""
+        raise InputError(where, "pixels must be 8 or 16 bits, or floats", values.dtype, _CURE)
     planes = values[None] if values.ndim == 2 else values.transpose(2, 0, 1)
     if values.dtype.kind == "f":
         light = planes.astype(np.float32)

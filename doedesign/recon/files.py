@@ -1,0 +1,153 @@
+"""Captures in files through a model, into a folder.
+
+    OUT/
+        NAME.png            the reconstruction, of the capture's own kind unless another is asked for
+        NAME_beside.png     the capture and the reconstruction side by side, on request
+        manifest.json       for every file: capture, network, PSFs, depths, digests
+
+Files appear one by one, each whole. A later call adds to the folder and replaces what has the same name.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from doedesign.recon.model import Model, PsfPair
+from doedesign.recon.photos import WRITTEN_FILES, Photo, read_capture, write_reconstruction
+from doedesign.recon.tiles import OVERLAP, TILE, plan_tiles
+from doedesign.runs.folder import alone_in
+from doedesign.runtime.progress import meter
+from fab.errors import InputError
+from fab.figure import length_text
+from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
+
+FORMAT = "doedesign reconstructions 1"
+
+_log = logging.getLogger("doedesign")
+
+
+def reconstruct_files(
+    model: Model,
+    captures: Sequence[Path],
+    folder: Path,
+    *,
+    psfs: PsfPair | None = None,
+    linear: bool | None = None,
+    kind: str | None = None,
+    beside: bool = False,
+    tile: int = TILE,
+    overlap: int = OVERLAP,
+) -> list[Path]:
+    """Reconstruct captures and write the results.
+
+    Args:
+        model: the model.
+        captures: files (`doedesign.recon.photos`).
+        folder: where to; a new or empty folder, or one of earlier reconstructions.
+        psfs: PSFs to give to the network; the model's own if None.
+        linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
+        kind: ending of the results, such as ".exr"; that of the capture if None.
+        beside: draw captures and reconstructions side by side, too.
+        tile: the most pixels of a tile's side.
+        overlap: pixels that tiles share.
+
+    Returns:
+        the files written.
+
+    Raises:
+        InputError: a capture or number that cannot be used, or a folder that holds something else.
+    """
+    names = _names(captures, kind)
+    require_own_folder(folder, captures, names)
+    multiple = model.network.layout.multiple
+    try:
+        plan_tiles((1, 1), tile, overlap, multiple)
+    except ValueError as error:
+        rule, _, got = str(error).partition(", but got ")
+        raise InputError("tile, overlap", rule.replace("`", ""), got, "Leave them out, or correct them.") from error
+    psfs = psfs or model.psfs()
+    if {"obstruction", "occlusion"} <= model.about.keys():
+        said = f"trained behind {model.about['obstruction']}, occlusion model {model.about['occlusion']}"
+        _log.info("%s: %s", model.folder, said)
+    _log.info("obstruction at %s, scene at %s", length_text(psfs.near_m), length_text(psfs.far_m))
+    written: list[Path] = []
+    with alone_in(folder):
+        # From here on the folder says whose it is, whenever this ends.
+        _note(folder, {})
+        for capture, name in zip(captures, names, strict=True):
+            photo = read_capture(capture, linear)
+            count = plan_tiles((photo.light.shape[1], photo.light.shape[2]), tile, overlap, multiple).total
+            with meter(f"tiles of {name}", count) as progress:
+                found = model.reconstruct(photo, psfs=psfs, tile=tile, overlap=overlap, on_tile=progress.advance)
+            files = [folder / name]
+            found.save(files[0], _bits(photo, files[0].suffix))
+            if beside:
+                files.append(folder / f"{files[0].stem}_beside.png")
+                write_reconstruction(files[1], found.beside(), 8)
+            record = {
+                "capture": capture.name,
+                "capture_sha256": sha256_file(capture),
+                "model_sha256": dict(model.digests),
+                "psf_sha256": dict(psfs.digests),
+                "near_m": psfs.near_m,
+                "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
+                "tile": tile,
+                "overlap": overlap,
+            }
+            _note(folder, {each.name: {**record, "sha256": sha256_file(each)} for each in files})
+            written += files
+    return written
+
+
+def _names(captures: Sequence[Path], kind: str | None) -> list[str]:
+    """A file name for every reconstruction; captures of one name are told apart by their folders."""
+    if not captures:
+        raise InputError("captures", "at least one capture must be given", "none", "Give a file.")
+    if kind is not None and kind not in WRITTEN_FILES:
+        raise InputError("kind", f"must be one of {', '.join(WRITTEN_FILES)}", kind, "Choose one of them.")
+    stems = [path.stem for path in captures]
+    if len(set(stems)) < len(stems):
+        stems = [f"{path.resolve().parent.name}_{path.stem}" for path in captures]
+    if len(set(stems)) < len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise InputError("captures", "must differ in name or folder", f"{twice} twice", "Give them one by one.")
+    endings = [kind or path.suffix.lower() for path in captures]
+    return [stem + (ending if ending in WRITTEN_FILES else ".png") for stem, ending in zip(stems, endings, strict=True)]
+
+
+def require_own_folder(folder: Path, captures: Sequence[Path] = (), names: Sequence[str] = ()) -> None:
+    """Refuse a folder with anything else in it: no other picture is overwritten.
+
+    Raises:
+        InputError: it holds something else, or one of the captures.
+    """
+    if not folder.is_dir():
+        return  # `alone_in` makes it, or says why it cannot be made
+    content = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+    manifest = read_json(folder / MANIFEST_NAME) if MANIFEST_NAME in content else {}
+    if content and manifest.get("format") != FORMAT:
+        rule = "reconstructions need a folder of their own, new or empty"
+        raise InputError(str(folder), rule, "one with other content", "Choose another output folder.")
+    given = {path.resolve() for path in captures}
+    for name in names:
+        if (folder / name).resolve() in given:
+            rule, cure = "a capture must not be overwritten", "Choose another output folder."
+            raise InputError(str(folder / name), rule, "its own name", cure)
+
+
+def _bits(photo: Photo, ending: str) -> int | None:
+    """Bits of a result: those of the capture; floats where there were floats and the kind can hold them."""
+    if ending == ".exr" or (photo.bits is None and ending != ".png"):
+        return None
+    return photo.bits or 16
+
+
+def _note(folder: Path, results: Mapping[str, Any]) -> None:
+    """Add results to the folder's manifest."""
+    path = folder / MANIFEST_NAME
+    known: Mapping[str, Any] = read_json(path).get("results", {}) if path.is_file() else {}
+    units = "SI; EXR and TIFF of floats hold linear light, the rest display values; files have the top row first"
+    write_atomic(path, canonical_json({"format": FORMAT, "units": units, "results": {**known, **results}}))
