@@ -1,10 +1,10 @@
-"""From a spec to what `simulate` and `train` put before the camera and behind it: obstruction, sensor, colours.
+"""From a spec to what stands before the camera and what lies behind it: obstruction, occlusion model, sensor, colours.
 
 A spec may leave all of it out but the occlusion model, which has no default: the models differ most where it matters
 (`sim.imaging.occlusion`), and a result has to say which one it was made with.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -24,28 +24,28 @@ from sim.obstruction import OBSTRUCTIONS, ObstructionKind
 from sim.sensor import Sensor
 
 # Luminance of linear sRGB (IEC 61966-2-1).
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def occlusion_from_spec(spec: Spec, source: str, given: str | None = None) -> Model:
-    """The occlusion model to use.
+    """The occlusion model: the one given, or that of the spec.
 
     Args:
         spec: the spec.
-        source: the spec's file, for the message.
-        given: what the command line says, which comes first.
+        source: the spec's file, for messages.
+        given: the name of a model.
 
     Raises:
-        InputError: neither names one, or the command line names none that there is.
+        InputError: neither names one, or there is none of that name.
     """
     if given is not None and given not in OCCLUSION_MODELS:
         rule = f"must be one of {', '.join(OCCLUSION_MODELS)}"
-        raise InputError("--occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
+        raise InputError("occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
     model = given or spec.scene.occlusion
     if model is None:
         cure = (
             'Add occlusion = "reciprocal" to [scene], which is nearest to wave optics, "radiometric", or "paper" for '
-            "eq. 10; or give --occlusion."
+            "eq. 10; or give `occlusion`."
         )
         raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
     return cast("Model", model)
@@ -57,7 +57,11 @@ def outside_from_kind(kind: ObstructionKind) -> Outside:
 
 
 def sensor_from_spec(spec: Spec) -> Sensor:
-    """The sensor of a spec, with the usual values of `sim.sensor` where the spec says nothing."""
+    """The sensor of a spec, with the usual values of `sim.sensor` where the spec says nothing.
+
+    Raises:
+        InputError: values that do not go together.
+    """
     given = spec.sensor
     said = {
         "full_well_e": given.full_well_e,
@@ -78,15 +82,15 @@ def sensor_from_spec(spec: Spec) -> Sensor:
 
 
 def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> ObstructionKind:
-    """What stands before the scene.
+    """The kind of obstruction before the scene: the one given, or that of the spec.
 
-    Its distance is that of the options; otherwise it lies between the nearest and the farthest of `scene.near`, for
-    which the plate was designed; otherwise it is what the kind is usually drawn at.
+    Its distance is that of the spec's options; otherwise it lies between the nearest and the farthest of `scene.near`,
+    for which the DOE was designed; otherwise it is what the kind is usually drawn at.
 
     Args:
         spec: the spec; its options hold for its own kind.
         source: the spec's file, beside which a folder of masks lies.
-        given: a kind, or a folder of masks, that the command line names instead.
+        given: a kind, or a folder of masks.
 
     Raises:
         InputError: no kind, an unknown one, or options that are not the kind's.
@@ -95,18 +99,20 @@ def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> 
     options: dict[str, Any] = dict(own.options) if own and given in (None, own.kind) else {}
     name = given or (own.kind if own else None)
     if name is None:
-        cure = f'Add [obstruction] with kind = "dirt", or give --obstruction. There are {", ".join(OBSTRUCTIONS)}.'
+        kinds = ", ".join(OBSTRUCTIONS)
+        cure = f'Add [obstruction] with kind = "dirt", or give `obstruction`. There are {kinds}.'
         raise InputError(f"{source}: obstruction.kind", "an obstruction must be named", "nothing", cure)
     if name not in OBSTRUCTIONS:
         if not Path(name).is_dir():
             rule = "must be a kind of obstruction, or a folder of masks"
-            raise InputError("--obstruction", rule, f'"{name}"', nearest(name, tuple(OBSTRUCTIONS)))
+            raise InputError("obstruction", rule, f'"{name}"', nearest(name, tuple(OBSTRUCTIONS)))
         name, options = "folder", {"folder": str(Path(name).resolve())}
     kind = OBSTRUCTIONS[name]
-    where = f"{source}: obstruction.options" if own and options == dict(own.options) else "--obstruction"
+    where = f"{source}: obstruction.options" if own and options == dict(own.options) else "obstruction"
     parameters = _parameters(kind, options, where)
     if "folder" in parameters:
-        parameters["folder"] = _beside(source, str(parameters["folder"]))
+        beside = Path(source).parent / str(parameters["folder"])
+        parameters["folder"] = str(beside if beside.is_dir() else parameters["folder"])
     try:
         made = kind(**parameters)
     except InputError as error:
@@ -114,20 +120,15 @@ def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> 
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
     near = spec.scene.near_m
-    return _at(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
+    return at_depth(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
 
 
-def _beside(source: str, folder: str) -> str:
-    beside = Path(source).parent / folder
-    return str(beside if beside.is_dir() else folder)
-
-
-def _at(kind: Any, depth_m: tuple[float, float]) -> Any:
-    """The same kind, or both that it is mixed of, at another distance."""
+def at_depth(kind: Any, depth_m: tuple[float, float]) -> Any:
+    """The same kind of obstruction, or both that it is mixed of, at another distance."""
     names = {field.name for field in fields(kind)}
     if "depth_m" in names:
         return replace(kind, depth_m=depth_m)
-    inner = {name: _at(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
+    inner = {name: at_depth(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
     return replace(kind, **inner)
 
 
@@ -164,12 +165,17 @@ def _parameter_item(field: Field[Any], value: Any, where: str) -> Any:
 
 
 def plain_parameters(kind: Any) -> dict[str, Any]:
-    """Parameters of a kind for JSON."""
+    """Parameters of a kind of obstruction for JSON."""
     return {
         key: str(value) if isinstance(value, Path) else [str(v) for v in value] if key == "files" else value
         for key, value in asdict(kind).items()
         if not callable(value)
     }
+
+
+def longest_first(wavelengths_m: Sequence[float]) -> list[int]:
+    """Positions of colours from the longest wavelength to the shortest, which stand for red, green and blue."""
+    return sorted(range(len(wavelengths_m)), key=lambda c: -wavelengths_m[c])
 
 
 def channels_from_rgb(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Float[np.ndarray, "c y x"]:
@@ -180,17 +186,15 @@ def channels_from_rgb(light: Float[np.ndarray, "3 y x"], camera: Camera) -> Floa
     """
     count = len(camera.colours)
     if count == 1:
-        return np.tensordot(_LUMINANCE, light, 1)[None].astype(np.float32)
+        return np.tensordot(LUMINANCE, light, 1)[None].astype(np.float32)
     if count != 3:
         rule = "pictures in red, green and blue need a camera of three colours, or of one"
         raise InputError("optics.colours", rule, f"{count} colours", "Merge colours into channels.")
-    longest_first = sorted(range(3), key=lambda c: -mean_wavelength_m(camera.colours[c]))
-    return np.ascontiguousarray(light[np.argsort(longest_first)])
+    return np.ascontiguousarray(light[np.argsort(longest_first([mean_wavelength_m(c) for c in camera.colours]))])
 
 
 def rgb_from_channels(light: Float[np.ndarray, "c y x"], camera: Camera) -> Float[np.ndarray, "3 y x"]:
     """Inverse of `channels_from_rgb`, for pictures: the longest wavelength is red; one colour becomes grey."""
     if len(camera.colours) == 1:
         return np.repeat(light, 3, axis=0)
-    longest_first = sorted(range(3), key=lambda c: -mean_wavelength_m(camera.colours[c]))
-    return np.ascontiguousarray(light[longest_first])
+    return np.ascontiguousarray(light[longest_first([mean_wavelength_m(c) for c in camera.colours])])

@@ -1,17 +1,16 @@
-"""Pictures from a folder, as scenes: found, decoded, kept in memory where they fit, and turned into linear light.
+"""Pictures from a folder: found, decoded (`fab.pictures`), kept in memory where they fit, and turned into linear light.
 
 Any folder of JPEG, PNG, TIFF, WebP or BMP files will do, folders within it included. A file that cannot be decoded is
-skipped: by name, counted, told once, never fatal while another one is left. Without a folder the photographs that
-scikit-image brings along are taken; nothing is ever downloaded.
+skipped, with a warning, as long as another one is left. Without a folder the photographs that scikit-image brings along
+are taken; nothing is ever downloaded.
 
-A picture is `[y, x, colour]` of 8-bit display values (sRGB) with row 0 at the lowest y, as a camera would store it
-turned the right way up. One that is larger than needed is shrunk once, on reading, so that its shorter side has
-`most_px` pixels; shrinking averages display values, as picture editors do. Sixteen bits are rounded to eight, colour
-profiles are not looked at, transparent pixels count as they are painted.
+A picture is `[y, x, colour]` of 8-bit display values (sRGB) with row 0 at the lowest y. One that is larger than needed
+is shrunk once, on reading, so that its shorter side has `most_px` pixels.
 """
 
+import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
@@ -28,7 +27,8 @@ PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 SAMPLES = ("motorcycle_left.png", "rocket.jpg", "coffee.png", "astronaut.png", "chelsea.png", "camera.png")
 BUDGET_BYTES = 1 << 30
 
-_SHOWN = 5  # names of skipped files in one message
+_SHOWN = 5  # names of files in one message
+_log = logging.getLogger("doedesign")
 
 Picture = UInt8[np.ndarray, "y x 3"]
 
@@ -43,7 +43,7 @@ def sample_files() -> tuple[Path, ...]:
     folder = Path(spec.origin).parent / "data" if spec and spec.origin else Path("skimage/data")
     found = tuple(folder / name for name in SAMPLES if (folder / name).is_file())
     if not found:
-        cure = "Give a folder of your own pictures with --images."
+        cure = "Give a folder of your own pictures."
         raise InputError(str(folder), "scikit-image must bring its sample pictures", "none of them", cure)
     return found
 
@@ -65,7 +65,7 @@ def picture_files(folder: Path | None) -> tuple[Path, ...]:
         raise explain_os_error(error, folder) from error
     if not found:
         rule = f"must hold pictures ({', '.join(PICTURE_FILES)})"
-        raise InputError(str(folder), rule, "none", "Put pictures there, or leave --images out for a first look.")
+        raise InputError(str(folder), rule, "none", "Put pictures there, or leave `images` out for a first look.")
     return found
 
 
@@ -80,7 +80,6 @@ class Pictures:
         files: the picture files.
         most_px: pixels that the shorter side of a picture may keep.
         budget_bytes: memory that decoded pictures may take.
-        say: told once of every file that is skipped.
         skipped: why each file that cannot be used was skipped.
         decodings: how often a file was decoded.
     """
@@ -88,7 +87,6 @@ class Pictures:
     files: tuple[Path, ...]
     most_px: int | None = None
     budget_bytes: int = BUDGET_BYTES
-    say: Callable[[str], None] = lambda _: None
     skipped: dict[Path, str] = field(default_factory=dict)
     decodings: int = 0
     _kept: dict[Path, Picture] = field(default_factory=dict, repr=False)
@@ -129,15 +127,19 @@ class Pictures:
         with self._lock:
             self.skipped[path] = f"{error.rule}, but got {error.got}"
             none_left = len(self.skipped) == len(self.files)
-        self.say(f"skipped {path}: {self.skipped[path]}")
+        _log.warning("skipped %s: %s", path, self.skipped[path])
         if none_left:
-            names = ", ".join(p.name for p in self.files[:_SHOWN])
-            more = f" and {len(self.files) - _SHOWN} more" if len(self.files) > _SHOWN else ""
-            rule = "at least one picture must be whole"
-            raise InputError(str(path.parent), rule, f"only broken ones: {names}{more}", "Give other pictures.")
+            rule, got = "at least one picture must be whole", f"only broken ones: {_names(self.files)}"
+            raise InputError(str(path.parent), rule, got, "Give other pictures.")
+
+    def skips(self) -> str:
+        """One sentence on the files that were skipped; empty if none was."""
+        if not self.skipped:
+            return ""
+        return f"{len(self.skipped)} of {len(self)} pictures skipped: {_names(sorted(self.skipped))}"
 
     def digest(self) -> str:
-        """What the files are, by name and size: equal for equal folders, whatever was decoded yet.
+        """SHA-256 of the files' names and sizes: equal for equal folders, whatever was decoded yet.
 
         Raises:
             InputError: a file is gone.
@@ -146,6 +148,11 @@ class Pictures:
             return sha256_bytes(canonical_json([[path.name, path.stat().st_size] for path in self.files]))
         except OSError as error:
             raise explain_os_error(error, str(error.filename)) from error
+
+
+def _names(paths: Sequence[Path]) -> str:
+    more = f" and {len(paths) - _SHOWN} more" if len(paths) > _SHOWN else ""
+    return ", ".join(path.name for path in paths[:_SHOWN]) + more
 
 
 def crop(
@@ -181,13 +188,3 @@ def _linear_table() -> Float[np.ndarray, "256"]:
     from sim.light import linear_from_srgb
 
     return linear_from_srgb(np.arange(256) / 255).astype(np.float32)
-
-
-def told_skips(pictures: Pictures) -> str:
-    """One sentence on the files that were skipped; empty if none was."""
-    if not pictures.skipped:
-        return ""
-    paths: Sequence[Path] = sorted(pictures.skipped)
-    names = ", ".join(path.name for path in paths[:_SHOWN])
-    more = f" and {len(paths) - _SHOWN} more" if len(paths) > _SHOWN else ""
-    return f"{len(paths)} of {len(pictures)} pictures skipped: {names}{more}"

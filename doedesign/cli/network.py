@@ -116,8 +116,8 @@ def finetune(
     from doedesign.commands.finetune import finetune as work
 
     choice = _psf_choice(psf, pixel, near_depth, far_depth)
-    request = FinetuneSettings(choice, steps, learning_rate, seed, validation, size, lpips_weights, linear, mirror)
-    folder = work(run, pairs, out, request, say)
+    others = steps, learning_rate, seed, validation, size, lpips_weights, linear, mirror
+    folder = work(run, pairs, out, FinetuneSettings(*choice.values(), *others), say)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -150,28 +150,22 @@ def reconstruct(
         kind: Kind of the results: png, tif or exr; that of the capture by default.
         beside: Draw every capture and its reconstruction side by side, too.
     """
-    from dataclasses import replace
-
-    from doedesign.commands.reconstruct import ReconstructionSettings, model_and_captures
+    from doedesign.commands.reconstruct import model_and_captures
     from doedesign.commands.reconstruct import reconstruct as work
 
     model, files = model_and_captures([run, *captures])
     ending = None if kind is None else f".{kind.lower().removeprefix('.')}"
-    request = ReconstructionSettings(
-        _psf_choice(psf, pixel, near_depth, far_depth), linear=linear, kind=ending, beside=beside
-    )
-    given = {name: value for name, value in (("tile", tile), ("overlap", overlap)) if value is not None}
-    paths = work(model, files, out, replace(request, **given), say=say)
-    print_paths(paths, json_)
+    how = {"tile": tile, "overlap": overlap, "linear": linear, "kind": ending, "beside": beside}
+    given = {name: value for name, value in how.items() if value is not None}
+    print_paths(work(model, files, out, **_psf_choice(psf, pixel, near_depth, far_depth), **given), json_)
 
 
-def _psf_choice(files: Sequence[Path], pixel: str | None, near: str | None, far: str | None) -> Any:
-    """The PSFs of --psf, --pixel, --near-depth and --far-depth."""
+def _psf_choice(files: Sequence[Path], pixel: str | None, near: str | None, far: str | None) -> dict[str, Any]:
+    """The PSFs of --psf, --pixel, --near-depth and --far-depth, as `doedesign.recon.model.Model.psfs` takes them."""
     from math import inf
-
-    from doedesign.recon.model import PsfChoice
 
     pixel_m, near_m = length_of("--pixel", pixel), length_of("--near-depth", near)
     if pixel_m is not None and not pixel_m > 0:
         raise InputError("--pixel", "must be positive", f'"{pixel}"', 'For example --pixel "3.7 um".')
-    return PsfChoice(files, pixel_m, near_m, inf if far == "inf" else length_of("--far-depth", far))
+    far_m = inf if far == "inf" else length_of("--far-depth", far)
+    return {"psf": files, "pixel_m": pixel_m, "near_m": near_m, "far_m": far_m}

@@ -21,7 +21,7 @@ Ctrl-C end it after the step it is at.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,8 +29,9 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign import __version__
+from doedesign.commands.options import named_as_options
 from doedesign.commands.psf import Say
-from doedesign.recon.model import Model, ModelPsfs, PsfChoice, open_model, psfs_of, shown
+from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs.folder import CHECKPOINT, alone_in
@@ -62,7 +63,10 @@ class FinetuneSettings:
     """How to fine-tune.
 
     Attributes:
-        psf: which PSFs the network is told of.
+        psf: files of PSFs to give to the network, see `doedesign.recon.model.Model.psfs`, like the next three.
+        pixel_m: their pixel pitch.
+        near_m: distance of the obstruction.
+        far_m: distance of the scene.
         steps: steps.
         learning_rate: Adam's first step size; a tenth of that of the model's training if None.
         seed: seed of everything random.
@@ -73,7 +77,10 @@ class FinetuneSettings:
         mirrored: exchange left and right at random, of captures and PSFs.
     """
 
-    psf: PsfChoice = field(default_factory=PsfChoice)
+    psf: Sequence[Path] = ()
+    pixel_m: float | None = None
+    near_m: float | None = None
+    far_m: float | None = None
     steps: int = _STEPS
     learning_rate: float | None = None
     seed: int = 0
@@ -99,7 +106,7 @@ class FinetuneInputs(NamedTuple):
     """
 
     model: Model
-    psfs: ModelPsfs
+    psfs: PsfPair
     tuner: Tuner
     data: PairData
     held_out: Pairs
@@ -115,7 +122,7 @@ class FinetuneInputs(NamedTuple):
     @property
     def title(self) -> str:
         """Name of the design, for pictures."""
-        return str(self.model.about.get("run", self.model.folder.name))
+        return str(self.model.about.get("run", self.model.folder and self.model.folder.name))
 
 
 def finetune(
@@ -143,7 +150,7 @@ def finetune(
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
     folder = out or model_folder / "finetuned"
-    with stoppable() as stop:
+    with named_as_options(), stoppable() as stop:
         work = _prepared(model_folder, pairs, request or FinetuneSettings(), say)
         claim = work.claim()
         with alone_in(folder):
@@ -160,8 +167,9 @@ def finetune(
 
 
 def _prepared(model_folder: Path, folder: Path, request: FinetuneSettings, say: Say) -> FinetuneInputs:
-    model = open_model(model_folder)
-    psfs, options = psfs_of(model, request.psf), _options(model, request)
+    model = Model.open(model_folder)
+    psfs = model.psfs(request.psf, pixel_m=request.pixel_m, near_m=request.near_m, far_m=request.far_m)
+    options = _options(model, request)
     split = split_pairs(find_pairs(folder), request.validation, request.seed, str(folder))
     if split.left_out:
         say(f"warning: {len(split.left_out)} pairs show what is held out under another name and are left out")
@@ -174,7 +182,7 @@ def _prepared(model_folder: Path, folder: Path, request: FinetuneSettings, say: 
     lpips, perceptual = perceptual_of(options, min(shape), where, request.lpips_weights, say)
     settings = {
         "format": FORMAT,
-        "model_sha256": model.digests,
+        "model_sha256": dict(model.digests),
         "psfs_sha256": sha256_bytes(psfs.far.tobytes() + psfs.near.tobytes()),
         "near_m": psfs.near_m,
         "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
@@ -200,6 +208,7 @@ def _options(model: Model, request: FinetuneSettings) -> TrainSpec:
     Raises:
         InputError: a number out of range.
     """
+    assert model.folder is not None  # that of an opened model
     path = model.folder / "spec.toml"
     before = load_spec(path).train if path.is_file() else TrainSpec()
     rate = before.learning_rate / 10 if request.learning_rate is None else request.learning_rate
@@ -274,7 +283,7 @@ def _judged(work: FinetuneInputs, state: FinetuneState) -> EvaluationResult:
             yield ValidationSample(files.name, clipped, np.clip(pair.reference, 0, 1), pair.mask)
 
     def to_rgb(image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "3 y x"]:
-        picture = shown(image, work.model)
+        picture = work.model.rgb(image)
         return np.repeat(picture, 3, axis=0) if len(picture) == 1 else picture
 
     return judge(looks(), work.lpips, to_rgb)
@@ -294,7 +303,7 @@ def _finish(folder: Path, work: FinetuneInputs, state: FinetuneState) -> None:
         "far_m": None if psfs.far_m == max(psfs.bank.depths_m) else psfs.far_m,
         "run": work.title,
         "finetuned": {**work.settings, "pairs": work.names, "version": __version__},
-        "before": model.about,
+        "before": dict(model.about),
     }
     write_network(folder / NETWORK_NAME, state.network, about)
     names = [NETWORK_NAME, BANK_NAME, "metrics.json", "pairs.json"]

@@ -31,8 +31,8 @@ import jax
 from doedesign import __version__
 from doedesign.build import camera_from_spec
 from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, plain_parameters
-from doedesign.capture.images import Pictures, told_skips
-from doedesign.capture.scenes import SceneBatch, SceneData
+from doedesign.capture.images import Pictures
+from doedesign.capture.scenes import Batch, SceneData
 from doedesign.commands.psf import Say
 from doedesign.report.training import draw_training, draw_validation
 from doedesign.runs.folder import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
@@ -163,8 +163,8 @@ def train(
                 say("judging the network and writing results")
                 _finish(folder, work, state)
             gathered(0)  # nobody leaves before all is written
-    if told := " ".join(filter(None, map(told_skips, (work.data.pictures, work.held_out.data.pictures)))):
-        say(told)
+    if skips := " ".join(filter(None, (data.pictures.skips() for data in (work.data, work.held_out.data)))):
+        say(skips)
     return folder
 
 
@@ -180,7 +180,7 @@ def _prepared(run: Run, request: TrainingSettings, say: Say) -> TrainingInputs:
     _require_possible(spec, source)
     split = split_pictures(request.images, request.validation, options.validation, options.seed)
     far = (min(spec.scene.far_m), max(spec.scene.far_m))
-    trained_on, held_out = (Pictures(files, most_px=2 * options.size, say=say) for files in split)
+    trained_on, held_out = (Pictures(files, most_px=2 * options.size) for files in split)
     threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
     data = SceneData(trained_on, kind, view, far, options.seed, options.batch, threads)
     looks = HeldOut(SceneData(held_out, kind, view, far, SCENE_SEED, mirrored=False), options.validation, lpips)
@@ -256,7 +256,7 @@ def _iterate(
     if state.step == options.steps:
         return state
 
-    def step(state: JointState, batch: SceneBatch) -> tuple[JointState, dict[str, Any]]:
+    def step(state: JointState, batch: Batch) -> tuple[JointState, dict[str, Any]]:
         rates = rates_at(options, state.step)
         state, record = trainer.step(state, _part(batch))
         return state, {**record._asdict(), "learning_rates": rates._asdict()}
@@ -278,14 +278,13 @@ def _iterate(
     )
 
 
-def _part(batch: SceneBatch) -> SceneBatch:
+def _part(batch: Batch) -> Batch:
     """This host's part of a batch."""
     hosts, here = jax.process_count(), jax.process_index()
     if hosts == 1:
         return batch
-    count = len(batch.names) // hosts
-    own = slice(here * count, (here + 1) * count)
-    return batch._replace(**{name: getattr(batch, name)[own] for name in batch._fields if name != "step"})
+    count = len(batch.items) // hosts
+    return batch._replace(items=batch.items[here * count : (here + 1) * count])
 
 
 def _look(folder: Path, work: TrainingInputs, state: JointState) -> dict[str, Any]:

@@ -22,7 +22,7 @@ import doedesign
 from doedesign.capture.from_spec import LUMINANCE, longest_first
 from doedesign.capture.simulate import SimulatedCapture
 from doedesign.recon.network import Network
-from doedesign.recon.photos import photo_from_array, read_capture
+from doedesign.recon.photos import Photo, photo_from_array, read_capture
 from doedesign.recon.reconstruction import Reconstruction
 from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
@@ -102,7 +102,9 @@ class Model:
         found = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
         if found is None:
             rule = "without a model the released one is taken, and must be there"
-            raise InputError(str(RELEASED), rule, "no such folder here or in the checkout", "Give the folder of a model.")
+            raise InputError(
+                str(RELEASED), rule, "no such folder here or in the checkout", "Give the folder of a model."
+            )
         return cls.open(found)
 
     @classmethod
@@ -115,7 +117,9 @@ class Model:
         Raises:
             InputError: files that are missing, broken, or do not belong together.
         """
-        home = next((each for each in (Path(folder) / "trained", Path(folder)) if (each / NETWORK_NAME).is_file()), None)
+        home = next(
+            (each for each in (Path(folder) / "trained", Path(folder)) if (each / NETWORK_NAME).is_file()), None
+        )
         if home is None:
             cure = "Train one with doedesign train RUN --images DIR, or give the folder of a released model."
             raise InputError(str(folder), f"must hold a trained network ({NETWORK_NAME})", "none", cure)
@@ -197,7 +201,7 @@ class Model:
 
     def reconstruct(
         self,
-        capture: str | Path | Num[np.ndarray, "y x *c"] | SimulatedCapture,
+        capture: str | Path | Num[np.ndarray, "..."] | Photo | SimulatedCapture,
         *,
         psfs: PsfPair | None = None,
         linear: bool | None = None,
@@ -208,8 +212,8 @@ class Model:
         """Reconstruct what a capture shows behind its obstruction.
 
         Args:
-            capture: a file (`doedesign.recon.photos`); an array `[y, x, 3]` or `[y, x]`, row 0 at the lowest y; or what
-                `doedesign.simulate` returns, whose own PSFs the network is then given.
+            capture: a file (`doedesign.recon.photos`), read or not; an array `[y, x, 3]` or `[y, x]`, row 0 at the
+                lowest y; or what `doedesign.simulate` returns, whose own PSFs the network is then given.
             psfs: PSFs to give to the network instead.
             linear: whether values are linear light with white 1; by default floats and RAW are, and integers are
                 display values (sRGB), white at their highest count.
@@ -221,19 +225,17 @@ class Model:
             InputError: a capture that cannot be read or has other colours than the network.
             ValueError: see `doedesign.recon.tiles.plan_tiles`.
         """
-        name = "capture"
         if isinstance(capture, SimulatedCapture):
-            light, name = capture.rgb(capture.doe), capture.name
-            psfs = psfs or self._psfs_of(capture)
+            photo, psfs = Photo(capture.rgb(capture.doe), None, True, capture.name), psfs or self._psfs_of(capture)
         elif isinstance(capture, str | Path):
-            light, name = read_capture(capture, linear).light, str(capture)
+            photo = read_capture(capture, linear)
         else:
-            light = photo_from_array(capture, linear).light
-        light, psfs = self.channels(light, name), psfs or self.psfs()
+            photo = capture if isinstance(capture, Photo) else photo_from_array(capture, linear)
+        light, psfs = self.channels(photo.light, photo.name), psfs or self.psfs()
         multiple = self.network.layout.multiple
         options: Any = {"tile": tile, "overlap": overlap, "multiple": multiple, "on_tile": on_tile}
         picture = reconstruct_tiled(self.network, light, psfs.far, psfs.near, **options)
-        return Reconstruction(self.rgb(picture), self.rgb(light), psfs.near_m, psfs.far_m, name)
+        return Reconstruction(self.rgb(picture), self.rgb(light), psfs.near_m, psfs.far_m, photo.name)
 
     def _psfs_of(self, capture: SimulatedCapture) -> PsfPair:
         """The PSFs of a simulated capture's own DOE; warns where its camera is not that of the training."""
@@ -242,12 +244,10 @@ class Model:
         off_m = np.subtract(sorted(self.wavelengths_m, reverse=True), waves) if len(waves) == len(self.colours) else inf
         if abs(camera.pixel_m / self.pixel_m - 1) > _PITCH_TOLERANCE or np.max(np.abs(off_m)) > _WAVELENGTH_TOLERANCE_M:
             _log.warning(
-                "the network was trained for another camera (%.4g um pixels, %s nm) than the capture's (%.4g um, %s nm); "
-                "it is given the capture's own PSFs, but one that is trained for this camera may do better",
-                1e6 * self.pixel_m,
-                ", ".join(f"{1e9 * w:.0f}" for w in self.wavelengths_m),
-                1e6 * camera.pixel_m,
-                ", ".join(f"{1e9 * w:.0f}" for w in waves),
+                "the network was trained for another camera (%s) than that of the capture (%s); it is given the capture's "
+                "own PSFs, but one that is trained for this camera may do better",
+                _words(self.pixel_m, self.wavelengths_m),
+                _words(camera.pixel_m, waves),
             )
         far, near = (self.channels(capture.rgb(psf), capture.name) for psf in (capture.psf_far, capture.psf_near))
         depths_m = (capture.depth_near_m, capture.depth_far_m)
@@ -284,6 +284,10 @@ class Model:
             raise InputError(str(path), "a PSF must hold light", f"a sum of {total.min():.3g}", "Check its background.")
         scaled = (energy * (own / total)[:, None, None, None]).astype(np.float32)
         return PsfBank(scaled, self.colours, bank.depths_m, bank.pixel_m, bank.field_rad)
+
+
+def _words(pixel_m: float, wavelengths_m: Sequence[float]) -> str:
+    return f"{1e6 * pixel_m:.4g} um pixels, {', '.join(f'{1e9 * w:.0f}' for w in wavelengths_m)} nm"
 
 
 def _at(bank: PsfBank, depth_m: float, name: str) -> Float[np.ndarray, "c y x"]:

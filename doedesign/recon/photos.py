@@ -42,11 +42,13 @@ class Photo(NamedTuple):
         light: `[c, y, x]` linear light, white 1; three colours or one.
         bits: bits per value in the file; None for floats.
         linear: whether the file held linear light.
+        name: of the file, for messages.
     """
 
     light: Float[np.ndarray, "c y x"]
     bits: int | None
     linear: bool
+    name: str = "capture"
 
 
 def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
@@ -67,18 +69,20 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
         raise InputError(str(path), rule, suffix or "no suffix", cure)
     stored = _described(path) if suffix in (".png", ".exr") else None
     if suffix == ".exr":
-        photo = Photo(_exr_light(path), None, True)
-    elif stored is not None and linear is None:
-        photo = Photo(read_image(path.parent, stored), 16, True)
-    elif suffix in RAW_FILES:
-        photo = Photo(_raw_light(path), 16, True)
-    else:
-        photo = photo_from_array(read_pixels(path, most_pixels=_MOST_PIXELS), linear, str(path))
+        return _finite(Photo(_exr_light(path), None, True, str(path)))
+    if stored is not None and linear is None:
+        return _finite(Photo(read_image(path.parent, stored), 16, True, str(path)))
+    if suffix in RAW_FILES:
+        return _finite(Photo(_raw_light(path), 16, True, str(path)))
+    return photo_from_array(read_pixels(path, most_pixels=_MOST_PIXELS), linear, str(path))
+
+
+def _finite(photo: Photo) -> Photo:
     finite = np.isfinite(photo.light)
     if not finite.all():
         row, column = (int(i) for i in np.argwhere(~finite.all(axis=0))[0])
         got = f"NaN or infinity at row {row} from below, column {column} ({int((~finite).sum())} such values)"
-        raise InputError(str(path), "every pixel must be finite", got, "Repair those pixels, or save it again.")
+        raise InputError(photo.name, "every pixel must be finite", got, "Repair those pixels, or save it again.")
     return photo
 
 
@@ -113,7 +117,7 @@ def write_reconstruction(path: str | Path, display: Float[np.ndarray, "c y x"], 
 
 
 def _described(path: Path) -> dict[str, Any] | None:
-    """What the manifest of `simulate` beside a file says of it, or None; another program's manifest says nothing.
+    """Entry of the manifest of `simulate` beside a file, or None where there is no such manifest.
 
     Raises:
         InputError: the file is no picture of light, or changed since.
@@ -143,33 +147,33 @@ def _exr_light(path: Path) -> Float[np.ndarray, "c y x"]:
     raise InputError(str(path), rule, f"the channels {', '.join(sorted(channels))}", "Keep these alone.")
 
 
-def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None, where: str = "capture") -> Photo:
+def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None, name: str = "capture") -> Photo:
     """Take the values of a picture for light.
 
     Args:
         values: `[y, x]`, or `[y, x, 3]` for red, green and blue, row 0 at the lowest y; uint8, uint16 or floats.
         linear: whether they are linear light, white 1 or the highest count; by default floats are, and integers are
             display values (sRGB).
-        where: what messages begin with.
+        name: what messages begin with.
 
     Raises:
-        InputError: another shape or another type.
+        InputError: another shape or another type, or values that are not finite.
     """
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (1, 3)):
         rule, got = "must be one picture, grey or in red, green and blue", f"pixels of shape {values.shape}"
-        raise InputError(where, rule, got, _CURE)
+        raise InputError(name, rule, got, _CURE)
     if values.dtype.kind not in "fu" or (values.dtype.kind == "u" and values.dtype.itemsize > 2):
-        raise InputError(where, "pixels must be 8 or 16 bits, or floats", values.dtype, _CURE)
+        raise InputError(name, "pixels must be 8 or 16 bits, or floats", values.dtype, _CURE)
     planes = values[None] if values.ndim == 2 else values.transpose(2, 0, 1)
     if values.dtype.kind == "f":
         light = planes.astype(np.float32)
         stays = linear is not False
-        return Photo(np.ascontiguousarray(light if stays else linear_from_srgb(light)), None, stays)
+        return _finite(Photo(np.ascontiguousarray(light if stays else linear_from_srgb(light)), None, stays, name))
     bits = 8 * values.dtype.itemsize
     # A table of what every count means is shorter than any picture.
     table = np.arange(2**bits) / (2**bits - 1)
     meaning = (table if linear else linear_from_srgb(table)).astype(np.float32)
-    return Photo(np.ascontiguousarray(meaning[planes]), bits, bool(linear))
+    return Photo(np.ascontiguousarray(meaning[planes]), bits, bool(linear), name)
 
 
 def _raw_light(path: Path) -> Float[np.ndarray, "c y x"]:

@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from doedesign.recon.model import ModelPsfs
+from doedesign.recon.model import PsfPair
 from doedesign.recon.network import Network
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec.training import TrainSpec
@@ -55,7 +55,7 @@ class Tuner(eqx.Module):
     options: TrainSpec = eqx.field(static=True)
 
     @classmethod
-    def of(cls, psfs: ModelPsfs, options: TrainSpec, perceptual: Any = None) -> "Tuner":
+    def of(cls, psfs: PsfPair, options: TrainSpec, perceptual: Any = None) -> "Tuner":
         """Prepare fine-tuning.
 
         Args:

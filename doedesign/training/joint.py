@@ -23,9 +23,9 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Key
 
 from doedesign.build import camera_from_spec, process_from_spec
-from doedesign.capture.from_spec import channels_from_rgb, outside_from_kind, sensor_from_spec
-from doedesign.capture.scenes import SceneBatch
-from doedesign.capture.simulate import depth_range_m, shadow_window
+from doedesign.capture.camera import CaptureModel, depth_range_m
+from doedesign.capture.from_spec import sensor_from_spec
+from doedesign.capture.scenes import Batch
 from doedesign.design.optimize import Free
 from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import plans_of
@@ -37,7 +37,6 @@ from doedesign.training.hosts import on_all, own_copy, parts_of
 from doedesign.training.loss import TERMS, Weights, losses
 from doedesign.training.optics import (
     Capture,
-    CaptureModel,
     LivePlate,
     Plate,
     RingPlate,
@@ -166,7 +165,7 @@ class Trainer(eqx.Module):
             height_m = np.zeros(camera.grid.shape, np.float32)
         alive = train.moves_optics or train.fabricated or train.field == "random"
         plate = _live_plate(spec, files, source, camera) if alive else resting_plate(spec, camera, kind, height_m)
-        bench = CaptureModel(camera, model, outside_from_kind(kind), sensor, shadow_window(kind, camera))
+        bench = CaptureModel.make(camera, kind, model, sensor)
         weights = Weights(train.l1, train.perceptual, train.masked)
         process = process_from_spec(spec.process) if train.fabricated else None
         plate = plate if mesh is None else on_all(plate, mesh)
@@ -192,7 +191,7 @@ class Trainer(eqx.Module):
         # Where the step will leave it: otherwise the second step would be compiled anew.
         return state if self.mesh is None else on_all(state, self.mesh)
 
-    def step(self, state: JointState, batch: SceneBatch) -> tuple[JointState, TrainingRecord]:
+    def step(self, state: JointState, batch: Batch) -> tuple[JointState, TrainingRecord]:
         """Take one step.
 
         Args:
@@ -220,7 +219,7 @@ class Trainer(eqx.Module):
             raise InputError(f"train, step {state.step}", "the loss must stay finite", record.loss, cure)
         return JointState(state.step + 1, network, free, *moments), record
 
-    def reconstruct(self, state: JointState, batch: SceneBatch) -> tuple[Capture, Float[Array, "b c y x"]]:
+    def reconstruct(self, state: JointState, batch: Batch) -> tuple[Capture, Float[Array, "b c y x"]]:
         """Photograph and reconstruct scenes on one device, on the axis and without errors of a process.
 
         Returns:
@@ -233,20 +232,20 @@ class Trainer(eqx.Module):
         return _look(network, free, trainer, seen, keys)
 
     def _seen(
-        self, batch: SceneBatch, seed: int, off_axis: bool, *, part: bool = False
+        self, batch: Batch, seed: int, off_axis: bool, *, part: bool = False
     ) -> tuple[TrainingScene, Key[Array, " b"]]:
         """A batch, or this host's part of one, as the compiled step takes it, with a key of noise for every scene."""
-        camera, count = self.bench.camera, len(batch.names)
+        count = len(batch.items)
         # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
         hosts, host = (jax.process_count(), jax.process_index()) if part else (1, 0)
         first = (batch.step * hosts + host) * count
         items = []
         for k in range(count):
             angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
-            near, far = float(batch.depth_m[k]), float(batch.background_depth_m[k])
-            light = [channels_from_rgb(np.asarray(rgb), camera) for rgb in (batch.background[k], batch.radiance[k])]
-            sources = [self.plate.source(depth, angles) for depth in (far, near)]
-            items.append(TrainingScene(light[0], batch.mask[k], light[1], np.float32(near), np.float32(far), *sources))
+            # In single precision, as the compiled step has them.
+            scene = jax.tree.map(np.float32, self.bench.scene(batch.items[k].scene))
+            depths = scene.background_depth_m, scene.obstructions[0].depth_m
+            items.append(TrainingScene(scene, *(self.plate.source(float(depth), angles) for depth in depths)))
         seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
         root = jax.random.key(seed + (_SALT_NOISE << 32))
         return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + count))
@@ -378,8 +377,8 @@ def _loss(
         half=train.precision == "mixed",
         checkpointed=train.checkpointing,
     )
-    reference = srgb_from_linear(jnp.asarray(seen.background))
-    return losses(picture, reference, jnp.asarray(seen.mask), trainer.weights, trainer.perceptual)
+    reference, mask = srgb_from_linear(jnp.asarray(seen.scene.background)), seen.scene.obstructions[0].mask
+    return losses(picture, reference, jnp.asarray(mask), trainer.weights, trainer.perceptual)
 
 
 def _slopes(

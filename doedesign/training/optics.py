@@ -17,16 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Key
 
+from doedesign.capture.camera import CaptureModel
 from doedesign.design.optimize import Free
 from doedesign.design.parametrize import LevelParametrization
 from doedesign.design.problem import WavelengthPlan
 from sim.camera import Camera
-from sim.imaging.formation import Optics, capture
-from sim.imaging.occlusion import Model, Outside
-from sim.imaging.scene import Obstruction, Scene
+from sim.imaging.scene import Scene
 from sim.propagation.hankel import Hankel, ring_source_waves
 from sim.psf_bank import PsfBank
-from sim.sensor import Sensor, developed, expose
 from sim.source import Source, SourceColumns, SourceRows, source_at, source_pupil
 
 
@@ -151,42 +149,16 @@ def _by_colour(lines: tuple[WavelengthPlan, ...], images: list[Array]) -> Array:
     return jnp.stack([sum(parts[1:], start=parts[0]) for parts in colours])
 
 
-class CaptureModel(NamedTuple):
-    """What is the same in every scene, but for the plate.
-
-    Attributes:
-        camera: optics, with an odd window, so that a capture lies on its scene.
-        model: occlusion model.
-        outside: see `sim.imaging.formation.capture`.
-        sensor: sensor without a mosaic.
-        shadow_px: window of the shadow discs.
-    """
-
-    camera: Camera
-    model: Model
-    outside: Outside
-    sensor: Sensor
-    shadow_px: int
-
-
 class TrainingScene(NamedTuple):
-    """One scene as the training sees it; see `doedesign.capture.scenes.SceneItem`. Colours are the camera's.
+    """One scene as the training sees it.
 
     Attributes:
-        background: `[c, y, x]` linear light.
-        mask: `[y, x]` share of each direction that is blocked.
-        radiance: `[c, y, x]` linear light of the obstruction.
-        depth_m: its distance.
-        background_depth_m: distance of the background.
+        scene: one obstruction before a background, colours those of the camera, depths in single precision.
         far: source in the background, as the plate wants it.
         near: source in the obstruction.
     """
 
-    background: Float[Array, "c y x"] | Float[np.ndarray, "c y x"]
-    mask: Float[Array, "y x"] | Float[np.ndarray, "y x"]
-    radiance: Float[Array, "c y x"] | Float[np.ndarray, "c y x"]
-    depth_m: Float[Array, ""] | np.float32
-    background_depth_m: Float[Array, ""] | np.float32
+    scene: Scene
     far: Any
     near: Any
 
@@ -220,14 +192,7 @@ def shot(
     """
     call: Any = plate.psf
     far, near = (call(free, softness, source) for source in (seen.far, seen.near))
-    camera = bench.camera
-    optics = Optics(
-        jnp.stack([far, near]), camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, bench.shadow_px
-    )
-    near_m, far_m = (jnp.asarray(depth) for depth in (seen.depth_m, seen.background_depth_m))
-    scene = Scene(seen.background, far_m, (Obstruction(seen.mask, seen.radiance, near_m),))
-    light = capture(scene, optics, bench.model, outside=bench.outside)
-    return Capture(developed(expose(light, bench.sensor, key), bench.sensor), far, near)
+    return Capture(bench.developed(jax.tree.map(jnp.asarray, seen.scene), far, near, key), far, near)
 
 
 def shots(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.recon.model import Model, in_camera
+from doedesign.recon.model import Model
 from doedesign.recon.photos import PHOTO_FILES, read_capture
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes, sha256_file
@@ -164,7 +164,7 @@ def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Cap
         InputError: a file that cannot be used, or files of different sizes.
     """
     named = (files.capture, files.reference)
-    capture, reference = (in_camera(read_capture(path, linear), path, model) for path in named)
+    capture, reference = (model.channels(read_capture(path, linear).light, str(path)) for path in named)
     mask = np.broadcast_to(np.float32(0), capture.shape[1:])
     if files.mask is not None:
         # A share of a pixel follows no curve. Colours of a mask are all the same.

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.capture.camera import depth_range_m
 from doedesign.capture.from_spec import rgb_from_channels
-from doedesign.capture.scenes import SceneBatch, SceneData
-from doedesign.capture.simulate import depth_range_m
+from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
@@ -78,9 +78,7 @@ def _at_rest(trainer: Trainer, state: JointState, kind: ObstructionKind) -> tupl
     return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
 
 
-def _shown(
-    trainer: Trainer, state: JointState, batch: SceneBatch, baselines: bool
-) -> dict[str, Float[np.ndarray, "c y x"]]:
+def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
     """What the camera records of a scene, and what the network and others make of it, in display values."""
     shot, picture = trainer.reconstruct(state, batch)
     light, far, near = (np.asarray(image, np.float32)[0] for image in shot)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from doedesign.capture.from_spec import channels_from_rgb
 from doedesign.capture.images import picture_files
-from doedesign.capture.scenes import SceneBatch, SceneData
+from doedesign.capture.scenes import Batch, SceneData
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file
 from sim.camera import Camera
@@ -91,7 +91,7 @@ class ValidationSample(NamedTuple):
     mask: Float[np.ndarray, "y x"]
 
 
-Show = Callable[[SceneBatch], Mapping[str, Float[np.ndarray, "c y x"]]]
+Show = Callable[[Batch], Mapping[str, Float[np.ndarray, "c y x"]]]
 
 
 def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[ValidationSample]:
@@ -106,5 +106,6 @@ def looks(data: SceneData, count: int, camera: Camera, show: Show) -> Iterator[V
     with data.batches(stop=count) as batches:
         for batch in batches:
             shown = {name: np.clip(image, 0, 1) for name, image in show(batch).items()}
-            scene = srgb_from_linear(channels_from_rgb(batch.background[0], camera))
-            yield ValidationSample(batch.names[0], shown, scene, batch.mask[0])
+            name, scene = batch.items[0]
+            clean = srgb_from_linear(channels_from_rgb(np.asarray(scene.background), camera))
+            yield ValidationSample(name, shown, clean, np.asarray(scene.obstructions[0].mask))

@@ -1,0 +1,87 @@
+"""How light becomes a developed capture: the part of a camera that is the same whatever optic it has."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from doedesign.capture.from_spec import channels_from_rgb, outside_from_kind
+from sim.camera import Camera
+from sim.imaging.convolve import Border
+from sim.imaging.disc import disc_window
+from sim.imaging.formation import Optics, capture, own_margin_px
+from sim.imaging.occlusion import Model, Outside
+from sim.imaging.scene import Obstruction, Scene
+from sim.obstruction import ObstructionKind
+from sim.sensor import Sensor, demosaiced, developed, expose
+
+Psf = Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"]
+
+
+@dataclass(frozen=True)
+class CaptureModel:
+    """A camera without its optic.
+
+    Attributes:
+        camera: lens and pixels, with an odd window, so that a capture lies on its scene.
+        occlusion: occlusion model.
+        outside: what eq. 10 takes for the obstruction's picture where there is none (`sim.imaging.formation.capture`).
+        sensor: the sensor.
+        shadow_px: window of the shadow discs.
+        border: what lies beyond a scene. With `own` a scene brings its surroundings along, so that light comes in over
+            the edges as it does in the world, and everything captured is smaller than the scene, by `margin_px`.
+    """
+
+    camera: Camera
+    occlusion: Model
+    outside: Outside
+    sensor: Sensor
+    shadow_px: int
+    border: Border = "reflect"
+
+    @classmethod
+    def make(cls, camera: Camera, kind: ObstructionKind, occlusion: Model, sensor: Sensor) -> "CaptureModel":
+        """A camera for one kind of obstruction, at whatever depth: all its scenes share one compiled capture."""
+        disc = camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * depth_range_m(kind)[0])
+        return cls(camera, occlusion, outside_from_kind(kind), sensor, disc_window(disc))
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels per axis by which scenes are larger than what is captured of them."""
+        return own_margin_px(self.camera.window, self.shadow_px, self.occlusion) if self.border == "own" else 0
+
+    def scene(self, scene: Scene) -> Scene:
+        """A scene in red, green and blue in the colours of the camera."""
+        rgb, near = np.asarray(scene.background), scene.obstructions[0]
+        seen = Obstruction(near.mask, channels_from_rgb(np.asarray(near.radiance), self.camera), near.depth_m)
+        return Scene(channels_from_rgb(rgb, self.camera), scene.background_depth_m, (seen,))
+
+    def optics(self, far: Psf, near: Psf) -> Optics:
+        """This camera with an optic that has these PSFs, of the background and of the obstruction."""
+        camera, psf = self.camera, jnp.stack([jnp.asarray(far), jnp.asarray(near)])
+        return Optics(psf, camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, self.shadow_px)
+
+    def developed(self, scene: Scene, far: Psf, near: Psf, key: Key[Array, ""]) -> Float[Array, "c y x"]:
+        """Photograph a scene: linear light with noise, white 1. Differentiable, but for a mosaic.
+
+        Args:
+            scene: one obstruction before a background, in the colours of the camera.
+            far: PSFs of the background, energy per pixel.
+            near: PSFs of the obstruction.
+            key: key of the noise.
+        """
+        optics = self.optics(far, near)
+        light = capture(scene, optics, self.occlusion, border=self.border, outside=self.outside)
+        raw: Any = expose(light, self.sensor, key)
+        return developed(demosaiced(np.asarray(raw), self.sensor) if self.sensor.pattern else raw, self.sensor)
+
+
+def depth_range_m(kind: Any) -> tuple[float, float]:
+    """Least and greatest distance that a kind of obstruction, or any it is mixed of, is drawn at, metres."""
+    depth = getattr(kind, "depth_m", None)
+    if depth:
+        return float(depth[0]), float(depth[1])
+    inner = [depth_range_m(getattr(kind, name)) for name in ("dirt", "raindrop")]
+    return min(low for low, _ in inner), max(high for _, high in inner)

@@ -1,0 +1,192 @@
+"""Simulated captures in a folder.
+
+    OUT/
+        manifest.json       what this was made with, and the digests of all items when done
+        contact.png         the items side by side
+        0000_NAME/          one folder per item; it appears whole or not at all
+            clean           the scene alone, sharp, linear light with white 1
+            conventional    the developed capture of the same camera with a flat plate
+            capture         the developed capture with the DOE
+            mask            share of each pixel's direction that the obstruction blocks, sharp
+            alpha           share of the background's light that the model takes away, with the DOE
+            depth           metres to what is seen: the obstruction where the mask is at least a half
+            manifest.json   digests, what the numbers mean, and what was drawn for it
+
+A stopped simulation goes on with the item it stopped at; the same seed gives the same bytes.
+"""
+
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from doedesign.capture.camera import CaptureModel
+from doedesign.capture.image_files import Stored, read_image, write_image
+from doedesign.capture.scenes import SceneData
+from doedesign.capture.simulate import Psfs, SimulatedCapture, photograph
+from doedesign.report.contact import ContactRow, draw_contact
+from doedesign.runs.folder import alone_in
+from doedesign.runtime.progress import meter
+from fab.errors import InputError
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
+from sim.imaging.occlusion import follows_light
+
+FORMAT = "doedesign simulation 1"
+
+_log = logging.getLogger("doedesign")
+
+
+def write_captures(
+    folder: Path,
+    data: SceneData,
+    count: int,
+    model: CaptureModel,
+    psfs: tuple[Psfs, Psfs],
+    settings: dict[str, Any],
+    *,
+    png: bool = False,
+) -> tuple[str, ...]:
+    """Make every item that is not there yet, and the contact sheet.
+
+    Args:
+        folder: where to; a new or empty folder, or that of the same simulation.
+        data: the scenes.
+        count: number of items.
+        model: what both cameras share.
+        psfs: PSFs by depth of the camera with the DOE, and of the conventional one.
+        settings: everything that an item depends on, but for its number.
+        png: write 16-bit PNG instead of EXR.
+
+    Returns:
+        names of the items' folders.
+
+    Raises:
+        InputError: the folder is that of something else, or a picture or an obstruction cannot be used.
+    """
+    digest = sha256_bytes(canonical_json(settings))
+    with alone_in(folder):
+        _require_own(folder, digest)
+        manifest = {**settings, "settings_sha256": digest}
+        write_atomic(folder / MANIFEST_NAME, canonical_json({**manifest, "state": "running"}))
+        ready = _finished(folder, digest)
+        if ready:
+            _log.info("%d items are there already", len(ready))
+        names = []
+        with meter("captures", count) as progress:
+            for number in range(count):
+                if number not in ready:
+                    sample, key = data.item(number), jax.random.fold_in(jax.random.key(data.seed), number)
+                    found = photograph(sample, model, *psfs, key)
+                    ready[number] = _write_item(folder, number, found, model, digest, png)
+                names.append(ready[number])
+                progress.advance(number + 1, ready[number])
+        _log.info("drawing the contact sheet")
+        rows = [_row(folder / name) for name in names]
+        title = f"{settings['run']} through {settings['obstruction']}"
+        draw_contact(folder / "contact.png", rows, title, _words(model, settings))
+        listed = {f"{name}/{MANIFEST_NAME}": sha256_file(folder / name / MANIFEST_NAME) for name in names}
+        listed |= {"contact.png": sha256_file(folder / "contact.png")}
+        write_atomic(folder / MANIFEST_NAME, canonical_json({**manifest, "state": "done", "results_sha256": listed}))
+    return tuple(names)
+
+
+def _require_own(folder: Path, digest: str) -> None:
+    """Refuse a folder of something else, and clear away what a killed simulation was writing."""
+    for path in folder.iterdir():
+        if path.name.startswith(".") and (".new." in path.name or path.name.startswith((".manifest", ".contact"))):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if not (folder / MANIFEST_NAME).is_file():
+        if any(folder.iterdir()):
+            rule = "a simulation needs a new or empty folder, or its own"
+            raise InputError(str(folder), rule, "other content", "Choose another output folder.")
+        return
+    if {path.name for path in folder.iterdir()} == {MANIFEST_NAME}:
+        return  # begun and nothing more: there is nothing to lose, whatever it was
+    found = read_json(folder / MANIFEST_NAME)
+    if found.get("format") != FORMAT or found.get("settings_sha256") != digest:
+        rule = "the folder must belong to this simulation"
+        got = "one with another run, seed, obstruction, model, sensor or other pictures"
+        raise InputError(str(folder), rule, got, "Choose another output folder, or remove that one.")
+
+
+def _finished(folder: Path, digest: str) -> dict[int, str]:
+    """Items that are there and whole, by number."""
+    found = {}
+    for path in sorted(folder.glob(f"*/{MANIFEST_NAME}")):
+        item = read_json(path)
+        files = {path.parent / name: expected for name, expected in item.get("sha256", {}).items()}
+        whole = all(file.is_file() and sha256_file(file) == expected for file, expected in files.items())
+        if item.get("settings_sha256") == digest and files and whole:
+            found[int(item["number"])] = path.parent.name
+        else:
+            shutil.rmtree(path.parent)
+    return found
+
+
+def _write_item(folder: Path, number: int, found: SimulatedCapture, model: CaptureModel, digest: str, png: bool) -> str:
+    """Write one item; return the name of its folder."""
+    name = f"{number:04d}_{''.join(c if c.isalnum() or c in '-_' else '-' for c in Path(found.name).stem)[:40]}"
+    with atomic_folder(folder / name) as fresh:
+        stored = _write_images(fresh, found, max(1.0, model.sensor.most_light(len(found.clean))), png)
+        described = {
+            "format": FORMAT,
+            "number": number,
+            "settings_sha256": digest,
+            "picture": found.name,
+            "depth_m": found.depth_near_m,
+            "background_depth_m": None if np.isinf(found.depth_far_m) else found.depth_far_m,
+            "covered": float(found.mask.mean(dtype=np.float64)),
+            "images": {title: one.described() for title, one in stored.items()},
+            "sha256": {one.file: sha256_file(fresh / one.file) for one in stored.values()},
+        }
+        (fresh / MANIFEST_NAME).write_bytes(canonical_json(described))
+    return name
+
+
+def _write_images(folder: Path, found: SimulatedCapture, most: float, png: bool) -> dict[str, Stored]:
+    colours = ("R", "G", "B") if len(found.clean) == 3 else ("Y",)
+    share = colours if len(found.alpha) == len(colours) else ("A",)
+    images = {
+        "clean": (found.rgb(found.clean), colours, "scene without obstruction", 1.0, False),
+        "conventional": (found.rgb(found.conventional), colours, "capture with a flat plate", most, False),
+        "capture": (found.rgb(found.doe), colours, "capture with the DOE", most, False),
+        "mask": (found.mask[None], ("M",), "share of each direction that is blocked", 1.0, False),
+        "alpha": (found.rgb(found.alpha), share, "share of the background's light that is lost", 1.0, False),
+        "depth": (found.depth_m[None], ("Z",), "metres to what is seen", 1 / found.depth_near_m, png),
+    }
+    return {
+        name: write_image(folder, name, image, channels, what, png=png, full_scale=scale, inverse=inverse)
+        for name, (image, channels, what, scale, inverse) in images.items()
+    }
+
+
+def _row(folder: Path) -> ContactRow:
+    """An item as the contact sheet shows it, read back from its files."""
+    described = read_json(folder / MANIFEST_NAME)
+    images = {name: read_image(folder, stored) for name, stored in described["images"].items()}
+    clean, conventional, doe = (
+        np.repeat(images[name], 3 // len(images[name]), axis=0) for name in ("clean", "conventional", "capture")
+    )
+    far = described["background_depth_m"]
+    behind = "infinity" if far is None else f"{far:.3g} m"
+    covered = 100 * described["covered"]
+    label = f"{folder.name}: {covered:.0f} % covered at {100 * described['depth_m']:.3g} cm, scene at {behind}"
+    return ContactRow(label, clean, conventional, doe, images["mask"][0], images["alpha"].mean(axis=0))
+
+
+def _words(model: CaptureModel, settings: dict[str, Any]) -> str:
+    sensor = model.sensor
+    noise = (
+        f"full well {sensor.full_well_e:g} electrons, white at {100 * sensor.exposure:g} % of it, read noise "
+        f"{sensor.read_noise_e:g} electrons"
+        if sensor.noise == "physical"
+        else f"noise model {sensor.noise}"
+    )
+    caution = "" if follows_light(model.occlusion) else " (passes light that never reaches the aperture: see README)"
+    return (
+        f"occlusion model {model.occlusion}{caution}; {settings['plate']}; {noise}; the conventional camera has a flat "
+        "plate of the same glass; captures are developed and shown as sRGB, without gain"
+    )
