@@ -40,7 +40,7 @@ import doedesign.recon.network as layers
 from bench.capture import make_psf, verdict
 from bench.psf import high_water_mb
 from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec
-from doedesign.capture.scenes import SceneBatch
+from doedesign.capture.scenes import Batch, NamedScene
 from doedesign.recon.conv import convolution
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.tiles import reconstruct_tiled
@@ -50,6 +50,7 @@ from doedesign.training.checkpoint import settled
 from doedesign.training.joint import JointState, Trainer
 from doedesign.training.perceptual import Lpips
 from sim.imaging.convolve import fast_length
+from sim.imaging.scene import Obstruction, Scene
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SPECS = {"automotive": 512, "automotive_cpu": 256}
@@ -65,16 +66,16 @@ def spec_of(name: str) -> Spec:
     return load_spec(EXAMPLES / f"{name}.toml", [f"train.size={SPECS[name]}", "train.batch=1", "train.perceptual=0.0"])
 
 
-def make_training(spec: Spec) -> tuple[Trainer, JointState, SceneBatch]:
+def make_training(spec: Spec) -> tuple[Trainer, JointState, Batch]:
     """A training, its first state, and a scene."""
     rng = np.random.default_rng(0)
     height = 1e-6 * rng.random((spec.doe.samples, spec.doe.samples), np.float32)
     trainer = Trainer.of(spec, {}, "", occlusion_from_spec(spec, ""), obstruction_from_spec(spec, ""), height)
     size = spec.train.size
-    background, radiance = (rng.random((1, 3, size, size), np.float32) for _ in range(2))
-    mask = np.kron(rng.random((1, 8, 8)) > 0.8, np.ones((1, size // 8, size // 8))).astype(np.float32)
-    near, far = (np.full(1, depth, np.float32) for depth in (0.08, 5.0))
-    return trainer, settled(trainer.initial(height)), SceneBatch(background, mask, radiance, near, far, ("",), 0)
+    background, radiance = (rng.random((3, size, size), np.float32) for _ in range(2))
+    mask = np.kron(rng.random((8, 8)) > 0.8, np.ones((size // 8, size // 8))).astype(np.float32)
+    scene = Scene(background, 5.0, (Obstruction(mask, radiance, 0.08),))
+    return trainer, settled(trainer.initial(height)), Batch(0, (NamedScene("", scene),))
 
 
 def stepping(spec: Spec) -> Call:
@@ -92,7 +93,7 @@ def stepping(spec: Spec) -> Call:
 # --- the floor -------------------------------------------------------------------------------------------------------
 
 
-def design(*shape: int) -> jax.Array:
+def random_array(*shape: int) -> jax.Array:
     """Numbers for a bare computation."""
     return jnp.asarray(np.random.default_rng(0).random(shape, np.float32))
 
@@ -100,9 +101,12 @@ def design(*shape: int) -> jax.Array:
 def transforms(count: int, length: int, forth: bool = True) -> Call:
     """So many real transforms of `length`², forth or back."""
     if forth:
-        images, run = design(count, length, length), jax.jit(jnp.fft.rfft2)
+        images, run = random_array(count, length, length), jax.jit(jnp.fft.rfft2)
         return lambda: run(images).block_until_ready()
-    spectra, back = jnp.fft.rfft2(design(count, length, length)), jax.jit(lambda s: jnp.fft.irfft2(s, (length, length)))
+    spectra, back = (
+        jnp.fft.rfft2(random_array(count, length, length)),
+        jax.jit(lambda s: jnp.fft.irfft2(s, (length, length))),
+    )
     return lambda: back(spectra).block_until_ready()
 
 
@@ -163,13 +167,13 @@ def network_floor(network: Network, size: int, window: int) -> tuple[list[Call],
 
 def bare_convolution(shape: tuple[int, ...], kernel: tuple[int, ...], stride: int) -> list[Call]:
     """A convolution, its gradient by the image and by the weights, in the fastest forms known."""
-    image, weights, margin = design(*shape), design(*kernel), kernel[0] // 2
+    image, weights, margin = random_array(*shape), random_array(*kernel), kernel[0] // 2
     sides = [(margin, margin)] * 2
 
     def plain(image: jax.Array, weights: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(image, weights, (stride, stride), sides, dimension_numbers=_DIMENSIONS)
 
-    slope = design(*jax.eval_shape(plain, image, weights).shape)
+    slope = random_array(*jax.eval_shape(plain, image, weights).shape)
     by_image = [jax.jit(lambda s: jax.linear_transpose(lambda i: plain(i, weights), image)(s)[0])]
     if stride == 1:
         turned = weights[::-1, ::-1].transpose(0, 1, 3, 2)
@@ -189,7 +193,7 @@ def bare_convolution(shape: tuple[int, ...], kernel: tuple[int, ...], stride: in
 def bare_doubled(shape: tuple[int, ...], kernel: tuple[int, ...]) -> list[Call]:
     """A transposed convolution of size and stride 2 is one matrix product, and so are its gradients."""
     pixels, inputs, outputs = shape[1] * shape[2], kernel[0], 4 * kernel[3]
-    image, weights, slope = design(pixels, inputs), design(inputs, outputs), design(pixels, outputs)
+    image, weights, slope = random_array(pixels, inputs), random_array(inputs, outputs), random_array(pixels, outputs)
     product = jax.jit(jnp.dot)
     pairs = ((image, weights), (slope, weights.T), (image.T, slope))
     return [lambda pair=pair: product(*pair).block_until_ready() for pair in pairs]
@@ -238,7 +242,7 @@ def report_step(name: str, rounds: int) -> None:
     ratios = seconds[:, 0] / seconds[:, 1:].sum(axis=1)
     middle, (ratio, busy) = np.median(seconds, axis=0)[:, 0], np.median(ratios, axis=0)
     what = f"{spec.doe.samples} x {spec.doe.samples} cells, {spec.train.size} x {spec.train.size} pixels, width 12"
-    print(f"Joint step of {name}: {what}, {trainer.bench.model}, mean absolute errors, batch 1")
+    print(f"Joint step of {name}: {what}, {trainer.bench.occlusion}, mean absolute errors, batch 1")
     print(f"  step {middle[0]:7.2f} s, bare {middle[1:].sum():6.2f} s: " + told(ratio, busy, ratios[:, 0]))
     for part, each in zip(floors, middle[1:], strict=True):
         print(f"    {part:34s}{each:6.2f} s")

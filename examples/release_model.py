@@ -22,7 +22,7 @@ from see_through import photographed
 
 from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code
-from doedesign.recon.model import RELEASED, open_model
+from doedesign.recon.model import RELEASED, Model
 from doedesign.recon.photos import write_reconstruction
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from fab.errors import InputError
@@ -44,7 +44,7 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
     manifest = read_json(trained / MANIFEST_NAME)
     if manifest.get("state") != "done" or manifest.get("camera") != "doe":
         raise InputError(str(trained), "must be a finished training behind a plate", "another", "Finish it first.")
-    model = open_model(trained)
+    model = Model.open(trained)
     write_network(out / NETWORK_NAME, model.network, model.about, half=True)
     for name in COPIED:
         write_atomic(out / name, (trained / name).read_bytes())
@@ -56,7 +56,7 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
             raise InputError(str(order), "the order must be drawn from this plate", "another plate's", cure)
         write_atomic(out / "masks.json", canonical_json(drawn))
         names.append("masks.json")
-    chain = photographed(open_model(out), sample_files()[0], SEED, side=SIDE)
+    chain = photographed(Model.open(out), sample_files()[0], SEED, side=SIDE)
     write_reconstruction(out / "capture.png", chain.plate, 16)
     scores = read_json(trained / "metrics.json")
     said = {

@@ -21,18 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from doedesign.build import camera_from_spec
-from doedesign.capture.from_spec import (
-    obstruction_from_spec,
-    occlusion_from_spec,
-    outside_from_kind,
-    rgb_from_channels,
-    sensor_from_spec,
-)
+from doedesign.capture.camera import CaptureModel
+from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, rgb_from_channels, sensor_from_spec
 from doedesign.capture.images import Pictures, sample_files
 from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import CameraPair, captured, flat_psfs, shadow_window
+from doedesign.capture.simulate import flat_psfs, photograph
 from doedesign.cli import exit_code
-from doedesign.recon.model import Model, open_model, released_model
+from doedesign.recon.model import Model
 from doedesign.report.canvas import note, picture, place, scale_bar
 from doedesign.spec import load_spec
 from doedesign.training.scores import scores
@@ -84,12 +79,13 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
         occlusion: occlusion model; that of the training if None.
         side: pixels per side; those of the training if None.
     """
-    bench, kind, far = bench_of(model, occlusion)
-    wanted = (side or load_spec(model.folder / "spec.toml").train.size) + bench.margin_px
-    view = CameraView((wanted, wanted), bench.camera.pixel_m, bench.camera.sensor_distance_m)
-    item = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0, 0)
-    shot = captured(item, bench, jax.random.key(seed))
-    psfs = [psf_at(model.bank, depth) for depth in (item.background_depth_m, item.depth_m)]
+    capture_model, kind, far = capture_model_of(model, occlusion)
+    camera = capture_model.camera
+    wanted = (side or load_spec(folder_of(model) / "spec.toml").train.size) + capture_model.margin_px
+    view = CameraView((wanted, wanted), camera.pixel_m, camera.sensor_distance_m)
+    sample = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0)
+    shot = photograph(sample, capture_model, partial(psf_at, model.bank), flat_psfs(camera), jax.random.key(seed))
+    psfs = [shot.psf_far, shot.psf_near]
     clean, plain, plate = (
         np.clip(srgb_from_linear(image), 0, 1) for image in (shot.clean, shot.conventional, shot.doe)
     )
@@ -98,32 +94,35 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
     for what in ("plain", "plate", "network"):
         judged = scores(pictures[what][None], clean[None], shot.mask[None])
         psnr[what] = (float(judged.occluded.psnr[0]), float(judged.full.psnr[0]))
-    told = f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(item.depth_m, 4))}, "
-    told += f"occlusion model {bench.model}. PSNR where it is covered, in brackets over all."
+    told = f"{file.name} behind {getattr(kind, 'name', 'masks')} at {format_length(round(shot.depth_near_m, 4))}, "
+    told += f"occlusion model {shot.occlusion}. PSNR where it is covered, in brackets over all."
     pictures |= {"far": psfs[0], "near": psfs[1]}
-    shown = {name: rgb_from_channels(image, bench.camera) for name, image in pictures.items()}
-    return Chain(mask=shot.mask, near_m=item.depth_m, psnr=psnr, words=told, **shown)
+    shown = {name: rgb_from_channels(image, camera) for name, image in pictures.items()}
+    return Chain(mask=shot.mask, near_m=shot.depth_near_m, psnr=psnr, words=told, **shown)
 
 
-def bench_of(model: Model, occlusion: str | None = None) -> tuple[CameraPair, ObstructionKind, tuple[float, float]]:
-    """The camera of a model beside a conventional one, its obstruction, and the distances of its scenes.
+def folder_of(model: Model) -> Path:
+    """Folder that a model was read from, with its spec and its design."""
+    assert model.folder is not None
+    return model.folder
+
+
+def capture_model_of(
+    model: Model, occlusion: str | None = None
+) -> tuple[CaptureModel, ObstructionKind, tuple[float, float]]:
+    """The camera of a model without its DOE, its obstruction, and the distances of its scenes.
 
     Args:
         model: plate and network.
         occlusion: occlusion model; that of the training if None.
     """
-    where = str(model.folder / "spec.toml")
-    spec = load_spec(model.folder / "spec.toml")
+    file = folder_of(model) / "spec.toml"
+    spec = load_spec(file)
     camera = replace(camera_from_spec(spec), window=model.bank.energy.shape[-1])
-    kind, name = (
-        obstruction_from_spec(spec, where),
-        occlusion_from_spec(spec, where, occlusion or model.about["occlusion"]),
-    )
-    eyes = partial(psf_at, model.bank), flat_psfs(camera)
-    bench = CameraPair(
-        camera, *eyes, name, outside_from_kind(kind), sensor_from_spec(spec), shadow_window(kind, camera), "own"
-    )
-    return bench, kind, (min(spec.scene.far_m), max(spec.scene.far_m))
+    kind = obstruction_from_spec(spec, str(file))
+    name = occlusion_from_spec(spec, str(file), occlusion or model.about["occlusion"])
+    made = replace(CaptureModel.make(camera, kind, name, sensor_from_spec(spec)), border="own")
+    return made, kind, (min(spec.scene.far_m), max(spec.scene.far_m))
 
 
 def restored(model: Model, capture: np.ndarray, far: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -134,7 +133,7 @@ def restored(model: Model, capture: np.ndarray, far: np.ndarray, near: np.ndarra
 
 def draw(path: Path, chain: Chain, model: Model, camera: Camera) -> None:
     """Draw the chain: optics above, pictures below."""
-    height = read_height(model.folder / "height.exr").height_m
+    height = read_height(folder_of(model) / "height.exr").height_m
     across, up = 4 * (SIDE + GAP) + GAP, 2 * (SIDE + ROW) + 0.65
     with picture(path, (across, up), "Through the dirt") as figure:
         tops = (up - 0.6, up - 0.6 - SIDE - ROW)
@@ -180,9 +179,9 @@ def main() -> int:
     given = parser.parse_args()
 
     def work() -> None:
-        model = open_model(given.model or released_model())
+        model = Model.open(given.model) if given.model else Model.released()
         chain = photographed(model, given.picture or sample_files()[0], given.seed, given.occlusion)
-        draw(given.out, chain, model, camera_from_spec(load_spec(model.folder / "spec.toml")))
+        draw(given.out, chain, model, camera_from_spec(load_spec(folder_of(model) / "spec.toml")))
         print(given.out)
 
     return exit_code(work)

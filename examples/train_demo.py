@@ -22,7 +22,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,12 +32,12 @@ import numpy as np
 import see_through
 
 from doedesign.capture.images import PICTURE_FILES, Pictures, picture_files, sample_files
-from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import captured, within
+from doedesign.capture.scenes import NamedScene, SceneData
+from doedesign.capture.simulate import inner, photograph
 from doedesign.cli import exit_code
 from doedesign.commands.train import TrainingSettings, train
 from doedesign.optimization import optimize
-from doedesign.recon.model import open_model
+from doedesign.recon.model import Model
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec
 from doedesign.training.scores import mean_and_interval, paired_difference, scores
@@ -162,27 +162,26 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
     Both show the same scenes. They bring their surroundings along, so they are larger than those that the trainings
     were judged by, other ones, and small pictures are enlarged for them.
     """
-    models = {camera: open_model(plan.out / f"{model}_{camera}_{seed}") for camera in CAMERAS}
-    bench, kind, far = see_through.bench_of(models["doe"])
-    bench = bench._replace(without=partial(psf_at, models["conventional"].bank))
-    side = load_spec(models["doe"].folder / "spec.toml").train.size + bench.margin_px
-    view = CameraView((side, side), bench.camera.pixel_m, bench.camera.sensor_distance_m)
+    models = {camera: Model.open(plan.out / f"{model}_{camera}_{seed}") for camera in CAMERAS}
+    own, kind, far = see_through.capture_model_of(models["doe"])
+    psfs = [partial(psf_at, models[camera].bank) for camera in CAMERAS]
+    side = load_spec(plan.out / f"{model}_doe_{seed}" / "spec.toml").train.size + own.margin_px
+    view = CameraView((side, side), own.camera.pixel_m, own.camera.sensor_distance_m)
     files = picture_files(source_of(plan).test)
     data = SceneData(Pictures(files, most_px=2 * side), kind, view, far, SCENE_SEED, mirrored=False)
     found: dict[str, dict[str, list[float]]] = {border: {} for border in BORDERS}
     with meter(f"surroundings, {model}, seed {seed}", len(files)) as progress:
         for number in range(len(files)):
-            item, key = data.item(0, number), jax.random.key(number)
-            turns = {"own": (item, bench), "reflect": (within(item, bench.margin_px), bench._replace(border="reflect"))}
-            for border, turn in turns.items():
-                shot = captured(*turn, key)
+            (name, scene), key = data.item(number), jax.random.key(number)
+            turns = {"own": (scene, own), "reflect": (inner(scene, own.margin_px), replace(own, border="reflect"))}
+            for border, (seen, by) in turns.items():
+                shot = photograph(NamedScene(name, seen), by, *psfs, key)
                 for camera, light in zip(CAMERAS, (shot.doe, shot.conventional), strict=True):
-                    bank = models[camera].bank
-                    far_psf, near_psf = (psf_at(bank, depth) for depth in (item.background_depth_m, item.depth_m))
-                    network = see_through.restored(models[camera], light, far_psf, near_psf)
-                    for name, image in (("capture", srgb_from_linear(light)), ("network", network)):
+                    bank, depths = models[camera].bank, (shot.depth_far_m, shot.depth_near_m)
+                    network = see_through.restored(models[camera], light, *(psf_at(bank, depth) for depth in depths))
+                    for what, image in (("capture", srgb_from_linear(light)), ("network", network)):
                         judged = scores(image[None], srgb_from_linear(shot.clean)[None], shot.mask[None])
-                        found[border].setdefault(f"{camera}: {name}", []).append(float(judged.occluded.psnr[0]))
+                        found[border].setdefault(f"{camera}: {what}", []).append(float(judged.occluded.psnr[0]))
             progress.advance(number + 1)
     return found
 

@@ -17,55 +17,148 @@ A stopped simulation goes on with the item it stopped at; the same seed gives th
 
 import logging
 import shutil
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from doedesign.capture.camera import CaptureModel
+from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.image_files import Stored, read_image, write_image
+from doedesign.capture.images import Pictures, picture_files
 from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import Psfs, SimulatedCapture, photograph
+from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, doe_psfs, flat_psfs, photograph
+from doedesign.design.design import Design
 from doedesign.report.contact import ContactRow, draw_contact
 from doedesign.runs.folder import alone_in
 from doedesign.runtime.progress import meter
+from doedesign.spec import spec_digest, variation_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
+from fab.process import Process, Variation
 from sim.imaging.occlusion import follows_light
+from sim.surface import as_fabricated
 
 FORMAT = "doedesign simulation 1"
 
+_USUAL_COUNT = 6
 _log = logging.getLogger("doedesign")
 
 
-def write_captures(
+class PlateErrors(NamedTuple):
+    """Which DOE as fabricated to look through.
+
+    Attributes:
+        process: the process that makes it.
+        errors: its errors.
+        words: a few words on where they come from.
+    """
+
+    process: Process
+    errors: Variation
+    words: str
+
+
+class SimulationResult(NamedTuple):
+    """What a simulation left behind.
+
+    Attributes:
+        folder: the folder.
+        items: names of the items' folders.
+        skipped: why each picture that could not be used was skipped.
+    """
+
+    folder: Path
+    items: tuple[str, ...]
+    skipped: dict[str, str]
+
+
+def simulate_files(
+    design: Design,
+    folder: Path,
+    images: Path | None = None,
+    *,
+    obstruction: str | None = None,
+    occlusion: str | None = None,
+    count: int | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    plate: PlateErrors | None = None,
+    png: bool = False,
+) -> SimulationResult:
+    """Write simulated captures of many pictures, or go on where an earlier call was stopped.
+
+    Args:
+        design: the DOE and its camera, with a spec.
+        folder: where to; a new or empty folder, or that of the same simulation.
+        images: folder of pictures; scikit-image's samples if None.
+        obstruction: see `doedesign.capture.simulate.simulate`, like `occlusion` and `size`.
+        occlusion: occlusion model.
+        count: how many items; each picture once, and at most six, if None.
+        seed: seed of everything.
+        size: pixels per side of a frame.
+        plate: look through the DOE that a process makes with these errors instead of the DOE as drawn.
+        png: write 16-bit PNG instead of EXR.
+
+    Raises:
+        InputError: the folder is that of something else, or a picture, name or number cannot be used.
+    """
+    assert design.spec is not None
+    stage = Stage.of(design, obstruction, occlusion, size)
+    kind, model, view, far_m = stage
+    pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
+    count = min(_USUAL_COUNT, len(pictures)) if count is None else count
+    if count < 1:
+        raise InputError("count", "must be at least 1", count, "Leave it out for one item per picture, at most six.")
+    data = SceneData(pictures, kind, view, far_m, seed, mirrored=False)
+    words = "plate as drawn" if plate is None else f"plate with {plate.words}"
+    settings = {
+        "format": FORMAT,
+        "run": design.spec.name,
+        "spec_sha256": spec_digest(design.spec),
+        "level_map_sha256": design.level_map.digest,
+        "plate": words,
+        "obstruction": getattr(kind, "name", type(kind).__name__),
+        "parameters": plain_parameters(kind),
+        "occlusion": model.occlusion,
+        "outside": model.outside,
+        "sensor": asdict(model.sensor),
+        "pictures_sha256": pictures.digest(),
+        "seed": seed,
+        "shape": list(view.shape),
+        "pixel_m": view.pixel_m,
+        "focal_m": view.focal_m,
+        "window": model.camera.window,
+        "image_files": "16-bit PNG" if png else "OpenEXR",
+        "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y; files have the top row first",
+    }
+    if plate is not None:
+        settings["variation"] = variation_to_toml(plate.errors)
+    size_words = f"{view.shape[1]} x {view.shape[0]} pixels"
+    _log.info("%d items of %s, %s, %s; %s", count, size_words, settings["obstruction"], model.occlusion, words)
+
+    process, errors = (Process(design.levels), Variation()) if plate is None else plate[:2]
+    make = partial(as_fabricated, design.level_map.level, model.camera, process, errors)
+    psfs = doe_psfs(make, model.camera), flat_psfs(model.camera)
+    names = _write_captures(folder, data, count, model, psfs, settings, png)
+    if skips := pictures.skips():
+        _log.info("%s", skips)
+    return SimulationResult(folder, names, {str(path): why for path, why in sorted(pictures.skipped.items())})
+
+
+def _write_captures(
     folder: Path,
     data: SceneData,
     count: int,
     model: CaptureModel,
     psfs: tuple[Psfs, Psfs],
     settings: dict[str, Any],
-    *,
-    png: bool = False,
+    png: bool,
 ) -> tuple[str, ...]:
-    """Make every item that is not there yet, and the contact sheet.
-
-    Args:
-        folder: where to; a new or empty folder, or that of the same simulation.
-        data: the scenes.
-        count: number of items.
-        model: what both cameras share.
-        psfs: PSFs by depth of the camera with the DOE, and of the conventional one.
-        settings: everything that an item depends on, but for its number.
-        png: write 16-bit PNG instead of EXR.
-
-    Returns:
-        names of the items' folders.
-
-    Raises:
-        InputError: the folder is that of something else, or a picture or an obstruction cannot be used.
-    """
+    """Make every item that is not there yet, and the contact sheet; return the names of the items' folders."""
     digest = sha256_bytes(canonical_json(settings))
     with alone_in(folder):
         _require_own(folder, digest)

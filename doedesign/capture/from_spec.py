@@ -27,11 +27,11 @@ from sim.sensor import Sensor
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
-def occlusion_from_spec(spec: Spec, source: str, given: str | None = None) -> Model:
+def occlusion_from_spec(spec: Spec | None, source: str, given: str | None = None) -> Model:
     """The occlusion model: the one given, or that of the spec.
 
     Args:
-        spec: the spec.
+        spec: the spec, if there is one.
         source: the spec's file, for messages.
         given: the name of a model.
 
@@ -41,7 +41,7 @@ def occlusion_from_spec(spec: Spec, source: str, given: str | None = None) -> Mo
     if given is not None and given not in OCCLUSION_MODELS:
         rule = f"must be one of {', '.join(OCCLUSION_MODELS)}"
         raise InputError("occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
-    model = given or spec.scene.occlusion
+    model = given or (spec and spec.scene.occlusion)
     if model is None:
         cure = (
             'Add occlusion = "reciprocal" to [scene], which is nearest to wave optics, "radiometric", or "paper" for '
@@ -56,12 +56,14 @@ def outside_from_kind(kind: ObstructionKind) -> Outside:
     return "nothing" if "raindrop" in str(getattr(kind, "name", "")) else "scene"
 
 
-def sensor_from_spec(spec: Spec) -> Sensor:
-    """The sensor of a spec, with the usual values of `sim.sensor` where the spec says nothing.
+def sensor_from_spec(spec: Spec | None) -> Sensor:
+    """The sensor of a spec, with the usual values of `sim.sensor` where there is none or it says nothing.
 
     Raises:
         InputError: values that do not go together.
     """
+    if spec is None:
+        return Sensor()
     given = spec.sensor
     said = {
         "full_well_e": given.full_well_e,
@@ -81,21 +83,24 @@ def sensor_from_spec(spec: Spec) -> Sensor:
         raise InputError("sensor", rule.replace("`", ""), got, "Change it in [sensor].") from error
 
 
-def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> ObstructionKind:
+def obstruction_from_spec(
+    spec: Spec | None, source: str, given: str | None = None, near_m: Sequence[float] = ()
+) -> ObstructionKind:
     """The kind of obstruction before the scene: the one given, or that of the spec.
 
-    Its distance is that of the spec's options; otherwise it lies between the nearest and the farthest of `scene.near`,
-    for which the DOE was designed; otherwise it is what the kind is usually drawn at.
+    Its distance is that of the spec's options; otherwise it lies between the nearest and the farthest of the near
+    depths, for which the DOE was designed; otherwise it is what the kind is usually drawn at.
 
     Args:
-        spec: the spec; its options hold for its own kind.
+        spec: the spec, if there is one; its options hold for its own kind.
         source: the spec's file, beside which a folder of masks lies.
         given: a kind, or a folder of masks.
+        near_m: near depths, where there is no spec to say them.
 
     Raises:
         InputError: no kind, an unknown one, or options that are not the kind's.
     """
-    own = spec.obstruction
+    own = None if spec is None else spec.obstruction
     options: dict[str, Any] = dict(own.options) if own and given in (None, own.kind) else {}
     name = given or (own.kind if own else None)
     if name is None:
@@ -119,7 +124,7 @@ def obstruction_from_spec(spec: Spec, source: str, given: str | None = None) -> 
         raise InputError(f"{where}: {error.where}", error.rule, error.got, error.cure) from error
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
-    near = spec.scene.near_m
+    near = near_m if spec is None else spec.scene.near_m
     return at_depth(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
 
 

@@ -178,6 +178,22 @@ def crop(
     return np.ascontiguousarray(window[:, ::-1] if mirror else window)
 
 
+def display_values(picture: UInt8[np.ndarray, "y x 3"] | Float[np.ndarray, "y x 3"]) -> Picture:
+    """An array of display values, uint8 or floats from 0 to 1, as a picture.
+
+    Raises:
+        InputError: another shape or another type, or values beyond 0 to 1.
+    """
+    if picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+        raise InputError("picture", "must be an array [y, x, 3]", f"shape {picture.shape}", "Give red, green and blue.")
+    if picture.dtype == np.uint8:
+        return picture
+    if picture.dtype.kind != "f" or not (picture.min() >= 0 and picture.max() <= 1):
+        got = f"{picture.dtype} from {picture.min():g} to {picture.max():g}"
+        raise InputError("picture", "must be uint8, or floats from 0 to 1", got, "Scale it.")
+    return np.rint(255 * picture).astype(np.uint8)
+
+
 def linear_light(picture: Picture) -> Float[np.ndarray, "3 y x"]:
     """Linear light of a picture, 1 for its white, float32."""
     return np.ascontiguousarray(_linear_table()[picture.transpose(2, 0, 1)])

@@ -4,33 +4,46 @@ PSFs are computed at the very depths of the scene; nothing is interpolated betwe
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, UInt8
 
 from doedesign.capture.camera import CaptureModel
-from doedesign.capture.from_spec import rgb_from_channels
-from doedesign.capture.scenes import NamedScene
+from doedesign.capture.from_spec import (
+    obstruction_from_spec,
+    occlusion_from_spec,
+    rgb_from_channels,
+    sensor_from_spec,
+)
+from doedesign.capture.images import display_values
+from doedesign.capture.scenes import NamedScene, draw_scene
 from doedesign.design.design import Design
+from doedesign.spec import Spec
+from fab.errors import InputError
 from fab.figure import bare, html_of, length_text, panels
+from fab.pictures import read_display
 from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.imaging.formation import lost_share
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Scene
 from sim.light import srgb_from_linear
+from sim.obstruction import CameraView, ObstructionKind
 from sim.psf_bank import psf_bank, surface_bank
-from sim.surface import as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
 Psfs = Callable[[float], Float[np.ndarray, "c y x"]]
+
+_USUAL_SIDE, _MOST_SIDE = 512, 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +117,91 @@ class SimulatedCapture:
         return html_of(f"Simulated capture of {self.name}", rows, self.plot())
 
 
+def simulate(
+    picture: str | Path | UInt8[np.ndarray, "y x 3"] | Float[np.ndarray, "y x 3"],
+    design: Design,
+    *,
+    obstruction: str | ObstructionKind | None = None,
+    occlusion: str | None = None,
+    seed: int = 0,
+    size: int | None = None,
+    fabricated: FabricatedDoe | None = None,
+) -> SimulatedCapture:
+    """Photograph a picture behind an obstruction, with the DOE of a design and without.
+
+    Args:
+        picture: a file, or display values (sRGB) `[y, x, 3]`, uint8 or floats from 0 to 1, row 0 at the lowest y. A
+            crop of it fills the frame; a smaller picture is enlarged.
+        design: the DOE and its camera. Its spec says what is left out here, and what the sensor does.
+        obstruction: a kind such as "dirt", "raindrop" or "fence", a folder of masks, or a kind with parameters of its
+            own (`sim.obstruction`). A kind by its name has the spec's options where it is the spec's.
+        occlusion: how an obstruction takes light from what lies behind it: "reciprocal", "radiometric", "paper" or
+            "paper_release" (`sim.imaging.occlusion`). There is no default.
+        seed: seed of the crop, the obstruction, its distance and the noise.
+        size: pixels per side of the frame; 512, or what the sensor has.
+        fabricated: a DOE as fabricated to look through instead (`Design.fabricated`).
+
+    Raises:
+        InputError: no occlusion model or obstruction is named, or a picture, name or number cannot be used.
+    """
+    stage = Stage.of(design, obstruction, occlusion, size)
+    if isinstance(picture, str | Path):
+        shown, name = read_display(picture, 2 * max(stage.view.shape)), Path(picture).name
+    else:
+        shown, name = display_values(picture), "picture"
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 0)))
+    sample = NamedScene(name, draw_scene(shown, stage.kind, stage.view, stage.far_m, rng))
+    camera, ideal = stage.model.camera, (Process(design.levels), Variation())
+    made = doe_psfs(lambda: fabricated or as_fabricated(design.level_map.level, camera, *ideal), camera)
+    return photograph(sample, stage.model, made, flat_psfs(camera), jax.random.fold_in(jax.random.key(seed), 0))
+
+
+class Stage(NamedTuple):
+    """What a design looks at, and with which camera.
+
+    Attributes:
+        kind: the kind of obstruction.
+        model: the camera without its optic.
+        view: the frame.
+        far_m: least and greatest distance of the scene, metres.
+    """
+
+    kind: ObstructionKind
+    model: CaptureModel
+    view: CameraView
+    far_m: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls, design: Design, obstruction: str | ObstructionKind | None, occlusion: str | None, size: int | None
+    ) -> "Stage":
+        """Take what is not given from the design's spec; see `simulate`.
+
+        Raises:
+            InputError: something is named nowhere, or cannot be used.
+        """
+        spec, source = design.spec, str((design.folder or Path()) / "spec.toml")
+        chosen = occlusion_from_spec(spec, source, occlusion)
+        if obstruction is None or isinstance(obstruction, str):
+            kind = obstruction_from_spec(spec, source, obstruction, design.near_m)
+        else:
+            kind = obstruction
+        camera = replace(design.camera, window=design.camera.window | 1)  # odd: the capture lies on the scene
+        side = _side(spec, size)
+        view = CameraView((side, side), camera.pixel_m, camera.sensor_distance_m)
+        model = CaptureModel.make(camera, kind, chosen, sensor_from_spec(spec))
+        return cls(kind, model, view, (min(design.far_m), max(design.far_m)))
+
+
+def _side(spec: Spec | None, size: int | None) -> int:
+    most = _MOST_SIDE if spec is None else min(spec.sensor.resolution) // spec.sensor.binning
+    side = min(_USUAL_SIDE, most) if size is None else size
+    if not 16 <= side <= most:
+        rule = f"must lie from 16 to the {most} binned pixels of the sensor's shorter side"
+        raise InputError("size", rule, side, "Choose another size.")
+    return side
+
+
 def photograph(
     sample: NamedScene, model: CaptureModel, with_doe: Psfs, without: Psfs, key: Key[Array, ""]
 ) -> SimulatedCapture:
@@ -144,27 +242,13 @@ def _middle(image: Any, margin_px: int) -> tuple[slice, slice]:
     return y, x
 
 
-def plate_psfs(design: Design, camera: Camera, process: Process | None, errors: Variation | None) -> Psfs:
-    """PSFs of the plate by depth; exactly at the depth asked for, and kept while a simulation lasts."""
-    made_by, variation = (process or Process(design.levels)), (errors or Variation())
-
-    @lru_cache(maxsize=1)
-    def surface() -> Any:
-        return as_fabricated(design.level_map.level, camera, made_by, variation)
-
-    @lru_cache(maxsize=8)
-    def at(depth_m: float) -> Float[np.ndarray, "c y x"]:
-        return surface_bank(camera, surface(), (depth_m,)).energy[:, 0]
-
-    return at
+def doe_psfs(make: Callable[[], FabricatedDoe], camera: Camera) -> Psfs:
+    """PSFs of a DOE by depth, exactly at the depth asked for, and kept; it is made at the first call."""
+    made = cache(make)
+    return lru_cache(maxsize=8)(lambda depth_m: surface_bank(camera, made(), (depth_m,)).energy[:, 0])
 
 
 def flat_psfs(camera: Camera) -> Psfs:
-    """PSFs of a flat plate of the same glass, which stands for the conventional camera."""
+    """PSFs of flat glass of the same kind, which stands for the conventional camera."""
     flat = np.zeros(camera.grid.shape, np.float32)
-
-    @lru_cache(maxsize=8)
-    def at(depth_m: float) -> Float[np.ndarray, "c y x"]:
-        return psf_bank(camera, flat, (depth_m,)).energy[:, 0]
-
-    return at
+    return lru_cache(maxsize=8)(lambda depth_m: psf_bank(camera, flat, (depth_m,)).energy[:, 0])

@@ -108,11 +108,11 @@ def simulate(
     if not fabricated and (process is not None or variation is not None or plate_seed is not None):
         rule = "must be given with --process, --variation or --plate-seed"
         raise InputError("--fabricated", rule, "not there", "Add it.")
-    from doedesign.commands.simulate import Fabrication, SimulationSettings
+    from doedesign.commands.simulate import Fabrication
     from doedesign.commands.simulate import simulate as work
 
-    request = SimulationSettings(images, obstruction, occlusion, count, seed, size, set_, png)
     plate = Fabrication(process, variation, plate_seed, draw) if fabricated else None
-    done = work(run, out, request, masks=masks, fabrication=plate, say=say)
+    how = {"obstruction": obstruction, "occlusion": occlusion, "count": count, "seed": seed, "size": size, "png": png}
+    done = work(run, out, overrides=set_, masks=masks, fabrication=plate, images=images, **how)
     paths = [done.folder, *(done.folder / name for name in ("contact.png", "manifest.json", *done.items))]
     print_paths(paths, json_, items=list(done.items), skipped=done.skipped)

@@ -116,8 +116,9 @@ def finetune(
     from doedesign.commands.finetune import finetune as work
 
     choice = _psf_choice(psf, pixel, near_depth, far_depth)
-    others = steps, learning_rate, seed, validation, size, lpips_weights, linear, mirror
-    folder = work(run, pairs, out, FinetuneSettings(*choice.values(), *others), say)
+    others: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation}
+    others |= {"size": size, "lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
+    folder = work(run, pairs, out, FinetuneSettings(**choice, **others), say)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 

@@ -244,8 +244,8 @@ class Model:
         off_m = np.subtract(sorted(self.wavelengths_m, reverse=True), waves) if len(waves) == len(self.colours) else inf
         if abs(camera.pixel_m / self.pixel_m - 1) > _PITCH_TOLERANCE or np.max(np.abs(off_m)) > _WAVELENGTH_TOLERANCE_M:
             _log.warning(
-                "the network was trained for another camera (%s) than that of the capture (%s); it is given the capture's "
-                "own PSFs, but one that is trained for this camera may do better",
+                "the network was trained for another camera (%s) than that of the capture (%s); it is given the "
+                "PSFs of the capture, but one that is trained for this camera may do better",
                 _words(self.pixel_m, self.wavelengths_m),
                 _words(camera.pixel_m, waves),
             )
@@ -277,6 +277,7 @@ class Model:
             rule = f"PSFs must have the colours of the network, {', '.join(self.colours)}"
             got, cure = ", ".join(bank.colours), "Give PSFs of the camera that the network was trained for."
             raise InputError(str(path), rule, got, cure)
+        assert depth_m is not None  # that of a measured one
         own = _at(self.bank, depth_m, str(path)).sum(axis=(1, 2), dtype=np.float64)
         energy = bank.energy[np.argsort(longest_first(self.wavelengths_m))]
         total = energy.sum(axis=(1, 2, 3), dtype=np.float64)

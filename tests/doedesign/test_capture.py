@@ -108,7 +108,7 @@ def test_the_occlusion_model_has_no_default():
     assert occlusion_from_spec(spec_of(), "a.toml", "paper") == "paper"
     with pytest.raises(InputError, match=r'a\.toml: scene\.occlusion: .*Add occlusion = "reciprocal" to \[scene\]'):
         occlusion_from_spec(spec_of(path=PLAIN), "a.toml")
-    with pytest.raises(InputError, match=r"--occlusion: .*Did you mean `radiometric`"):
+    with pytest.raises(InputError, match=r"occlusion: .*Did you mean `radiometric`"):
         occlusion_from_spec(spec_of(), "a.toml", "radiometrc")
 
 

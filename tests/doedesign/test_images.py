@@ -15,7 +15,6 @@ from doedesign.capture.images import (
     linear_light,
     picture_files,
     sample_files,
-    told_skips,
 )
 from fab.errors import InputError
 from fab.pictures import read_display
@@ -69,17 +68,17 @@ def test_windows_of_a_picture():
     assert np.all(large == 50)
 
 
-def test_files_that_are_no_pictures_are_skipped_by_name(folder: Path):
-    said: list[str] = []
-    pictures = Pictures(picture_files(folder), say=said.append)
+def test_files_that_are_no_pictures_are_skipped_by_name(folder: Path, caplog: pytest.LogCaptureFixture):
+    pictures = Pictures(picture_files(folder))
     for _ in range(2):
         got = [pictures.get(k) for k in range(len(pictures))]
         assert [picture is not None for picture in got] == [True, True, False, False, False, True]
     assert [path.name for path in pictures.skipped] == ["d.png", "e.jpg", "f.tif"]
-    assert len(said) == 3  # once each
+    # Once each.
+    said = [record.getMessage() for record in caplog.records]
     assert all(name in text for name, text in zip(("d.png", "e.jpg", "f.tif"), said, strict=True))
-    assert told_skips(pictures) == "3 of 6 pictures skipped: d.png, e.jpg, f.tif"
-    assert told_skips(Pictures(())) == ""
+    assert pictures.skips() == "3 of 6 pictures skipped: d.png, e.jpg, f.tif"
+    assert Pictures(()).skips() == ""
 
 
 def test_only_broken_files_are_an_error(tmp_path: Path):

@@ -9,7 +9,7 @@ import pytest
 
 from doedesign.capture.images import sample_files
 from doedesign.cli import main
-from doedesign.recon.model import RELEASED, open_model, released_model
+from doedesign.recon.model import RELEASED, Model
 from doedesign.recon.photos import read_capture
 from fab.errors import InputError
 from fab.files import read_json, sha256_file
@@ -35,7 +35,7 @@ def test_the_released_model_is_what_its_manifest_says():
     assert {path.name for path in folder.iterdir()} == {"manifest.json", *said["sha256"]}
     assert all(sha256_file(folder / name) == digest for name, digest in said["sha256"].items())
     assert (folder / "network.npz").stat().st_size < 10e6
-    model = open_model(folder)
+    model = Model.open(folder)
     assert model.about["pictures"]["licence"] == said["trained"]["licence"]
     assert len(model.about["pictures"]["training"]) > 20
     masks = read_json(folder / "masks.json")
@@ -48,13 +48,11 @@ def test_reconstruct_works_out_of_the_box(
 ):
     """Without a model named: the capture that lies beside the released one comes out nearer to its scene."""
     monkeypatch.chdir(tmp_path)
-    capture = released_model() / "capture.png"
+    capture = ROOT / RELEASED / "capture.png"
     assert main(["reconstruct", str(capture), "--out", str(tmp_path / "out")]) == 0
     assert "occlusion model" in capsys.readouterr().err
     images = [np.clip(srgb_from_linear(read_capture(p).light), 0, 1) for p in (capture, tmp_path / "out/capture.png")]
-    chain = see_through.photographed(
-        open_model(released_model()), sample_files()[0], release_model.SEED, side=release_model.SIDE
-    )
+    chain = see_through.photographed(Model.released(), sample_files()[0], release_model.SEED, side=release_model.SIDE)
     # Both were rounded to 16 bits, and transforms differ in the last digits from machine to machine.
     assert psnr(images[0], chain.plate) > 60
     assert psnr(images[1], chain.scene) > psnr(images[0], chain.scene) + 4
@@ -90,4 +88,4 @@ def test_the_demo_of_training_compares_what_it_trained(tmp_path: Path):
     with pytest.raises(InputError, match="must be a finished training behind a plate"):
         release_model.release(plan.out / "paper_conventional_0", None, tmp_path / "released")
     release_model.release(folders[0], None, tmp_path / "released")
-    assert open_model(tmp_path / "released").colours == ("550nm",)
+    assert Model.open(tmp_path / "released").colours == ("550nm",)

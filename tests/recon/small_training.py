@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from doedesign.capture.from_spec import obstruction_from_spec
-from doedesign.capture.scenes import SceneBatch
+from doedesign.capture.scenes import Batch, NamedScene
 from doedesign.spec import Spec, load_spec
 from doedesign.training.joint import Trainer
 from sim.imaging.occlusion import Model
+from sim.imaging.scene import Obstruction, Scene
 
 PIXELS, CELLS = 32, 96
 # The least network, which compiles in the least time.
@@ -79,7 +80,7 @@ def trainer(*changes: str, model: Model = "paper", height_m: np.ndarray | None =
     return Trainer.of(spec, {}, "small.toml", model, kind, height, **more)
 
 
-def batch(count: int = 1, step: int = 0) -> SceneBatch:
+def batch(count: int = 1, step: int = 0) -> Batch:
     """Scenes of soft blobs behind a disc."""
     y, x = np.mgrid[:PIXELS, :PIXELS] / PIXELS - 0.5
     items = [np.random.default_rng((step, k)) for k in range(count)]
@@ -88,8 +89,7 @@ def batch(count: int = 1, step: int = 0) -> SceneBatch:
     places = [rng.uniform(-0.2, 0.2, 2) for rng in items]
     mask = np.stack([np.clip(4 - 20 * np.hypot(y - v, x - u), 0, 1) for v, u in places])
     radiance = np.stack([np.full((3, PIXELS, PIXELS), 0.2 * rng.random()) for rng in items])
-    near = np.array([rng.uniform(6e-3, 9e-3) for rng in items], np.float32)
-    far = np.full(count, 0.6, np.float32)
-    names = tuple(f"{step}-{k}" for k in range(count))
+    near = [rng.uniform(6e-3, 9e-3) for rng in items]
     background, mask, radiance = (part.astype(np.float32) for part in (background, mask, radiance))
-    return SceneBatch(background, mask, radiance, near, far, names, step)
+    scenes = [Scene(background[k], 0.6, (Obstruction(mask[k], radiance[k], near[k]),)) for k in range(count)]
+    return Batch(step, tuple(NamedScene(f"{step}-{k}", scene) for k, scene in enumerate(scenes)))

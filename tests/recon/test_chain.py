@@ -141,7 +141,7 @@ def test_a_capture_has_the_gradient_of_its_plate() -> None:
     """By central differences along one direction, with the heights unrounded."""
     made, plate = live("optimize.sampling=exact")
     # Whole raw numbers would hide small changes; their gradient is that of numbers that are not rounded.
-    bench = made.bench._replace(sensor=replace(made.bench.sensor, noise="none", bits=None))
+    bench = replace(made.bench, sensor=replace(made.bench.sensor, noise="none", bits=None))
     seen, keys = made._seen(batch(), 0, False)
     look = jnp.asarray(np.random.default_rng(1).standard_normal((1, 1, 32, 32)), jnp.float32)
     free = radians_of(plate, heights())

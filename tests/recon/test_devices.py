@@ -24,6 +24,7 @@ from doedesign.training.history import read_history
 from doedesign.training.hosts import join_hosts
 from fab.errors import InputError
 from fab.files import read_json
+from fab.pictures import read_display
 from tests.doedesign.small_runs import finished_run
 from tests.recon.small_training import PLAIN, SPEC, batch, heights, trainer
 

@@ -15,7 +15,7 @@ from scipy.signal import convolve2d
 import doedesign.commands.finetune as command
 from doedesign.cli import exit_code, main
 from doedesign.commands.finetune import FinetuneSettings, finetune
-from doedesign.recon.model import PsfChoice, open_model, psfs_of
+from doedesign.recon.model import Model
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import read_network, write_network
@@ -195,7 +195,7 @@ def test_the_result_is_a_model(whole: Path, pairs: Path, tmp_path: Path, capsys:
     written = json.loads(capsys.readouterr().out)["paths"]
     assert [Path(path).name for path in written] == ["0_capture.png", "1_capture.exr"]
     assert read_capture(written[0]).light.shape == (1, 36, 44)
-    before = psfs_of(open_model(whole), PsfChoice())
+    before = Model.open(whole).psfs()
     assert before.near_m == pytest.approx(2 / (1 / 0.05 + 1 / 0.12))
 
 
@@ -290,7 +290,7 @@ def test_a_mirrored_capture_is_seen_through_a_mirrored_plate(tmp_path: Path, mod
     light = np.random.default_rng(3).uniform(0.1, 0.9, (40, 40)).astype(np.float32)
     for name, image in (("reference", light), ("capture", convolve2d(light, psf[0], mode="same"))):
         write_picture(tmp_path / f"a_{name}.exr", {"Y": image})
-    data = PairData(Pairs(find_pairs(tmp_path), open_model(model)), (24, 32), seed=0, batch=16)
+    data = PairData(Pairs(find_pairs(tmp_path), Model.open(model)), (24, 32), seed=0, batch=16)
     batch = data.at(0)
     assert 0 < batch.mirrored.sum() < 16
     kernels = np.asarray(mirrored_as(jax.numpy.asarray(psf), jax.numpy.asarray(batch.mirrored)))
@@ -303,7 +303,7 @@ def test_a_mirrored_capture_is_seen_through_a_mirrored_plate(tmp_path: Path, mod
 
 def test_the_stream_goes_on_from_any_step(pairs: Path, model: Path):
     """Every pair once in an epoch; and pictures that do not fit into memory are read again."""
-    files, opened = find_pairs(pairs), open_model(model)
+    files, opened = find_pairs(pairs), Model.open(model)
     data = PairData(Pairs(files, opened), (32, 32), seed=1, batch=2)
     tight = PairData(Pairs(files, opened, most_bytes=40_000), (32, 32), seed=1, batch=2)
     with data.batches(0, 6) as stream, tight.batches(3, 5) as later:
@@ -352,7 +352,7 @@ def test_folders_of_captures_and_references(pairs: Path, model: Path, tmp_path: 
         name, part = path.stem.split("_")
         (tmp_path / part).mkdir(exist_ok=True)
         shutil.copy(path, tmp_path / part / f"{name}{path.suffix}")
-    opened = open_model(model)
+    opened = Model.open(model)
     for one, other in zip(find_pairs(pairs), find_pairs(tmp_path), strict=True):
         assert one.name == other.name
         for a, b in zip(read_pair(one, opened), read_pair(other, opened), strict=True):
@@ -368,10 +368,11 @@ def test_measured_psfs_become_those_of_the_result(pairs: Path, model: Path, tmp_
     write_picture(tmp_path / "far.exr", {"Y": counts[2:-2, 2:-2]})
     write_picture(tmp_path / "near.exr", {"Y": counts})
     # Their one channel has another name than the model's, and its energy is that of the model's own PSF.
-    choice = PsfChoice([tmp_path / "far.exr", tmp_path / "near.exr"], PIXEL, near_m=0.1, far_m=5.0)
-    code, said = tuned(model, pairs, tmp_path / "out", steps=0, psf=choice)
+    files: list[Path] = [tmp_path / "far.exr", tmp_path / "near.exr"]
+    how: Any = {"pixel_m": PIXEL, "near_m": 0.1, "far_m": 5.0}
+    code, said = tuned(model, pairs, tmp_path / "out", steps=0, psf=files, **how)
     assert code == 0, said
-    used, kept = psfs_of(open_model(model), choice), psfs_of(open_model(tmp_path / "out"), PsfChoice())
+    used, kept = Model.open(model).psfs(files, **how), Model.open(tmp_path / "out").psfs()
     assert (kept.near_m, kept.far_m) == (pytest.approx(0.1), 5.0)
     for one, other in ((kept.far, used.far), (kept.near, used.near)):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)  # the depth of 0.1 m is rounded on its way
@@ -436,10 +437,10 @@ def test_other_mistakes(model: Path, pairs: Path, tmp_path: Path):
     write_bank(tmp_path / "even.exr", bank(window=8))
     (tmp_path / "weights.npz").write_bytes(b"")
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"psf": PsfChoice([tmp_path / "pitch.exr"])}, "3.7 um pixels"),
-        ({"psf": PsfChoice([tmp_path / "colours.exr"])}, "colours of the network"),
-        ({"psf": PsfChoice([tmp_path / "even.exr"])}, "odd sensor.window, such as 9"),
-        ({"psf": PsfChoice(near_m=0.01)}, "--near-depth"),
+        ({"psf": [tmp_path / "pitch.exr"]}, "3.7 um pixels"),
+        ({"psf": [tmp_path / "colours.exr"]}, "colours of the network"),
+        ({"psf": [tmp_path / "even.exr"]}, "odd window, such as 9"),
+        ({"near_m": 0.01}, "--near-depth"),
         ({"validation": 6}, "--validation: must be from 1 to 5"),
         ({"validation": 0}, "--validation"),
         ({"steps": -1}, "--steps"),

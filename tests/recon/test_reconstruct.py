@@ -10,8 +10,9 @@ from PIL import Image
 
 import doedesign
 from doedesign.cli import main
-from doedesign.commands.reconstruct import FORMAT, ReconstructionSettings, reconstruct
-from doedesign.recon.model import PsfChoice, open_model, psfs_of
+from doedesign.commands.reconstruct import reconstruct
+from doedesign.recon.files import FORMAT
+from doedesign.recon.model import Model
 from doedesign.recon.network import NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import camera_facts, read_network, write_network
@@ -74,7 +75,7 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
     for path, bits in zip(files, (None, 16, 8, 16, None), strict=True):
         write_reconstruction(path, display, bits)
     out = tmp_path / "out"
-    written = reconstruct(run, files, out, ReconstructionSettings(tile=32, overlap=8))
+    written = reconstruct(run, files, out, tile=32, overlap=8)
     assert written == [out / path.name for path in files]
     for before, after in zip(files, written, strict=True):
         one, other = read_capture(before), read_capture(after)
@@ -84,7 +85,7 @@ def test_a_network_that_changes_nothing_gives_the_capture_back(tmp_path: Path, r
 
 def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Path):
     out = tmp_path / "out"
-    reconstruct(run, [capture], out, ReconstructionSettings(PsfChoice(near_m=0.07), kind=".png", beside=True))
+    reconstruct(run, [capture], out, near_m=0.07, kind=".png", beside=True)
     manifest = read_json(out / "manifest.json")
     assert manifest["format"] == FORMAT
     assert set(manifest["results"]) == {"capture.png", "capture_beside.png"}
@@ -97,7 +98,7 @@ def test_the_manifest_says_what_was_done(tmp_path: Path, run: Path, capture: Pat
 
 
 def test_side_by_side_shows_both(tmp_path: Path, run: Path, capture: Path, light: np.ndarray):
-    reconstruct(run, [capture], tmp_path / "out", ReconstructionSettings(beside=True))
+    reconstruct(run, [capture], tmp_path / "out", beside=True)
     seen = np.asarray(Image.open(tmp_path / "out" / "capture_beside.png"))[::-1].transpose(2, 0, 1) / 255
     assert seen.shape == (3, 30, 2 * 41 + 2)
     for half in (seen[..., :41], seen[..., 43:]):
@@ -138,30 +139,30 @@ def test_psfs_reach_the_network(tmp_path: Path, capture: Path):
     shutil.copy(model / "psf.exr", tmp_path / "same.exr")
     pictures = []
     for k, psf in enumerate(((), (tmp_path / "same.exr",), (tmp_path / "sharp.exr",))):
-        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", ReconstructionSettings(PsfChoice(psf)))
+        (path,) = reconstruct(model, [capture], tmp_path / f"out{k}", psf=psf)
         pictures.append(read_picture(path)[0]["G"])
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert np.abs(pictures[2] - pictures[0]).max() > 1e-3
 
 
 def test_depths_are_the_middle_of_the_near_ones_and_the_farthest(run: Path):
-    model = open_model(run)
-    psfs = psfs_of(model, PsfChoice())
+    model = Model.open(run)
+    psfs = model.psfs()
     assert psfs.near_m == pytest.approx(2 / (1 / 0.05 + 1 / 0.12))
     assert psfs.far_m == np.inf
     np.testing.assert_array_equal(psfs.far, model.bank.energy[:, 3])
     # Half way in 1/z between the bank's two near depths is half of each.
     np.testing.assert_allclose(psfs.near, model.bank.energy[:, :2].mean(axis=1), rtol=1e-5)
-    chosen = psfs_of(model, PsfChoice(near_m=0.05, far_m=5.0))
+    chosen = model.psfs(near_m=0.05, far_m=5.0)
     np.testing.assert_array_equal(chosen.near, model.bank.energy[:, 0])
     np.testing.assert_array_equal(chosen.far, model.bank.energy[:, 2])
 
 
 def test_a_bank_in_another_order_is_put_in_order(tmp_path: Path, run: Path):
-    model, own = open_model(run), bank()
+    model, own = Model.open(run), bank()
     turned = PsfBank(own.energy[[2, 0, 1]], (COLOURS[2], COLOURS[0], COLOURS[1]), own.depths_m, PIXEL * 1.0005)
     write_bank(tmp_path / "turned.exr", turned)
-    found, usual = psfs_of(model, PsfChoice([tmp_path / "turned.exr"])), psfs_of(model, PsfChoice())
+    found, usual = model.psfs([tmp_path / "turned.exr"]), model.psfs()
     np.testing.assert_array_equal(found.far, usual.far)
     np.testing.assert_array_equal(found.near, usual.near)
 
@@ -175,9 +176,9 @@ def measured(path: Path, window: int = 9, seed: int = 5) -> np.ndarray:
 
 def test_measured_psfs_take_the_energy_of_the_models(tmp_path: Path, run: Path):
     far, near = measured(tmp_path / "far.exr"), measured(tmp_path / "near.exr", 11, 6)
-    model = open_model(run)
-    choice = PsfChoice([tmp_path / "far.exr", tmp_path / "near.exr"], PIXEL)
-    found, own = psfs_of(model, choice), psfs_of(model, PsfChoice())
+    model = Model.open(run)
+    found = model.psfs([tmp_path / "far.exr", tmp_path / "near.exr"], pixel_m=PIXEL)
+    own = model.psfs()
     np.testing.assert_array_equal(found.bank.energy, np.stack([found.near, found.far], axis=1))
     # The smaller one stands in the middle of the larger one's window.
     for psf, usual, counts in ((found.far[:, 1:-1, 1:-1], own.far, far), (found.near, own.near, near)):
@@ -224,7 +225,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
     write_picture(tmp_path / "nan.exr", {c: nan for c in "RGB"})
 
     def psf(*names: str, **more) -> dict:
-        return {"request": ReconstructionSettings(PsfChoice([tmp_path / name for name in names], **more))}
+        return {"psf": [tmp_path / name for name in names], **more}
 
     return {
         "pitch": (r"must have the 3\.7 um pixels .* but got 1\.85 um\. Compute or bin", psf("pitch.exr")),
@@ -233,7 +234,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
             psf("colours.exr"),
         ),
         "count": ("the colours of the network, 486nm, 589nm, 656nm, but got 589nm", psf("one.exr")),
-        "even": (r"must have an odd window.*8 x 8 pixels.*odd sensor\.window, such as 9", psf("even.exr")),
+        "even": (r"must have an odd window.*8 x 8 pixels.*odd window, such as 9", psf("even.exr")),
         "depths": ("--near-depth: must lie within the depths of the PSF bank, 0.3 to inf m", psf("depths.exr")),
         "foreign": ("pixel pitch of a PSF from another program must be given", psf("far.exr", "far.exr")),
         "single": ("are needed, but got one depth", psf("far.exr", pixel_m=PIXEL)),
@@ -241,29 +242,29 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
         "dark": ("a PSF must hold light", psf("dark.exr", "dark.exr", pixel_m=PIXEL)),
         "three": ("must be one bank, or one file of the scene", psf("far.exr", "far.exr", "far.exr")),
         "no psf": ("must exist", psf("none.exr")),
-        "near beyond": ("--near-depth: must lie within", {"request": ReconstructionSettings(PsfChoice(near_m=0.01))}),
+        "near beyond": ("--near-depth: must lie within", {"near_m": 0.01}),
         "negative": (
             "--near-depth: must be a positive distance",
-            {"request": ReconstructionSettings(PsfChoice(near_m=-0.1))},
+            {"near_m": -0.1},
         ),
         "nan depth": (
             "--far-depth: must be a positive distance",
-            {"request": ReconstructionSettings(PsfChoice(far_m=np.nan))},
+            {"far_m": np.nan},
         ),
         "order": (
             "the obstruction must be nearer",
-            {"request": ReconstructionSettings(PsfChoice(near_m=6.0, far_m=5.0))},
+            {"near_m": 6.0, "far_m": 5.0},
         ),
         "tile": (
             "--tile, --overlap: overlap must be at most half",
-            {"request": ReconstructionSettings(tile=64, overlap=48)},
+            {"tile": 64, "overlap": 48},
         ),
-        "kind": ("--kind: must be one of", {"request": ReconstructionSettings(kind=".jpg")}),
+        "kind": ("--kind: must be one of", {"kind": ".jpg"}),
         "grey": ("a capture must have the 3 colours of the network, but got 1", {"captures": [tmp_path / "grey.exr"]}),
         "nan": ("NaN or infinity at row 3 from below, column 4", {"captures": [tmp_path / "nan.exr"]}),
         "nothing": ("at least one capture", {"captures": []}),
         "missing": ("must exist", {"captures": [tmp_path / "none.png"]}),
-        "no model": ("must hold a trained network", {"model_folder": tmp_path}),
+        "no model": ("must hold a trained network", {"model": tmp_path}),
         "beside": ("a folder of their own", {"out": capture.parent}),
         "run as out": ("a folder of their own", {"out": run}),
     }
@@ -272,7 +273,7 @@ def refusals(tmp_path: Path, run: Path, capture: Path) -> dict[str, tuple[str, d
 def test_mistakes_are_told_and_leave_nothing(tmp_path: Path, run: Path, capture: Path):
     for name, (message, wrong) in refusals(tmp_path, run, capture).items():
         out = tmp_path / "results" / name.replace(" ", "_")
-        given = {"model_folder": run, "captures": [capture], "out": out} | wrong
+        given = {"model": run, "captures": [capture], "out": out} | wrong
         with pytest.raises(InputError, match=message):
             reconstruct(**given)
         assert not out.exists() or {path.name for path in out.iterdir()} <= {"manifest.json"}, name
@@ -288,10 +289,10 @@ def test_models_that_do_not_fit_together_are_refused(tmp_path: Path):
     }
     for name, (wrong, message) in cases.items():
         with pytest.raises(InputError, match=message):
-            open_model(model_in(tmp_path / name, **wrong))
+            Model.open(model_in(tmp_path / name, **wrong))
     (model_in(tmp_path / "bare") / "psf.exr").unlink()
     with pytest.raises(InputError, match=r"psf\.exr"):
-        open_model(tmp_path / "bare")
+        Model.open(tmp_path / "bare")
 
 
 def test_a_capture_is_never_overwritten(tmp_path: Path, run: Path, capture: Path):
@@ -332,7 +333,7 @@ def test_captures_alone_go_through_the_released_model(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(doedesign, "__file__", str(tmp_path / "elsewhere" / "doedesign" / "__init__.py"))
     assert main(["reconstruct", str(capture)]) == 2
-    assert "Give a model before the captures" in capsys.readouterr().err
+    assert "Give the folder of a model" in capsys.readouterr().err
     released = tmp_path / "elsewhere" / "masks" / "released"
     model_in(released)
     arguments = ["reconstruct", str(capture), "--near-depth", "7 cm", "--far-depth", "inf", "--kind", "png", "--beside"]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.capture.scenes import SceneBatch
+from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
 from doedesign.training.optics import LivePlate
@@ -99,7 +99,7 @@ def test_a_conventional_camera_has_a_flat_plate() -> None:
 
 
 def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
-    def first(given: SceneBatch, made: Trainer = joint) -> float:
+    def first(given: Batch, made: Trainer = joint) -> float:
         return made.step(made.initial(heights()), given)[1].loss
 
     loss = first(batch())
@@ -177,7 +177,7 @@ def test_other_ways_to_the_same_loss(changes: tuple[str, ...]) -> None:
 
 def test_a_loss_that_is_not_finite_is_told(joint: Trainer) -> None:
     broken = batch()
-    broken.background[0, 1, 3, 3] = np.nan
+    np.asarray(broken.items[0].scene.background)[1, 3, 3] = np.nan
     with pytest.raises(InputError, match=r"train, step 0.*must stay finite.*nan.*learning_rate"):
         joint.step(joint.initial(heights()), broken)
 

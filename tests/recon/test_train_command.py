@@ -472,7 +472,7 @@ def test_held_out_pictures_are_never_trained_on(
     step = Trainer.step
 
     def noting(self: Trainer, state: Any, batch: Any) -> Any:
-        seen.update(batch.names)
+        seen.update(item.name for item in batch.items)
         return step(self, state, batch)
 
     monkeypatch.setattr(Trainer, "step", noting)

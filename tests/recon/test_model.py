@@ -1,0 +1,92 @@
+"""A model in memory: whatever a capture comes as, it is reconstructed alike."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from doedesign.capture.simulate import SimulatedCapture
+from doedesign.recon.model import Model
+from doedesign.recon.network import NetworkShape
+from doedesign.recon.photos import read_capture, write_reconstruction
+from fab.errors import InputError
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+from sim.light import srgb_from_linear
+from tests.recon.drawn_networks import drawn
+from tests.recon.test_reconstruct import COLOURS, PIXEL, WAVES, bank
+
+LAYOUT = NetworkShape(width=3, depth=1, features=False, refine=False)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    """A network that uses the PSFs it is given."""
+    return Model(drawn(LAYOUT, 0.1), bank(), COLOURS, WAVES, PIXEL, (0.05, 0.12))
+
+
+def camera(pixel_m: float = PIXEL, waves: tuple[float, ...] = tuple(reversed(WAVES))) -> Camera:
+    """The model's camera, with its colours from red to blue."""
+    colours = tuple(Colour(f"{w:g}", (w,), (1.0,)) for w in waves)
+    return Camera(Grid((16, 16), 2e-6), 30e-6, "fused_silica", colours, 1e-3, pixel_m, 7)
+
+
+def shot(seen_by: Camera, light: np.ndarray) -> SimulatedCapture:
+    """A capture whose PSFs are the model's at 0.05 m and at infinity, colours in the other order."""
+    energy = bank().energy[::-1]
+    blank = np.zeros(light.shape[1:], np.float32)
+    return SimulatedCapture(
+        light, light, light, blank, blank[None], blank, energy[:, 3], energy[:, 0], 0.05, np.inf, seen_by, "paper"
+    )
+
+
+@pytest.fixture
+def light() -> np.ndarray:
+    return np.random.default_rng(1).uniform(0, 1, (3, 24, 30)).astype(np.float32)
+
+
+def test_files_and_arrays_are_the_same(model: Model, tmp_path: Path, light: np.ndarray):
+    display = srgb_from_linear(light)
+    for name, bits in (("a.png", 8), ("b.tif", 16), ("c.tif", None)):
+        write_reconstruction(tmp_path / name, display, bits)
+        found = model.reconstruct(tmp_path / name)
+        photo = read_capture(tmp_path / name)
+        np.testing.assert_array_equal(model.reconstruct(photo.light.transpose(1, 2, 0)).picture, found.picture)
+        np.testing.assert_array_equal(found.light, photo.light)
+    counts = np.rint(255 * display).astype(np.uint8).transpose(1, 2, 0)
+    np.testing.assert_array_equal(model.reconstruct(counts).picture, model.reconstruct(tmp_path / "a.png").picture)
+    with pytest.raises(InputError, match="every pixel must be finite"):
+        model.reconstruct(np.full((8, 8, 3), np.nan))
+    with pytest.raises(InputError, match="must be one picture"):
+        model.reconstruct(np.zeros((8, 8, 4)))
+
+
+def test_a_simulated_capture_brings_its_psfs(model: Model, light: np.ndarray, caplog: pytest.LogCaptureFixture):
+    own = model.psfs(near_m=0.05, far_m=np.inf)
+    wanted = model.reconstruct(light.transpose(1, 2, 0), psfs=own).picture
+    found = model.reconstruct(shot(camera(), light))
+    np.testing.assert_array_equal(found.picture, wanted)
+    assert (found.near_m, found.far_m) == (0.05, np.inf)
+    assert not caplog.records
+    # Other PSFs reach the network, too.
+    other = model.reconstruct(replace(shot(camera(), light), psf_far=bank(seed=1).energy[:, 3]))
+    assert np.abs(other.picture - wanted).max() > 1e-3
+
+
+def test_another_camera_is_told(model: Model, light: np.ndarray, caplog: pytest.LogCaptureFixture):
+    for seen_by in (camera(1.85e-6), camera(waves=(620e-9, 550e-9, 450e-9))):
+        caplog.clear()
+        model.reconstruct(shot(seen_by, light))
+        assert ["another camera" in record.getMessage() for record in caplog.records] == [True]
+    with pytest.raises(InputError, match="must have the 3 colours"):
+        model.reconstruct(replace(shot(camera(waves=(550e-9,)), light), doe=light[:1]))
+
+
+def test_a_reconstruction_draws_and_saves_itself(model: Model, light: np.ndarray, tmp_path: Path):
+    found = model.reconstruct(light.transpose(1, 2, 0))
+    assert len(found.plot().axes) == 2
+    assert "data:image/png;base64," in found._repr_html_()
+    found.save(tmp_path / "a.png")
+    again = srgb_from_linear(read_capture(tmp_path / "a.png").light)
+    np.testing.assert_allclose(again, np.clip(found.picture, 0, 1), atol=1e-4)
