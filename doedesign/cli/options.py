@@ -30,12 +30,21 @@ def length_of(option: str, text: str | None) -> float | None:
 
 
 # What the library calls in its own words is an option here.
+_PLACES = {
+    "captures": "CAPTURE",
+    "far_m": "--far-depth",
+    "near_m": "--near-depth",
+    "tile, overlap": "--tile, --overlap",
+}
 _OPTIONS = {
     "Give the pitch of a pixel": "Add --pitch-um",
     "Give the scale": "Add --scale",
     "have the level map repaired": "take --on-violation fix",
     "take the mesh alone": "take the mesh alone (--mesh-patch)",
     "or its masks.": "or its masks (--order).",
+    "or give `obstruction`": "or give --obstruction",
+    "or give `occlusion`": "or give --occlusion",
+    "leave `images` out": "leave --images out",
 }
 
 
@@ -47,8 +56,9 @@ def in_options(error: InputError, options: Collection[str] = ()) -> str:
         options: names of arguments that are options.
     """
     text = str(error)
-    if error.where in options:
-        text = f"--{error.where.replace('_', '-')}{text.removeprefix(error.where)}"
+    if error.where in _PLACES or error.where in options:
+        option = _PLACES.get(error.where, f"--{error.where.replace('_', '-')}")
+        text = option + text.removeprefix(error.where)
     for words, option in _OPTIONS.items():
         text = text.replace(words, option)
     return text

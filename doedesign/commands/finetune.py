@@ -29,7 +29,6 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign import __version__
-from doedesign.commands.options import named_as_options
 from doedesign.commands.psf import Say
 from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
@@ -150,7 +149,7 @@ def finetune(
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
     folder = out or model_folder / "finetuned"
-    with named_as_options(), stoppable() as stop:
+    with stoppable() as stop:
         work = _prepared(model_folder, pairs, request or FinetuneSettings(), say)
         claim = work.claim()
         with alone_in(folder):

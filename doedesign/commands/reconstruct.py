@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from doedesign.commands.options import named_as_options
 from doedesign.recon.files import reconstruct_files
 from doedesign.recon.model import Model
 from doedesign.recon.photos import PHOTO_FILES
@@ -33,7 +32,6 @@ def reconstruct(
 
     See `doedesign.recon.model.Model.psfs` and `doedesign.recon.files.reconstruct_files` for the rest.
     """
-    with named_as_options():
-        opened = Model.released() if model is None else Model.open(model)
-        psfs = opened.psfs(psf, pixel_m=pixel_m, near_m=near_m, far_m=far_m)
-        return reconstruct_files(opened, captures, out or Path("reconstructed"), psfs=psfs, **how)
+    opened = Model.released() if model is None else Model.open(model)
+    psfs = opened.psfs(psf, pixel_m=pixel_m, near_m=near_m, far_m=far_m)
+    return reconstruct_files(opened, captures, out or Path("reconstructed"), psfs=psfs, **how)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from doedesign.capture.folder import PlateErrors, SimulationResult, simulate_files
 from doedesign.commands.fabricated import errors_of_plate
-from doedesign.commands.options import named_as_options
 from doedesign.runs.folder import open_run, spec_with
 from doedesign.runs.level_maps import open_design
 
@@ -54,13 +53,10 @@ def simulate(
         InputError: a run, picture, mask or number that cannot be used, or no occlusion model.
     """
     run = open_run(run_folder)
-    with named_as_options():
-        design = replace(open_design(run, masks), spec=spec_with(run, overrides, _FREE))
-        plate = None
-        if fabrication is not None:
-            process = design.process(fabrication.process)
-            plate = PlateErrors(
-                process,
-                *errors_of_plate(design, process, fabrication.variation, fabrication.seed, fabrication.draw),
-            )
-        return simulate_files(design, out or run.path("simulated"), plate=plate, **how)
+    design = replace(open_design(run, masks), spec=spec_with(run, overrides, _FREE))
+    plate = None
+    if fabrication is not None:
+        process = design.process(fabrication.process)
+        errors = errors_of_plate(design, process, fabrication.variation, fabrication.seed, fabrication.draw)
+        plate = PlateErrors(process, *errors)
+    return simulate_files(design, out or run.path("simulated"), plate=plate, **how)

@@ -440,7 +440,7 @@ def test_other_mistakes(model: Path, pairs: Path, tmp_path: Path):
         ({"psf": [tmp_path / "pitch.exr"]}, "3.7 um pixels"),
         ({"psf": [tmp_path / "colours.exr"]}, "colours of the network"),
         ({"psf": [tmp_path / "even.exr"]}, "odd window, such as 9"),
-        ({"near_m": 0.01}, "--near-depth"),
+        ({"near_m": 0.01}, "--near-depth: must lie within"),
         ({"validation": 6}, "--validation: must be from 1 to 5"),
         ({"validation": 0}, "--validation"),
         ({"steps": -1}, "--steps"),
