@@ -20,7 +20,7 @@ from doedesign.design.optimize import (
     steps,
 )
 from doedesign.design.problem import Problem, SourceSet, problem_of
-from doedesign.report.pictures import draw_encircled, draw_height, draw_history, draw_mtf, draw_pattern, draw_psfs
+from doedesign.report.history import plot_history
 from doedesign.runs.folder import (
     Run,
     begin_run,
@@ -35,10 +35,16 @@ from doedesign.runs.folder import (
 from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files, load_spec, spec_warnings
+from fab.figure import save
 from fab.files import canonical_json, write_atomic
+from fab.height import HeightMap
 from fab.levels import Levels
+from fab.plots.height import plot_height
 from fab.units import NM
 from sim.aperture import circle_coverage
+from sim.plots.curves import plot_encircled, plot_mtf
+from sim.plots.pattern import plot_pattern
+from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import ring_count
 from sim.psf_bank import PsfBank, psf_bank
 from sim.transfer import transfer_bank
@@ -182,19 +188,19 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(problem, design)
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
-    draw_height(run.path("height.png"), height, levels, camera, spec.name)
-    draw_psfs(run.path("psf.png"), camera, bank, near, far)
+    save(plot_height(HeightMap(height, camera.grid, camera.aperture_m), levels, spec.name), run.path("height.png"))
+    save(plot_psfs(bank, camera, near, far), run.path("psf.png"))
     transfers = [transfer_bank(camera, each, (*near, *far)) for each in (height, flat)]
-    draw_mtf(run.path("mtf.png"), camera, transfers[0], near, far, transfers[1])
-    draw_encircled(run.path("encircled.png"), camera, bank, near, far, lens)
+    save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))
+    save(plot_encircled(bank, camera, near, far, lens), run.path("encircled.png"))
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]
     if design.history:
-        draw_history(run.path("history.png"), list(design.history))
+        save(plot_history(design.history), run.path("history.png"))
         names.append("history.png")
     targets = [t for t, o in zip(problem.terms, spec.objectives, strict=True) if o.name == "target_pattern"]
     if targets:
         target = targets[0].value.keywords["target"]  # pyright: ignore[reportFunctionMemberAccess]
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
-        draw_pattern(run.path("pattern.png"), camera, target, achieved, **patterns[0])
+        save(plot_pattern(target, achieved, camera, **patterns[0]), run.path("pattern.png"))
         names.append("pattern.png")
     return names

@@ -27,9 +27,9 @@ import numpy as np
 
 from doedesign.build import camera_from_spec
 from doedesign.cli import exit_code
-from doedesign.report.canvas import INK, SERIES, picture, place
 from doedesign.runs.folder import open_run
 from doedesign.runtime.progress import meter
+from fab.figure import INK, SERIES, panels, save
 from fab.files import canonical_json, write_atomic
 from fab.units import MM, format_length
 from sim.camera import Camera
@@ -159,8 +159,8 @@ def draw(path: Path, rows: list[dict[str, Any]], name: str) -> None:
     """Draw what passes on the axis, and the errors, over the width of the bar."""
     widths = [row["width_m"] / MM for row in rows]
     title = f"{name}: light past a bar {format_length(rows[0]['depth_m'])} before the lens"
-    with picture(path, (8.3, 3.9), title) as figure:
-        left, right = place(figure, 0.65, 0.55, 3.3, 2.7), place(figure, 4.75, 0.55, 3.3, 2.7)
+    with panels(None, (8.3, 3.9), title) as figure:
+        left, right = figure.subplots(1, 2)
         for key, words, mark, line, hue in (
             ("eq_10", "eq. 10: 1 - p near * M", "s", "-", SERIES[1]),
             ("geometry", "radiometric: 1 - d * M", "o", "-", SERIES[0]),
@@ -173,9 +173,10 @@ def draw(path: Path, rows: list[dict[str, Any]], name: str) -> None:
             right.plot(widths, [100 * row["lines"][model] for row in rows], ":", color=hue)
         right.set_title("Error against wave optics (%)")
         for axes, words in ((left, ""), (right, ". Lines: even light; dots: fine bright lines")):
-            axes.set_xlabel(f"width of the bar (mm){words}", labelpad=2)
+            axes.set_xlabel(f"width of the bar (mm){words}")
             axes.set_ylim(bottom=0)
             axes.legend()
+    save(figure, path)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -52,8 +52,8 @@ from explain_plates import (
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.report.canvas import length_text
 from doedesign.runs.folder import Run, open_run
+from fab.figure import length_text
 from fab.files import canonical_json, write_atomic
 from fab.units import UM
 

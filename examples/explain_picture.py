@@ -20,7 +20,7 @@ from explain_plates import (
     Seen,
 )
 
-from doedesign.report.canvas import FAINT, INK, LIGHT, LINE, MARK, SMALL, note, picture, place
+from fab.figure import FAINT, INK, LIGHT, LINE, MARK, SERIES, SMALL, panels, save
 from fab.units import UM
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from doedesign.prediction import Prediction
 
 _TICKS = (0.5, 1, 2, 3, 5, 10, 20)
-_ORANGE, _GREEN = "#e69f00", "#009e73"
+_ORANGE, _GREEN = SERIES[4], SERIES[2]
 
 
 def draw(path: Path, answer: Answer) -> None:
@@ -39,21 +39,21 @@ def draw(path: Path, answer: Answer) -> None:
         path: the PNG file.
         answer: what was found.
     """
-    with picture(path, (11.0, 8.7), "From 3:1 to 1:1: which errors of a 16-level plate would do it?") as figure:
-        _draw_errors(place(figure, 1.75, 5.0, 3.75, 3.1), answer)
-        _draw_lifts(place(figure, 6.4, 5.0, 3.6, 3.1), answer)
-        _draw_both(place(figure, 0.75, 0.65, 4.75, 3.55), answer)
+    words = (
+        f"Lower right: near PSFs at the {PROBE} probe, logarithmic, one scale for all three; circle: edge of the disc. "
+        "Lift: the design raised by that many of its 16 steps, modulo one wave. The light without errors is the same "
+        f"at {FULL_WAVE}, the masks are not."
+    )
+    near = [f"near {k}" for k in range(len(answer.shown))]
+    title = "From 3:1 to 1:1: which errors of a 16-level plate would do it?"
+    with panels(None, (11.0, 8.7), title, words) as figure:
+        at = figure.subplot_mosaic([["errors"] * 3 + ["lifts"] * 3, ["both"] * 3 + near], height_ratios=(3.1, 3.55))
+        _draw_errors(at["errors"], answer)
+        _draw_lifts(at["lifts"], answer)
+        _draw_both(at["both"], answer)
         for k, (seen, prediction) in enumerate(answer.shown):
-            _draw_near(place(figure, 5.95 + 1.68 * k, 2.05, 1.58, 1.58), answer.bench, seen, prediction, k)
-        figure.text(5.95 / 11.0, 4.24 / 8.7, f"Near PSFs at the {PROBE} probe")
-        note(
-            figure,
-            5.95,
-            0.85,
-            "Logarithmic, one scale for all three. Circle: edge of the disc.\n"
-            "Lift: the design raised by that many of its 16 steps, modulo one wave. The\n"
-            f"light without errors is the same at {FULL_WAVE}, the masks are not.",
-        )
+            _draw_near(at[near[k]], answer.bench, seen, prediction, k)
+    save(figure, path)
 
 
 def _ratio_axis(axis: Any, values: Sequence[float]) -> None:
@@ -85,7 +85,7 @@ def _draw_errors(axes: "Axes", answer: Answer) -> None:
     axes.set_ylim(len(order) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     _ratio_axis(axes.xaxis, [seen.ratio for seen in answer.of("single", "lifted")])
-    axes.set_xlabel(f"ring:disc at the {PROBE} probe", labelpad=2)
+    axes.set_xlabel(f"ring:disc at the {PROBE} probe")
     axes.set_title("Each error alone, within its range. Dots: lift 0; bars: all lifts")
     for ratio, words, hue in ((MEASURED_RATIO, "measured ", MARK), (drawn, f"design, {FULL_WAVE} ", INK)):
         axes.text(ratio, len(order) - 0.5, words, color=hue, fontsize=SMALL, rotation=90, ha="right", va="bottom")
@@ -103,8 +103,8 @@ def _draw_lifts(axes: "Axes", answer: Answer) -> None:
     axes.axhline(MEASURED_RATIO, color=MARK, lw=1.2)
     # Room for words above.
     _ratio_axis(axes.yaxis, [2 * max(seen.ratio for seen in plates), *(seen.ratio for seen in plates)])
-    axes.set_xlabel("etched areas grow by this at every edge (µm)", labelpad=2)
-    axes.set_ylabel(f"ring:disc at the {PROBE} probe", labelpad=0)
+    axes.set_xlabel("etched areas grow by this at every edge (µm)")
+    axes.set_ylabel(f"ring:disc at the {PROBE} probe")
     axes.set_title(f"Line width off, the same design at {len(answer.of('drawn'))} lifts")
     words = f"lifts that reach 1:1: {', '.join(map(str, sorted(reaching)))}" if reaching else "no lift reaches 1:1"
     place_: Any = {"fontsize": SMALL, "ha": "center", "va": "top", "transform": axes.transAxes}
@@ -142,8 +142,8 @@ def _draw_both(axes: "Axes", answer: Answer) -> None:
         axes.axhline(level, color=FAINT, lw=0.9, ls=":", zorder=0)
         axes.text(0.99, level + 0.003, words, **at_right)
     axes.set_ylim(min(seen.throughput for seen in answer.seen) - 0.17, passed + 0.035)
-    axes.set_xlabel(f"ring:disc at the {PROBE} probe", labelpad=2)
-    axes.set_ylabel("energy in the sensor window, per incident", labelpad=2)
+    axes.set_xlabel(f"ring:disc at the {PROBE} probe")
+    axes.set_ylabel("energy in the sensor window, per incident")
     axes.set_title("Both measured numbers at once")
     axes.legend(loc="lower left", ncols=2, handletextpad=0.4, labelspacing=0.3, columnspacing=1.0, handlelength=1.4)
 
@@ -164,4 +164,4 @@ def _draw_near(axes: "Axes", bench: Bench, seen: Seen, prediction: "Prediction",
     plate = seen.plate
     titles = ("no errors\nlift 0", f"{plate.error}\n{plate.size}, lift {plate.lift}", f"the same\nat lift {plate.lift}")
     axes.set_title(titles[index].replace("um", "µm"), fontsize=SMALL)
-    axes.set_xlabel(f"{seen.ratio:.2f}:1\nin the window {seen.throughput:.2f}", fontsize=SMALL, labelpad=3)
+    axes.set_xlabel(f"{seen.ratio:.2f}:1\nin the window {seen.throughput:.2f}", fontsize=SMALL)

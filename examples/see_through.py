@@ -28,17 +28,15 @@ from doedesign.capture.scenes import SceneData
 from doedesign.capture.simulate import flat_psfs, photograph
 from doedesign.cli import exit_code
 from doedesign.recon.model import Model
-from doedesign.report.canvas import note, picture, place, scale_bar
 from doedesign.spec import load_spec
 from doedesign.training.scores import scores
+from fab.figure import SMALL, panels, save, scale_bar
 from fab.units import format_length
 from sim.camera import Camera
 from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.store import read_height
-
-SIDE, GAP, ROW = 1.75, 0.12, 0.42  # inches; ROW between two rows, for a scale bar and words
 
 
 class Chain(NamedTuple):
@@ -134,9 +132,7 @@ def restored(model: Model, capture: np.ndarray, far: np.ndarray, near: np.ndarra
 def draw(path: Path, chain: Chain, model: Model, camera: Camera) -> None:
     """Draw the chain: optics above, pictures below."""
     height = read_height(folder_of(model) / "height.exr").height_m
-    across, up = 4 * (SIDE + GAP) + GAP, 2 * (SIDE + ROW) + 0.65
-    with picture(path, (across, up), "Through the dirt") as figure:
-        tops = (up - 0.6, up - 0.6 - SIDE - ROW)
+    with panels(None, (7.6, 5.0), "Through the dirt", chain.words, "compressed") as figure:
         lens = np.log10(np.maximum(chain.far, 1e-7)), np.log10(np.maximum(chain.near, 1e-7))
         peak = max(float(image.max()) for image in lens)
         psfs = [np.clip((image - peak + 5) / 5, 0, 1) for image in lens]
@@ -155,17 +151,15 @@ def draw(path: Path, chain: Chain, model: Model, camera: Camera) -> None:
                 (f"network, {psnr['network']}", chain.network, None),
             ),
         )
-        for top, row in zip(tops, rows, strict=True):
-            for k, (words, image, colours) in enumerate(row):
-                axes = place(figure, GAP + k * (SIDE + GAP), top - SIDE, SIDE, SIDE)
-                shown = image if image.ndim == 2 else image.transpose(1, 2, 0)
-                most = 1.0 if colours == "gray" else None  # the height map takes all of its colours
-                axes.imshow(shown, origin="lower", cmap=colours, aspect="auto", vmin=most and 0.0, vmax=most)
-                axes.set_axis_off()
-                note(figure, GAP + k * (SIDE + GAP), top + 0.03, words)
-                if k == 0 and top == tops[0]:
-                    scale_bar(axes, camera.grid.extent_m[1])
-        note(figure, GAP, 0.08, chain.words)
+        grid = figure.subplots(2, 4)
+        for axes, (words, image, colours) in zip(grid.flat, (*rows[0], *rows[1]), strict=True):
+            shown = image if image.ndim == 2 else image.transpose(1, 2, 0)
+            most = 1.0 if colours == "gray" else None  # the height map takes all of its colours
+            axes.imshow(shown, origin="lower", cmap=colours, vmin=most and 0.0, vmax=most)
+            axes.set_axis_off()
+            axes.set_title(words, fontsize=SMALL)
+        scale_bar(grid[0, 0], camera.grid.extent_m[1])
+    save(figure, path)
 
 
 def main() -> int:

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.report.pictures import draw_budget
+from doedesign.report.tolerance import plot_budget
 from doedesign.tolerancing import Budget, study
+from fab.figure import save
 from fab.units import format_length
 
 HERE = Path(__file__).parent
@@ -73,7 +74,7 @@ def budgets(
     lines += [f"{b.what:<10} {b.factor:6.2f}  {b.low:.2f} and {b.high:.2f}  {sigmas(b)}" for b in found]
     pictures = [run / "budget" / f"{budget.what}.png" for budget in found]
     for path, budget in zip(pictures, found, strict=True):
-        draw_budget(path, budget)
+        save(plot_budget(budget), path)
     return "\n".join([*lines, "", *map(str, pictures)])
 
 

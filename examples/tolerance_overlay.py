@@ -17,8 +17,9 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.report.pictures import draw_changes, draw_histograms
+from doedesign.report.tolerance import plot_changes, plot_histograms
 from doedesign.tolerancing import Change, Plates, Study, study
+from fab.figure import save
 
 HERE = Path(__file__).parent
 
@@ -70,8 +71,8 @@ def strehl_by_mask(changes: list[Change]) -> list[tuple[float, float]]:
 def draw(folder: Path, asked: Study, plates: Plates, drawn: Plates, changes: list[Change]) -> list[Path]:
     """Histograms of the plates, and what every mask does alone."""
     files = [folder / "histograms.png", folder / "masks.png"]
-    draw_histograms(files[0], asked.design.camera, plates.table, drawn.table, asked.limits)
-    draw_changes(files[1], changes)
+    save(plot_histograms(plates.table, drawn.table, asked.design.camera, asked.limits), files[0])
+    save(plot_changes(changes), files[1])
     return files
 
 

@@ -2,8 +2,8 @@
 
 A picture is a function that draws and returns what it drew: axes where one panel is enough, a figure (or a sub-figure
 at the place of the axes that it was given) where several are. `save` writes it. matplotlib's constrained layout places
-everything. A new figure is drawn in the house style, whatever the user's settings are, and a picture on the user's own
-axes in the user's style. Maps are averaged here, not by matplotlib, which would turn rings of three cells into moire.
+everything. Figures are drawn in the house style, whatever the user's settings are; what is drawn on the user's own axes
+is in the user's style. Maps are averaged here, not by matplotlib, which would turn rings of three cells into moire.
 """
 
 import base64
@@ -60,6 +60,8 @@ SMALL = 8  # points
 DPI = 160
 _STYLE = {
     "figure.dpi": DPI,
+    "figure.constrained_layout.w_pad": 0.06,  # inches
+    "figure.constrained_layout.h_pad": 0.06,
     "savefig.dpi": "figure",
     "font.size": 9,
     "axes.titlesize": 9,
@@ -118,7 +120,7 @@ def panels(
     note: str = "",
     layout: Literal["constrained", "compressed"] = "constrained",
 ) -> "Iterator[FigureBase]":
-    """Open a new figure in the house style, or a sub-figure in the place of some axes.
+    """Open a new figure, or a sub-figure in the place of some axes, in the house style.
 
     Args:
         ax: axes of a subplot, which the sub-figure replaces; None for a new figure.
@@ -140,14 +142,17 @@ def panels(
             raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
         ax.remove()
         figure = parent.add_subfigure(place)
-        _head_and_foot(figure, size_in[0], title, note)
-        yield figure
+        with _house_style():
+            _head_and_foot(figure, size_in[0], title, note)
+            yield figure
         return
     with _house_style():
         figure = _figure_class()(figsize=size_in, layout=layout)
         # A right margin, which matplotlib's own wrapping of the note would leave out.
-        _head_and_foot(figure, size_in[0], title, textwrap.fill(note, max(20, int(17 * size_in[0]))))
+        _head_and_foot(figure, size_in[0], title, textwrap.fill(note, max(20, int(15.5 * size_in[0]))))
         yield figure
+        # One pass leaves texts some dots off, since panels of fixed aspect move; drawing makes the second.
+        figure.get_layout_engine().execute(figure)
 
 
 @contextmanager
@@ -236,13 +241,15 @@ def evenly_spaced(count: int, most: int) -> list[int]:
     return [round(i * (count - 1) / max(most - 1, 1)) for i in range(most)]
 
 
-def _mean_over_parts(values: NDArray[np.floating], count: int) -> NDArray[np.floating]:
+def _mean_over_parts(values: NDArray[Any], count: int) -> NDArray[np.float32]:
     """Means over `count` equal parts of the first axis, whose borders may lie within a sample."""
-    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
-    whole, rest = np.divmod(np.linspace(0, len(values), count + 1), 1)
-    at = whole.astype(np.intp)
-    up_to = sums[at] + rest[:, None] * (sums[np.minimum(at + 1, len(values))] - sums[at])
-    return (np.diff(up_to, axis=0) * (count / len(values))).astype(np.float32)
+    size = len(values)
+    whole, rest = np.divmod(np.linspace(0, size, count + 1)[:, None], 1)
+    first = whole[:, 0].astype(np.intp)
+    sums = np.add.reduceat(values, first[:-1], axis=0, dtype=np.float64)
+    # What of the sample at each border belongs to the part before it.
+    before = rest * values[np.minimum(first, size - 1)]
+    return ((sums - before[:-1] + before[1:]) * (count / size)).astype(np.float32)
 
 
 def shrunk(values: NDArray[np.floating], most: int, kind: Literal["mean", "smooth"] = "mean") -> NDArray[np.floating]:

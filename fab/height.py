@@ -8,7 +8,7 @@ the picture is +y. Numbers that are not metres need a scale, the metres that one
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ from fab.files import read_npy
 from fab.grid import Grid
 from fab.pictures import MOST_PIXELS, TIFF_FILES, read_pixels
 from fab.units import format_length, metres
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 __all__ = ["HeightMap", "read_height", "refuse_where", "require_heights"]
 
@@ -50,6 +54,23 @@ class HeightMap:
         if not 0 < self.aperture_m < float("inf"):
             raise InputError("aperture", "must be positive and finite", self.aperture_m, "Give the diameter.")
         require_heights(self.height_m, "height map")
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the map as a whole and cell by cell, and the share of area at every height (`fab.plots.height`)."""
+        from fab.plots.height import plot_height
+
+        return plot_height(self, ax=ax)
+
+    def _repr_html_(self) -> str:
+        from fab.figure import html_of, length_text
+
+        ny, nx = self.grid.shape
+        rows = {
+            "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
+            "heights": f"{length_text(float(self.height_m.min()))} to {length_text(float(self.height_m.max()))}",
+            "clear aperture": length_text(self.aperture_m),
+        }
+        return html_of("height map", rows, self.plot())
 
 
 def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where: str, rule: str, cure: str) -> None:

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from fab.height import HeightMap
 from fab.levels import Levels, height_of, quantise, quantise_wrapped, require_levels
 from fab.masks import level_map_from_planes, planes
 from fab.units import format_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 __all__ = ["LevelMap", "level_digest", "read_level_map", "write_level_map"]
 
@@ -108,6 +113,25 @@ class LevelMap:
     def with_level(self, level: NDArray[np.integer]) -> "LevelMap":
         """The same DOE with other level numbers ``[y, x]``."""
         return replace(self, level=level)
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw heights as a whole and cell by cell, and the share of area at every level (`fab.plots.height`)."""
+        from fab.plots.height import plot_height
+
+        aperture_m = min(self.aperture_m, math.hypot(*self.grid.extent_m))
+        return plot_height(HeightMap(self.height_m, self.grid, aperture_m), self.levels, self.name, ax)
+
+    def _repr_html_(self) -> str:
+        from fab.figure import html_of, length_text
+
+        ny, nx = self.shape
+        rows = {
+            "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
+            "levels": str(self.levels.told),
+            "clear aperture": length_text(self.aperture_m),
+            "SHA-256": self.digest[:12],
+        }
+        return html_of(self.name, rows, self.plot())
 
     def __str__(self) -> str:
         """Return "quick: 320 x 320 pixels of 1.85 um in 16 levels of 75 nm"."""

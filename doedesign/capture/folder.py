@@ -32,11 +32,12 @@ from doedesign.capture.images import Pictures, picture_files
 from doedesign.capture.scenes import SceneData
 from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, doe_psfs, flat_psfs, photograph
 from doedesign.design.design import Design
-from doedesign.report.contact import ContactRow, draw_contact
+from doedesign.report.sheet import ContactRow, plot_contact
 from doedesign.runs.folder import alone_in
 from doedesign.runtime.progress import meter
 from doedesign.spec import spec_digest, variation_to_toml
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process, Variation
 from sim.imaging.occlusion import follows_light
@@ -179,7 +180,7 @@ def _write_captures(
         _log.info("drawing the contact sheet")
         rows = [_row(folder / name) for name in names]
         title = f"{settings['run']} through {settings['obstruction']}"
-        draw_contact(folder / "contact.png", rows, title, _words(model, settings))
+        save(plot_contact(rows, title, _words(model, settings)), folder / "contact.png")
         listed = {f"{name}/{MANIFEST_NAME}": sha256_file(folder / name / MANIFEST_NAME) for name in names}
         listed |= {"contact.png": sha256_file(folder / "contact.png")}
         write_atomic(folder / MANIFEST_NAME, canonical_json({**manifest, "state": "done", "results_sha256": listed}))

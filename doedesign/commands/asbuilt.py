@@ -10,14 +10,15 @@ from doedesign.commands.psf import require_own
 from doedesign.design.design import Design
 from doedesign.lab.as_built import AsBuiltDoe, compared, gratings_compared, plate_of
 from doedesign.prediction import predict
-from doedesign.report.pictures import draw_psfs
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import DEVIATIONS, Process
 from fab.runsheet.as_built import AsBuilt, read_as_built
+from sim.plots.psfs import plot_psfs
 from sim.store import write_bank
 
 FORMAT = "doedesign as-built 1"
@@ -99,7 +100,7 @@ def _write(
         "gratings": gratings_compared(measured, process, plate.variation, design.camera.material),
     }
     write_bank(folder / "as-built.exr", prediction.bank, {"design": design.name, "plate": "as built"})
-    draw_psfs(folder / "as-built_psf.png", design.camera, prediction.bank, design.near_m, design.far_m)
+    save(plot_psfs(prediction.bank, design.camera, design.near_m, design.far_m), folder / "as-built_psf.png")
     (folder / "as-built.json").write_bytes(canonical_json(found))
     head = [f"plate of {design.name} as it was measured"]
     (folder / "variation.toml").write_text(variation_to_toml(plate.variation, head), encoding="utf-8")

@@ -16,13 +16,14 @@ from doedesign.calibration import calibrate as fitted
 from doedesign.calibration.unknowns import unknowns_of
 from doedesign.commands.psf import require_own
 from doedesign.design.design import Design
-from doedesign.report.calibration import value_text
-from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
-from doedesign.report.tolerance import error_label
+from doedesign.report.calibration import plot_check, plot_estimates, plot_fitted_psfs
+from doedesign.report.explanations import plot_explanations
+from doedesign.report.labels import error_label, value_text
 from doedesign.runs.folder import Run, alone_in, open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import ProcessSpec, load_process, process_to_toml, variation_to_toml
+from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process
 
@@ -123,7 +124,7 @@ def explain(
         text = family_text(family)
         (fresh / "explanations.json").write_bytes(canonical_json({"run": run.spec.name, **_family_record(family)}))
         (fresh / "explanations.txt").write_text(text + "\n", encoding="utf-8")
-        draw_family(fresh / "explanations.png", family)
+        save(plot_explanations(family), fresh / "explanations.png")
     say(text)
     return folder, family
 
@@ -169,9 +170,9 @@ def _write(folder: Path, run: Run, spec: ProcessSpec, measured: Measurement, res
     (folder / ESTIMATE).write_text(process_to_toml(process_spec_of(result.process, spec), comments), encoding="utf-8")
     plate = result.objective.unknowns.variation(result.posterior.values)
     (folder / "plate.toml").write_text(variation_to_toml(plate, comments), encoding="utf-8")
-    draw_fitted_psfs(folder / "psfs.png", result)
-    draw_estimates(folder / "errors.png", result)
-    draw_check(folder / "check.png", result)
+    save(plot_fitted_psfs(result), folder / "psfs.png")
+    save(plot_estimates(result), folder / "errors.png")
+    save(plot_check(result), folder / "check.png")
 
 
 def estimate_comments(result: Calibration, measured: Measurement) -> list[str]:

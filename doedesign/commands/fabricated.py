@@ -8,16 +8,18 @@ import numpy as np
 from doedesign.commands.psf import Say, require_own
 from doedesign.design.design import Design
 from doedesign.prediction import plate_rows
-from doedesign.report.pictures import draw_psfs, draw_split
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_variation, variation_to_toml
 from fab.draws import EXPECTED, variation_at
 from fab.errors import CheckFailed, InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process, Variation
 from sim.leakage import SplitPsf, split_psf
+from sim.plots.leakage import plot_split
+from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, surface_bank
 from sim.store import write_bank
 from sim.surface import as_fabricated
@@ -119,14 +121,14 @@ def _write(folder: Path, design: Design, process: Process, plate: Variation, sou
     write_bank(folder / "fabricated.exr", bank, {"design": design.name, "plate": source})
     (folder / "variation.toml").write_text(variation_to_toml(plate, [source]), encoding="utf-8")
     (folder / "metrics.json").write_bytes(canonical_json(rows))
-    draw_psfs(folder / "fabricated_psf.png", camera, bank, design.near_m, design.far_m)
+    save(plot_psfs(bank, camera, design.near_m, design.far_m), folder / "fabricated_psf.png")
     orders = [
         tuple(
             next(r["zeroth_order"] for r in rows[name] if r["colour"] == colour) for name in ("nominal", "fabricated")
         )
         for colour in bank.colours
     ]
-    draw_split(folder / "leakage.png", camera, nominal, splits, 0, orders)
+    save(plot_split(nominal, splits, camera, 0, orders), folder / "leakage.png")
     digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
     manifest = {
         "format": "doedesign fabricated 1",

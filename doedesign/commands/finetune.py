@@ -32,7 +32,8 @@ from doedesign import __version__
 from doedesign.commands.psf import Say
 from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
-from doedesign.report.training import draw_training, draw_validation
+from doedesign.report.history import plot_training
+from doedesign.report.sheet import plot_validation
 from doedesign.runs.folder import CHECKPOINT, alone_in
 from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec import load_spec
@@ -47,6 +48,7 @@ from doedesign.training.pairs import PairSplit, find_pairs, pairs_digest, split_
 from doedesign.training.perceptual import Lpips
 from doedesign.training.validation import ValidationSample
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, write_atomic
 from sim.light import srgb_from_linear
 from sim.store import write_bank
@@ -266,7 +268,7 @@ def _look(folder: Path, work: FinetuneInputs, state: FinetuneState) -> dict[str,
     title, words = f"{work.title}, fine-tuned by {state.step} steps", "middle of real pairs never trained on; PSNR"
     if any(pair.mask is not None for pair in work.held_out.files):
         words += ", and in brackets where it is covered"
-    draw_validation(folder / "validation" / f"step_{state.step:06d}.png", found.rows, title, words)
+    save(plot_validation(found.rows, title, words), folder / "validation" / f"step_{state.step:06d}.png")
     return found.means
 
 
@@ -308,6 +310,6 @@ def _finish(folder: Path, work: FinetuneInputs, state: FinetuneState) -> None:
     names = [NETWORK_NAME, BANK_NAME, "metrics.json", "pairs.json"]
     records = read_history(folder / HISTORY_NAME, state.step)
     if records:
-        draw_training(folder / "curves.png", records, work.title)
+        save(plot_training(records, work.title), folder / "curves.png")
         names += ["curves.png", HISTORY_NAME]
     seal(folder, names, _manifest(work))

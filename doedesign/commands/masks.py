@@ -8,12 +8,10 @@ from typing import Any, Literal
 from doedesign.build import camera_from_spec, process_from_spec, require_levels_of, wafer_from_spec
 from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
-from doedesign.report.marks import draw_part
-from doedesign.report.rules import draw_rules
-from doedesign.report.wafer import draw_wafer
 from doedesign.runs.level_maps import Drawing
 from doedesign.spec import Spec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import sha256_file
 from fab.layout.frame import Frame
 from fab.layout.geometry import Chrome
@@ -22,6 +20,8 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.order import Order, plan_order
 from fab.order.write import write_planned
+from fab.plots.marks import plot_part
+from fab.plots.wafer import plot_wafer
 from fab.process import Process, Variation
 from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
 from fab.runsheet.write import write_run_sheet
@@ -83,16 +83,18 @@ def write_masks(
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
         plate, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
         dbu_m, aperture_m = order.dbu_m, order.level_map.aperture_m
-        draw_wafer(fresh / plate, order.wafer, frame, aperture_m, dbu_m, f"{order.stem}: what lies where")
+        title = f"{order.stem}: what lies where"
+        save(plot_wafer(order.wafer, frame, aperture_m, dbu_m, title), fresh / plate)
         site = alignment_site(order.plates, dbu_m)
-        draw_part(fresh / marks, site, order.plates, f"{order.stem}: alignment site, every mask in its colour")
+        title = f"{order.stem}: alignment site, every mask in its colour"
+        save(plot_part(site, order.plates, title), fresh / marks)
         log.info("writing the run sheet")
         sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m))
         found = order.rules
         if found.clean:
             return [plate, marks, *sheets]
         title = f"{order.stem}: where the masks break the rules of {process.name}"
-        draw_rules(fresh / name, found, title)
+        save(found.plot(title=title), fresh / name)
         return [plate, marks, *sheets, name]
 
     written = write_planned(folder, order, add=add)

@@ -10,14 +10,18 @@ import numpy as np
 
 from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
-from doedesign.report.pictures import draw_encircled, draw_height, draw_mtf, draw_psfs
 from doedesign.runs.folder import CONTINUOUS, Run, alone_in, open_run
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed, InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
+from fab.height import HeightMap
+from fab.plots.height import plot_height
 from sim.camera import Camera
+from sim.plots.curves import plot_encircled, plot_mtf
+from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
 from sim.store import write_bank
@@ -151,10 +155,10 @@ def _write(
     for name in ("continuous", "quantised"):
         bank, height = banks[name], designs[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
-        draw_psfs(folder / f"{name}_psf.png", camera, bank, near, far)
+        save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
         transfer = transfer_bank(camera, height, depths)
-        draw_mtf(folder / f"{name}_mtf.png", camera, transfer, near, far, lens_transfer)
-        draw_encircled(folder / f"{name}_encircled.png", camera, bank, near, far, lens)
+        save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
+        save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
         metrics[name] = design_metrics(camera, height, bank, near, lens)
     if _takes_hankel(run, "continuous", field):
         # The budget's band is that of a raster of cells, which rings are not.
@@ -165,7 +169,10 @@ def _write(
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
     title = f"{run.spec.name}, continuous"
-    draw_height(folder / "continuous_height.png", designs["continuous"], None, camera, title)
+    save(
+        plot_height(HeightMap(designs["continuous"], camera.grid, camera.aperture_m), None, title),
+        folder / "continuous_height.png",
+    )
     (folder / "metrics.json").write_bytes(canonical_json(metrics))
     digests = {path.name: sha256_file(path) for path in sorted(folder.iterdir())}
     manifest = {"format": "doedesign psf 1", "run": run.spec.name, "results_sha256": digests}

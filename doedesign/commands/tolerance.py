@@ -8,14 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from doedesign.report.pictures import (
-    draw_budget,
-    draw_changes,
-    draw_histograms,
-    draw_psfs,
-    draw_shares,
-    draw_yield,
-)
+from doedesign.report.tolerance import plot_budget, plot_changes, plot_histograms, plot_shares, plot_yield
 from doedesign.runs.folder import open_run
 from doedesign.spec import variation_to_toml
 from doedesign.tolerancing.analysis import QUANTITIES, limit_text, obeys, yield_of
@@ -25,9 +18,11 @@ from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_
 from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
 from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
 from fab.process import DEVIATIONS, error_names
 from fab.units import format_length
+from sim.plots.psfs import plot_psfs
 
 Say = Callable[[str], None]
 
@@ -235,23 +230,23 @@ def _write(folder: Path, asked: Study, plan: StudyPlan, found: StudyFindings, re
 def _draw(folder: Path, asked: Study, found: StudyFindings) -> list[str]:
     """Draw what was found; returns the names of the pictures."""
     design, plates = asked.design, found.plates
-    draw_histograms(folder / "histograms.png", design.camera, plates.table, found.nominal.table, asked.limits)
-    draw_yield(folder / "yield.png", plates.table, asked.limits)
+    save(plot_histograms(plates.table, found.nominal.table, design.camera, asked.limits), folder / "histograms.png")
+    save(plot_yield(plates.table, asked.limits), folder / "yield.png")
     names = ["histograms.png", "yield.png"]
     if found.changes is not None:
-        draw_changes(folder / "one_at_a_time.png", found.changes)
+        save(plot_changes(found.changes), folder / "one_at_a_time.png")
         names.append("one_at_a_time.png")
     if found.shares is not None:
-        draw_shares(folder / "sobol.png", design.camera, found.shares)
+        save(plot_shares(found.shares, design.camera), folder / "sobol.png")
         names.append("sobol.png")
     if found.budget is not None:
-        draw_budget(folder / "budget.png", found.budget)
+        save(plot_budget(found.budget), folder / "budget.png")
         names.append("budget.png")
     shown = {NOMINAL: "nominal_psf.png", plates.worst: "worst_psf.png"}
     # By a worker: it finds there what the others have compiled, and gives the same bytes whatever this process is like.
     model = DrawModel(predicted_bank, design, asked.process)
     for key, bank in evaluate_here(model, {key: asked.variation(key) for key in shown}, 1):
-        draw_psfs(folder / shown[key], design.camera, bank, design.near_m, design.far_m)
+        save(plot_psfs(bank, design.camera, design.near_m, design.far_m), folder / shown[key])
         names.append(shown[key])
     return names
 

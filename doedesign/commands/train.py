@@ -34,7 +34,8 @@ from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_sp
 from doedesign.capture.images import Pictures
 from doedesign.capture.scenes import Batch, SceneData
 from doedesign.commands.psf import Say
-from doedesign.report.training import draw_training, draw_validation
+from doedesign.report.history import plot_training
+from doedesign.report.sheet import plot_validation
 from doedesign.runs.folder import CHECKPOINT, TRAINING, Run, alone_in, open_run, spec_with
 from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec import Spec, spec_digest, spec_to_toml
@@ -46,6 +47,7 @@ from doedesign.training.loop import Callbacks, FolderLock, Schedule, is_done, pe
 from doedesign.training.results import HeldOut, height_at_rest_m, heights_before, validate, write_results
 from doedesign.training.validation import SCENE_SEED, split_pictures
 from fab.errors import InputError
+from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json, sha256_bytes, sha256_file, write_atomic
 from sim.obstruction import CameraView, ObstructionKind
 
@@ -294,7 +296,7 @@ def _look(folder: Path, work: TrainingInputs, state: JointState) -> dict[str, An
         words = f"occlusion model {work.settings['occlusion']}, camera {work.settings['camera']}; PSNR in brackets: "
         words += "where it is covered"
         title = f"{work.run.spec.name}, step {state.step}"
-        draw_validation(folder / "validation" / f"step_{state.step:06d}.png", found.rows, title, words)
+        save(plot_validation(found.rows, title, words), folder / "validation" / f"step_{state.step:06d}.png")
     return found.means
 
 
@@ -304,7 +306,7 @@ def _finish(folder: Path, work: TrainingInputs, state: JointState) -> None:
     names = write_results(folder, work.run, work.trainer, state, work.held_out, work.kind, about)
     records = read_history(folder / HISTORY_NAME, state.step)
     if records:
-        draw_training(folder / "curves.png", records, work.run.spec.name)
+        save(plot_training(records, work.run.spec.name), folder / "curves.png")
         names += ["curves.png", HISTORY_NAME]
     names += ["spec.toml", "pictures.json"]
     seal(folder, names, _manifest(work))

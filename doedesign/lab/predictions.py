@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -21,11 +19,11 @@ from numpy.typing import NDArray
 from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
 from doedesign.prediction import Prediction, plate_rows, predict
-from doedesign.report.pictures import draw_psfs
 from doedesign.tolerancing.analysis import table_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at
 from fab.errors import InputError
+from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Normal, Process, Variation
@@ -35,6 +33,7 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.material import full_wave_wavelength_m, refractive_index
+from sim.plots.psfs import plot_psfs
 from sim.psf_bank import surface_bank
 from sim.surface import FabricatedDoe, as_fabricated
 
@@ -232,7 +231,4 @@ def predict_sheet(
         ),
         matters=matters,
     )
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "psf.png"
-        draw_psfs(path, design.camera, expected.bank, design.near_m, design.far_m)
-        return SheetPrediction(outlook, path.read_bytes())
+    return SheetPrediction(outlook, png_bytes(plot_psfs(expected.bank, design.camera, design.near_m, design.far_m)))

@@ -1,66 +1,125 @@
-"""Sheets of pictures: rows below each other, each under a line of words, in columns with heads."""
+"""Contact sheets: rows of images below each other, each over its caption, in columns with heads."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.canvas import DPI, SMALL, note, picture, place, wrapped
+from fab.figure import DPI, SMALL, panels, shrunk
 
-_GAP = 0.08  # inches
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+__all__ = ["ContactRow", "ValidationRow", "plot_contact", "plot_validation"]
+
+_CONTACT_SIDE, _VALIDATION_SIDE = 1.75, 1.6  # inches
+_MOST_CONTACTS, _MOST_VALIDATIONS = 12, 4
 
 
-class SheetRow(NamedTuple):
-    """One row.
+class ContactRow(NamedTuple):
+    """One simulated capture.
 
     Attributes:
-        label: what stands above it.
-        images: `[y, x]` greys or `[y, x, c]` colours, 0 to 1, row 0 at the bottom; one for each column.
+        label: its caption.
+        clean: `[c, y, x]` linear light, red, green and blue, without an obstruction.
+        conventional: recorded by the camera without a DOE.
+        doe: recorded with it.
+        mask: `[y, x]` sharp mask of the obstruction.
+        alpha: `[y, x]` share of the background's light that is lost with the DOE.
     """
 
     label: str
-    images: tuple[np.ndarray, ...]
+    clean: Float[np.ndarray, "3 y x"]
+    conventional: Float[np.ndarray, "3 y x"]
+    doe: Float[np.ndarray, "3 y x"]
+    mask: Float[np.ndarray, "y x"]
+    alpha: Float[np.ndarray, "y x"]
 
 
-def draw_sheet(
-    path: str | Path, heads: Sequence[str], rows: Sequence[SheetRow], side_in: float, title: str, words: str
-) -> None:
-    """Draw rows of pictures.
+class ValidationRow(NamedTuple):
+    """One scene that was not trained on, display values.
+
+    Attributes:
+        label: its caption.
+        capture: `[c, y, x]` red, green and blue as the camera records it.
+        reconstruction: output of the network.
+        scene: the true scene.
+    """
+
+    label: str
+    capture: Float[np.ndarray, "3 y x"]
+    reconstruction: Float[np.ndarray, "3 y x"]
+    scene: Float[np.ndarray, "3 y x"]
+
+
+def plot_contact(rows: Sequence[ContactRow], title: str, words: str, ax: "Axes | None" = None) -> "FigureBase":
+    """Draw captures one below the other: clean, conventional camera, camera with the DOE, mask, alpha.
 
     Args:
-        path: the PNG file.
-        heads: what stands above each column.
-        rows: the rows; at least one.
-        side_in: width of a picture, inches.
-        title: what stands above all.
-        words: what it was made with, for the foot.
-
-    Raises:
-        InputError: the system refuses the path.
+        rows: the captures; beyond twelve, the first.
+        title: a line above all.
+        words: how they were made, for the foot.
+        ax: axes whose place the sheet takes; a new figure by default.
     """
-    across = len(heads) * (side_in + _GAP) + 0.16
-    text = wrapped(words, across - 0.3)
-    foot = 0.2 + 0.15 * (text.count("\n") + 1)
-    highs = [side_in * row.images[0].shape[0] / row.images[0].shape[1] + 0.2 for row in rows]
-    with picture(path, (across, foot + sum(highs) + 0.65), title) as figure:
-        top = foot + sum(highs)
-        for k, head in enumerate(heads):
-            at = ((0.12 + k * (side_in + _GAP)) / across, (top + 0.1) / figure.get_figheight())
-            figure.text(*at, head, fontsize=SMALL, va="baseline")
-        for row, high in zip(rows, highs, strict=True):
-            top -= high
-            for k, image in enumerate(row.images):
-                axes = place(figure, 0.12 + k * (side_in + _GAP), top, side_in, high - 0.2)
-                axes.imshow(image, origin="lower", cmap="gray", vmin=0, vmax=1, interpolation="nearest", aspect="auto")
+    from sim.light import srgb_from_linear
+
+    heads = ("clean", "conventional camera", "camera with the plate", "mask", "alpha, with the plate")
+    shown = []
+    for row in rows[:_MOST_CONTACTS]:
+        # Averaged in linear light, cut at white.
+        light = [srgb_from_linear(_reduced(image, _CONTACT_SIDE)) for image in (row.clean, row.conventional, row.doe)]
+        shown.append((row.label, [*light, *(shrunk(one, _dots(_CONTACT_SIDE)) for one in (row.mask, row.alpha))]))
+    return _plot_sheet(heads, shown, _CONTACT_SIDE, title, words, ax)
+
+
+def plot_validation(rows: Sequence[ValidationRow], title: str, words: str, ax: "Axes | None" = None) -> "FigureBase":
+    """Draw scenes one below the other: capture, reconstruction, scene.
+
+    Args:
+        rows: the scenes; beyond four, the first.
+        title: a line above all.
+        words: how they were made, for the foot.
+        ax: axes whose place the sheet takes; a new figure by default.
+    """
+    shown = [
+        (row.label, [_reduced(np.clip(one, 0, 1), _VALIDATION_SIDE) for one in row[1:]])
+        for row in rows[:_MOST_VALIDATIONS]
+    ]
+    return _plot_sheet(("capture", "reconstruction", "scene"), shown, _VALIDATION_SIDE, title, words, ax)
+
+
+def _dots(side_in: float) -> int:
+    return round(side_in * DPI)
+
+
+def _reduced(image: Float[np.ndarray, "c y x"], side_in: float) -> Float[np.ndarray, "v u c"]:
+    """Colours averaged to no more than a picture of this width can show."""
+    return np.stack([shrunk(plane, _dots(side_in)) for plane in image], axis=-1)
+
+
+def _plot_sheet(
+    heads: Sequence[str],
+    rows: Sequence[tuple[str, Sequence[np.ndarray]]],
+    side_in: float,
+    title: str,
+    words: str,
+    ax: "Axes | None",
+) -> "FigureBase":
+    """Draw rows of a caption and images `[y, x]` or `[y, x, c]`, 0 to 1."""
+    heights = [side_in * images[0].shape[0] / images[0].shape[1] + 0.3 for _, images in rows]
+    heights[0] += 0.2
+    size = (len(heads) * (side_in + 0.12) + 0.1, sum(heights) + 1.0)
+    with panels(ax, size, title, words) as figure:
+        strips = figure.subfigures(len(rows), 1, height_ratios=heights, squeeze=False)[:, 0]
+        for strip, (label, images) in zip(strips, rows, strict=True):
+            strip.supxlabel(label, x=0.01, ha="left", fontsize=SMALL, parse_math=False)
+            for axes, image, head in zip(strip.subplots(1, len(heads)), images, heads, strict=True):
+                shown = np.clip(image, 0, 1)
+                axes.imshow(shown, origin="lower", cmap="gray", vmin=0, vmax=1, interpolation="nearest")
                 axes.set_axis_off()
-            note(figure, 0.12, top + high - 0.18, row.label)
-        note(figure, 0.12, 0.1, text)
-
-
-def reduced(values: Float[np.ndarray, "c y x"], side_in: float) -> Float[np.ndarray, "c v u"]:
-    """Blocks of pixels averaged, to no more than a picture of this width can show."""
-    factor = max(1, -(-max(values.shape[1:]) // round(side_in * DPI)))
-    c, y, x = values.shape[0], values.shape[1] // factor, values.shape[2] // factor
-    return values[:, : y * factor, : x * factor].reshape(c, y, factor, x, factor).mean(axis=(2, 4))
+                axes.set_anchor("S")  # next to its caption
+                if strip is strips[0]:
+                    axes.set_title(head)
+    return figure

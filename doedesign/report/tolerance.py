@@ -1,60 +1,49 @@
-"""What a process makes of a design: histograms, yield, which errors matter, and how large they may be.
+"""Pictures of a tolerance study: histograms, yield, which errors matter, and how large they may be.
 
-Every quantity has a panel of its own. "Worst" is the worst of a plate's colours and depths, which decides whether the
-plate is good.
+Every quantity has a panel of its own. "Worst" is the worst of a DOE's colours and depths, which decides whether the DOE
+is good.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.canvas import (
-    FAINT,
-    INK,
-    LINE,
-    MARK,
-    SERIES,
-    colour_label,
-    length_text,
-    line_colours,
-    note,
-    picture,
-    place,
-    wrapped,
-)
-from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, Yield, good_plates, yield_of
+from doedesign.report.labels import error_label
+from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, good_plates, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.sensitivity import Change, Share
+from fab.figure import INK, LINE, MARK, SERIES, length_text, panels, single
 from fab.process import DEVIATIONS
+from sim.plots.colours import colour_label, line_colours
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
     from matplotlib.lines import Line2D
 
     from doedesign.spec import LimitSpec
     from sim.camera import Camera
 
+__all__ = [
+    "limit_place",
+    "plot_budget",
+    "plot_changes",
+    "plot_histograms",
+    "plot_shares",
+    "plot_yield",
+]
+
 _MOST_BARS = 10
 _COLUMNS = 3
-# Inches: a panel, room at its left and right, below it and above, and for the words under the picture.
-_WIDE, _HIGH, _LEFT, _RIGHT, _BELOW, _ABOVE = 2.6, 1.7, 0.6, 0.15, 0.5, 0.3
-_LOWER, _HIGHER = "#56b4e9", LINE
+_LOWER, _HIGHER = SERIES[5], LINE
 _BAND = {"color": LINE, "alpha": 0.18, "lw": 0}
 _BAD = {"color": MARK, "alpha": 0.08, "lw": 0}
-
-
-def error_label(name: str) -> str:
-    """An error in words: "overlay x, mask 2" for "overlay_x_m[2]"."""
-    key, _, mask = name.partition("[")
-    words = key.removesuffix("_m").removesuffix("_rad").replace("_", " ")
-    return f"{words}, mask {mask.removesuffix(']')}" if mask else words
 
 
 def _scale(quantity: str) -> float:
@@ -66,68 +55,60 @@ def _axis_label(quantity: str) -> str:
 
 
 @contextmanager
-def _panels(
-    path: str | Path,
+def _per_quantity(
+    ax: "Axes | None",
     quantities: Sequence[str],
-    words: str,
-    marks: Sequence["Line2D"] = (),
-    left: float = _LEFT,
-    high: float = _HIGH,
-) -> "Iterator[list[Axes]]":
-    """A picture with one panel per quantity; below, what the marks mean, and words."""
+    note: str,
+    keys: Sequence["Line2D"] = (),
+    size_in: tuple[float, float] = (3.35, 2.5),
+) -> "Iterator[tuple[FigureBase, list[Axes]]]":
+    """One panel of a size per quantity under a legend."""
     columns = max(min(len(quantities), _COLUMNS), 1)
-    rows = math.ceil(len(quantities) / columns)
-    across = columns * (left + _WIDE + _RIGHT)
-    text = wrapped(words, across - 0.3)
-    lines = 0.15 * (text.count("\n") + 1)
-    foot = 0.15 + lines + (0.2 if marks else 0.0)
-    up = foot + rows * (_BELOW + high + _ABOVE)
-    with picture(path, (across, up)) as figure:
-        if marks:
-            at = {"loc": "lower left", "bbox_to_anchor": (0.15 / across, (0.15 + lines) / up), "borderaxespad": 0.0}
-            figure.legend(handles=marks, ncols=len(marks), borderpad=0.0, columnspacing=1.2, **at)
-        axes = []
-        for i, quantity in enumerate(quantities):
-            row, column = divmod(i, columns)
-            bottom = foot + (rows - 1 - row) * (_BELOW + high + _ABOVE) + _BELOW
-            axes.append(place(figure, left + column * (left + _WIDE + _RIGHT), bottom, _WIDE, high))
-            axes[-1].set_xlabel(_axis_label(quantity), labelpad=2)
-            axes[-1].tick_params(length=2.5)
-            axes[-1].ticklabel_format(useOffset=False)
-        yield axes
-        note(figure, 0.15, 0.1, text)
+    rows = max(math.ceil(len(quantities) / columns), 1)
+    size = (max(columns * size_in[0], 4.5), rows * size_in[1] + 0.5 + (0.2 if keys else 0.0))
+    with panels(ax, size, note=note) as figure:
+        grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes, quantity in zip(grid, quantities, strict=False):
+            axes.set_title(QUANTITIES[quantity].label)
+            axes.set_xlabel(_axis_label(quantity))
+        for spare in grid[len(quantities) :]:
+            spare.set_axis_off()
+        if keys:
+            figure.legend(handles=list(keys), loc="outside upper left", ncols=len(keys), borderpad=0.0)
+        yield figure, grid[: len(quantities)]
 
 
-def _marks(camera: "Camera", **look: Any) -> "list[Line2D]":
+def _colour_keys(camera: "Camera", **style: Any) -> "list[Line2D]":
     """A line or mark for every colour."""
     from matplotlib.lines import Line2D
 
     hues = zip(camera.colours, line_colours(camera.colours), strict=True)
-    return [Line2D([], [], color=hue, label=colour_label(colour), **look) for colour, hue in hues]
+    return [Line2D([], [], color=hue, label=colour_label(colour), **style) for colour, hue in hues]
 
 
-def draw_histograms(
-    path: str | Path, camera: "Camera", table: PlateTable, nominal: PlateTable, limits: Sequence["LimitSpec"] = ()
-) -> None:
-    """Draw how every quantity is distributed over the plates: a line per colour, the worst depth of each plate.
+def plot_histograms(
+    table: PlateTable,
+    nominal: PlateTable,
+    camera: "Camera",
+    limits: Sequence["LimitSpec"] = (),
+    ax: "Axes | None" = None,
+) -> "FigureBase":
+    """Draw how every quantity is distributed over the DOEs: a line per colour, the worst depth of each DOE.
 
     Args:
-        path: the PNG file.
+        table: the DOEs as fabricated.
+        nominal: the DOE exactly as designed, dotted.
         camera: the colours.
-        table: the plates.
-        nominal: the plate exactly as drawn, dotted.
-        limits: what a good plate obeys; the side beyond is shaded.
-
-    Raises:
-        InputError: the system refuses the path.
+        limits: requirements on a good DOE; the side beyond is shaded.
+        ax: axes whose place the picture takes; a new figure by default.
     """
     hues = dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
     words = f"{len(table.keys)} plates, the worst depth of each; dotted: the plate as drawn"
     words += "; shaded: beyond the limit" if limits else ""
     missing = int((~table.within).sum())
     words += f"; {missing} beyond the model are not shown" if missing else ""
-    with _panels(path, list(table.values), words, _marks(camera)) as panels:
-        for axes, quantity in zip(panels, table.values, strict=True):
+    with _per_quantity(ax, list(table.values), words, _colour_keys(camera)) as (figure, grid):
+        for axes, quantity in zip(grid, table.values, strict=True):
             scale = _scale(quantity)
             series = {c: scale * _finite(table.worst(quantity, c)) for c in table.colours}
             design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in table.colours}
@@ -139,9 +120,9 @@ def draw_histograms(
                     axes.axvline(design[colour], color=hues[colour], ls=":", lw=1.2)
             axes.set_xlim(bins[0], bins[-1])
             _shade(axes, [one for one in limits if one.quantity == quantity], scale)
-            axes.set_ylabel("plates", labelpad=2)
+            axes.set_ylabel("plates")
             axes.locator_params(axis="y", integer=True)
-            axes.set_title(QUANTITIES[quantity].label)
+    return figure
 
 
 def _finite(values: Float[np.ndarray, " plate"]) -> Float[np.ndarray, " finite"]:
@@ -171,46 +152,47 @@ def _shade(axes: "Axes", limits: Sequence["LimitSpec"], scale: float) -> None:
                 axes.axvline(scale * bound, color=MARK, lw=1.2)
 
 
-def draw_yield(path: str | Path, table: PlateTable, limits: Sequence["LimitSpec"] = ()) -> None:
-    """Draw the yield over where the limit of each quantity lies: its share of plates whose worst row is as good.
+def plot_yield(table: PlateTable, limits: Sequence["LimitSpec"] = (), ax: "Axes | None" = None) -> "FigureBase":
+    """Draw the yield over where the limit of each quantity lies: the share of DOEs whose worst row is as good.
 
     Args:
-        path: the PNG file.
-        table: the plates.
+        table: the DOEs as fabricated.
         limits: the limits as they are; one that concerns a single colour or depth has a curve of its own.
+        ax: axes whose place the picture takes; a new figure by default.
 
     Raises:
-        InputError: a limit that speaks of no row, or the system refuses the path.
+        InputError: a limit that concerns no row.
     """
     chosen = list(dict.fromkeys(one.quantity for one in limits)) or list(table.values)
     words = f"share of {len(table.keys)} plates that are good if the limit lies there, with its 95 % confidence"
     if limits:
         words += f"; all limits together: {yield_of(good_plates(table, limits))}"
-    with _panels(path, chosen, words) as panels:
-        for axes, quantity in zip(panels, chosen, strict=True):
+    with _per_quantity(ax, chosen, words) as (figure, grid):
+        for axes, quantity in zip(grid, chosen, strict=True):
             places = {(one.colour, one.depth_m) for one in limits if one.quantity == quantity} or {(None, None)}
             curves = {place: table.worst(quantity, *place) for place in sorted(places, key=str)}
             edges = _bins(_scale(quantity) * _finite(np.concatenate(list(curves.values()))))
             axes.set_xlim(edges[0], edges[-1])
             _shade(axes, [one for one in limits if one.quantity == quantity], _scale(quantity))
             for hue, (where, values) in zip(SERIES, curves.items(), strict=False):
-                _plot_yield(axes, values, quantity, hue, limit_place(*where) if len(places) > 1 else "")
+                _plot_yield_curve(axes, values, quantity, hue, limit_place(*where) if len(places) > 1 else "")
             axes.set_ylim(0, 103)
-            axes.set_ylabel("yield (%)", labelpad=2)
-            axes.grid(color=FAINT, lw=0.4, alpha=0.5)
+            axes.set_ylabel("yield (%)")
+            axes.grid(True)
             sign = "at most" if QUANTITIES[quantity].worse == "high" else "at least"
             axes.set_title(f"{QUANTITIES[quantity].label} {sign} ...")
             if len(places) > 1:
                 axes.legend(loc="best")
+    return figure
 
 
 def limit_place(colour: str | None, depth_m: float | None) -> str:
-    """Which rows a limit concerns, in words."""
+    """Rows that a limit concerns, in words."""
     return ", ".join([*([colour] if colour else []), *([length_text(depth_m)] if depth_m is not None else [])]) or "all"
 
 
-def _plot_yield(axes: "Axes", values: Float[np.ndarray, " plate"], quantity: str, hue: str, label: str) -> None:
-    """Plot the share of plates that are as good as a limit, over the whole view."""
+def _plot_yield_curve(axes: "Axes", values: Float[np.ndarray, " plate"], quantity: str, hue: str, label: str) -> None:
+    """Plot the share of DOEs that are as good as a limit, over the whole view."""
     plates, (low, high) = len(values), axes.get_xlim()
     x = np.clip(_scale(quantity) * np.sort(values), low, high)
     if QUANTITIES[quantity].worse == "low":
@@ -222,17 +204,14 @@ def _plot_yield(axes: "Axes", values: Float[np.ndarray, " plate"], quantity: str
     axes.step(x, share, where="post", color=hue, lw=1.4, label=label)
 
 
-def draw_changes(path: str | Path, changes: Sequence[Change]) -> None:
-    """Draw what every error does alone to the worst row of each quantity, one standard deviation to either side.
+def plot_changes(changes: Sequence[Change], ax: "Axes | None" = None) -> "FigureBase":
+    """Draw the effect of every error alone on the worst row of each quantity, one standard deviation to either side.
 
     Of more than ten errors, those that matter most to a quantity are shown.
 
     Args:
-        path: the PNG file.
         changes: as `doedesign.tolerancing.sensitivity.one_at_a_time` gives them.
-
-    Raises:
-        InputError: the system refuses the path.
+        ax: axes whose place the picture takes; a new figure by default.
     """
     from matplotlib.lines import Line2D
 
@@ -242,24 +221,22 @@ def draw_changes(path: str | Path, changes: Sequence[Change]) -> None:
     ]
     count = min(_MOST_BARS, max((sum(c.quantity == q for c in worst) for q in quantities), default=1))
     words = "worst colour and depth; every error alone, all others at their mean (the line)"
-    marks = [
-        Line2D([], [], color=hue, lw=5, label=f"one sigma {side}")
-        for hue, side in ((_LOWER, "lower"), (_HIGHER, "higher"))
-    ]
-    with _panels(path, quantities, words, marks, left=1.65, high=0.35 + 0.17 * count) as panels:
-        for axes, quantity in zip(panels, quantities, strict=True):
+    sides = ((_LOWER, "lower"), (_HIGHER, "higher"))
+    keys = [Line2D([], [], color=hue, lw=5, label=f"one sigma {side}") for hue, side in sides]
+    with _per_quantity(ax, quantities, words, keys, (4.4, 1.1 + 0.17 * count)) as (figure, grid):
+        for axes, quantity in zip(grid, quantities, strict=True):
             shown = sorted((c for c in worst if c.quantity == quantity), key=_reach, reverse=True)[:_MOST_BARS]
-            _plot_changes(axes, shown, _scale(quantity))
-            axes.set_title(QUANTITIES[quantity].label)
+            _plot_bars(axes, shown, _scale(quantity))
+    return figure
 
 
 def _reach(change: Change) -> float:
-    """How far an error moves its quantity."""
+    """Distance by which an error moves its quantity."""
     moved = (abs(value - change.expected) for value in (change.low, change.high) if value is not None)
     return max((one for one in moved if math.isfinite(one)), default=0.0)
 
 
-def _plot_changes(axes: "Axes", shown: Sequence[Change], scale: float) -> None:
+def _plot_bars(axes: "Axes", shown: Sequence[Change], scale: float) -> None:
     expected = scale * shown[0].expected
     ends = [expected]
     for position, change in enumerate(shown):
@@ -272,22 +249,19 @@ def _plot_changes(axes: "Axes", shown: Sequence[Change], scale: float) -> None:
     axes.set_xlim(min(ends) - room, max(ends) + room)
     axes.set_yticks(range(len(shown)), [error_label(c.error) for c in shown])
     axes.set_ylim(len(shown) - 0.4, -0.6)
-    axes.grid(axis="x", color=FAINT, lw=0.4, alpha=0.5)
+    axes.grid(axis="x")
 
 
-def draw_shares(path: str | Path, camera: "Camera", shares: Sequence[Share]) -> None:
-    """Draw which share of the variance of each quantity every source of error causes.
+def plot_shares(shares: Sequence[Share], camera: "Camera", ax: "Axes | None" = None) -> "FigureBase":
+    """Draw the share of the variance of each quantity that every source of error causes.
 
-    Bars are the worst row of a plate: dark what a source causes by itself, light with other sources together. Marks are
+    Bars are the worst row of a DOE: dark what a source causes by itself, light with other sources together. Marks are
     the totals of single colours.
 
     Args:
-        path: the PNG file.
-        camera: the colours.
         shares: as `doedesign.tolerancing.sensitivity.sobol` gives them.
-
-    Raises:
-        InputError: the system refuses the path.
+        camera: the colours.
+        ax: axes whose place the picture takes; a new figure by default.
     """
     hues = dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
     quantities = list(dict.fromkeys(one.quantity for one in shares))
@@ -295,9 +269,9 @@ def draw_shares(path: str | Path, camera: "Camera", shares: Sequence[Share]) -> 
     sources += [s for s in dict.fromkeys(one.source for one in shares) if s not in sources]
     words = "Sobol indices of the worst colour and depth: dark alone, light together with others, with 95 % confidence"
     words += "; marks: totals of single colours"
-    marks = _marks(camera, ls="", marker="|", mew=1.5)
-    with _panels(path, quantities, words, marks, left=1.0, high=0.35 + 0.22 * len(sources)) as panels:
-        for axes, quantity in zip(panels, quantities, strict=True):
+    keys = _colour_keys(camera, ls="", marker="|", mew=1.5)
+    with _per_quantity(ax, quantities, words, keys, (3.75, 1.1 + 0.22 * len(sources))) as (figure, grid):
+        for axes, quantity in zip(grid, quantities, strict=True):
             for one in (o for o in shares if o.quantity == quantity):
                 position = sources.index(one.source)
                 if one.colour is not None:
@@ -310,41 +284,36 @@ def draw_shares(path: str | Path, camera: "Camera", shares: Sequence[Share]) -> 
             axes.set_yticks(range(len(sources)), sources)
             axes.set_ylim(len(sources) - 0.4, -0.6)
             axes.set_xlim(0, 105)
-            axes.grid(axis="x", color=FAINT, lw=0.4, alpha=0.5)
-            axes.set_xlabel("share of the variance (%)", labelpad=2)
-            axes.set_title(QUANTITIES[quantity].label)
+            axes.grid(axis="x")
+            axes.set_xlabel("share of the variance (%)")
+    return figure
 
 
-def draw_budget(path: str | Path, budget: Budget) -> None:
+def plot_budget(budget: Budget, ax: "Axes | None" = None) -> "Axes":
     """Draw the yield over the size of some errors, and where it is the wanted one.
 
     Args:
-        path: the PNG file.
         budget: the budget.
-
-    Raises:
-        InputError: the system refuses the path.
+        ax: axes to draw on; those of a new figure by default.
     """
-    yields: Callable[[Callable[[Yield], float]], list[float]] = lambda side: [  # noqa: E731
-        100 * side(one) for one in budget.yields
-    ]
-    shares, low, high = yields(lambda y: y.share), yields(lambda y: y.low), yields(lambda y: y.high)
-    words = wrapped(f"{budget.yields[0].plates} plates per point, 95 % confidence; {budget}", 4.6)
-    foot = 0.6 + 0.15 * (words.count("\n") + 1)
-    with picture(path, (5.0, foot + 2.9)) as figure:
-        axes = place(figure, 0.65, foot, 4.2, 2.55)
+    share, low, high = (
+        [100 * value for value in side]
+        for side in zip(*((one.share, one.low, one.high) for one in budget.yields), strict=True)
+    )
+    words = f"{budget.yields[0].plates} plates per point, 95 % confidence; {budget}"
+    with single(ax, (5.0, 3.9), note=words) as axes:
         axes.fill_between(budget.factors, low, high, **_BAND)
         fine = np.linspace(0, budget.factors[-1], 201)
         axes.plot(fine, 100 * budget.yield_at(fine), color=LINE)
-        axes.plot(budget.factors, shares, "o", color=LINE, ms=3.5, clip_on=False)
+        axes.plot(budget.factors, share, "o", color=LINE, ms=3.5, clip_on=False)
         axes.axhline(100 * budget.wanted, color=MARK, lw=1.0, ls="--")
         if budget.verdict == "found":
             axes.axvspan(budget.low, budget.high, **_BAD)
             axes.plot(budget.factor, 100 * budget.wanted, "o", color=MARK, ms=6)
         axes.set_xlim(0, budget.factors[-1])
         axes.set_ylim(0, 103)
-        axes.grid(color=FAINT, lw=0.4, alpha=0.5)
-        axes.set_xlabel(f"sigma of {budget.what} over that of the process", labelpad=2)
+        axes.grid(True)
+        axes.set_xlabel(f"sigma of {budget.what} over that of the process")
         axes.set_ylabel("yield (%)")
         axes.set_title(f"How large may {budget.what} errors be?")
-        note(figure, 0.15, 0.1, words)
+    return axes

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.training import ValidationRow
+from doedesign.report.sheet import ValidationRow
 from doedesign.training.perceptual import Lpips
 from doedesign.training.scores import Scores, scores
 from doedesign.training.validation import ValidationSample

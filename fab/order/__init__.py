@@ -2,6 +2,5 @@
 
 order         Order: what is drawn, for whom, and what everything is called
 entries       what the manifest says of an order
-preview       the picture of a mask set
 write         the folder, its manifest, and its proof
 """

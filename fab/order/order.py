@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
 from fab.errors import InputError
@@ -89,7 +88,7 @@ class Order:
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw heights, chrome and every etch mask (`fab.plots.masks.plot_masks`)."""
-        plot_masks = import_module("fab.plots.masks").plot_masks
+        from fab.plots.masks import plot_masks
 
         title = f"{self.stem}: {self.level_map.levels.told}, level map {self.level_map.digest[:12]}"
         return plot_masks(self.level_map, self.chrome.radii_m(self.level_map), title, ax)

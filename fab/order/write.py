@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.figure import html_of
+from fab.figure import html_of, save
 from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
 from fab.gds.writer import write_gds, write_oasis
 from fab.layout.doe import mask_layout
@@ -52,7 +52,6 @@ from fab.manifest.records import (
 )
 from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entry, wafer_entry
 from fab.order.order import OnViolation, Order, plan_order
-from fab.order.preview import preview_png
 from fab.process import Process
 from fab.solids.model import DoeModel
 from fab.solids.patch import Patch
@@ -201,9 +200,7 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     del layout
     log.info("drawing the preview")
     _write_map(folder / levels_file, level_map.level)
-    title = f"{order.stem}: {levels.told}, level map {level_map.digest[:12]}"
-    picture = preview_png(title, level_map, order.chrome.radii_m(level_map))
-    (folder / preview).write_bytes(picture)
+    save(order.plot(), folder / preview)
     log.info("drawing the solids")
     model = DoeModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
     # What is added takes long where it follows light; the solids are drawn meanwhile.

@@ -20,7 +20,6 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -212,7 +211,7 @@ class RulesReport:
 
     def plot(self, ax: "Axes | None" = None, title: str = "") -> "FigureBase":
         """Draw where every mask breaks a rule (`fab.plots.rules.plot_rules`)."""
-        plot_rules = import_module("fab.plots.rules").plot_rules
+        from fab.plots.rules import plot_rules
 
         return plot_rules(self, title or f"{self.level_map.name}: where the masks break the rules", ax)
 

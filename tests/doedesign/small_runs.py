@@ -8,7 +8,7 @@ import pytest
 
 import doedesign.optimization
 from doedesign.cli import main
-from fab.files import write_atomic
+from tests.pictures import leave_out_pictures
 
 
 def call(*arguments: object) -> tuple[int, str, str]:
@@ -23,9 +23,7 @@ def finished_run(folder: Path, spec: str) -> Path:
     """Optimise a spec into FOLDER/run without its pictures, which are looked at elsewhere."""
     (folder / "small.toml").write_text(spec)
     with pytest.MonkeyPatch.context() as patch:
-        for name in dir(doedesign.optimization):
-            if name.startswith("draw_"):
-                patch.setattr(doedesign.optimization, name, lambda path, *_: write_atomic(path, b"picture"))
+        leave_out_pictures(patch, doedesign.optimization)
         code, _, said = call("optimize", folder / "small.toml", "--out", folder / "run")
     assert code == 0, said
     return folder / "run"

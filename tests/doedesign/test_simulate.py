@@ -30,6 +30,7 @@ from sim.psf_bank import surface_bank
 from sim.sensor import Sensor
 from tests.doedesign.small_runs import finished_run
 from tests.doedesign.test_simulate_command import SPEC
+from tests.pictures import leave_out_pictures
 
 
 @pytest.mark.parametrize("model", ["paper", "radiometric", "reciprocal"])
@@ -82,7 +83,7 @@ ASKED: dict[str, Any] = {"obstruction": "dirt", "occlusion": "radiometric", "siz
 def test_in_memory_and_in_files_the_same(run: Path, design: Design, picture: Path, monkeypatch: pytest.MonkeyPatch):
     """The function and the command take the same capture; so do a file and its values."""
     shot = simulate(picture, design, **ASKED, seed=3)
-    monkeypatch.setattr(doedesign.capture.folder, "draw_contact", lambda path, *_: path.write_bytes(b"picture"))
+    leave_out_pictures(monkeypatch, doedesign.capture.folder)
     found = simulate_files(design, run / "simulated", picture.parent, **ASKED, seed=3)
     images = read_json(run / "simulated" / found.items[0] / "manifest.json")["images"]
     for name, image in (("capture", shot.doe), ("conventional", shot.conventional), ("depth", shot.depth_m[None])):

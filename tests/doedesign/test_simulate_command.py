@@ -12,6 +12,7 @@ import doedesign.capture.folder
 from doedesign.capture.image_files import read_image
 from fab.files import read_json
 from tests.doedesign.small_runs import call, finished_run
+from tests.pictures import leave_out_pictures
 
 SPEC = """
 name = "small"
@@ -63,7 +64,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def plain_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sheet is looked at in a test of its own; drawing it takes longer than all else."""
-    monkeypatch.setattr(doedesign.capture.folder, "draw_contact", lambda path, *_: Path(path).write_bytes(b"picture"))
+    leave_out_pictures(monkeypatch, doedesign.capture.folder)
 
 
 def arguments(run: Path, out: Path, images: Path, *more: object) -> list[object]:

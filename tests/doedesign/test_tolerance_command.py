@@ -13,8 +13,9 @@ import doedesign.commands.tolerance
 import doedesign.optimization
 from doedesign.spec import load_variation
 from doedesign.tolerancing import study
-from fab.files import sha256_file, write_atomic
+from fab.files import sha256_file
 from tests.doedesign.small_runs import call, finished_run
+from tests.pictures import leave_out_pictures
 
 SPEC = """
 name = "small"
@@ -139,9 +140,7 @@ def test_a_study_grows_and_leaves_no_old_pictures(
     run: Path, asked: tuple[int, str, str], monkeypatch: pytest.MonkeyPatch
 ):
     commands = doedesign.commands.tolerance
-    for name in dir(commands):
-        if name.startswith("draw_"):
-            monkeypatch.setattr(commands, name, lambda path, *_: write_atomic(path, b"picture"))
+    leave_out_pictures(monkeypatch, commands)
     monkeypatch.setattr(commands, "evaluate_here", lambda work, plates, workers: ((key, None) for key in plates))
     before = (run / "tolerance" / "draws.jsonl").read_bytes()
     more = ("--draws", 5, "--sensitivity", "sobol", "--sobol", 2, "--corners", "--json")

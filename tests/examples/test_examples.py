@@ -12,7 +12,7 @@ import doedesign.commands.psf
 import doedesign.optimization
 from doedesign.cli import main
 from doedesign.spec import load_spec, spec_warnings
-from fab.files import write_atomic
+from tests.pictures import leave_out_pictures
 
 pytestmark = pytest.mark.slow
 
@@ -104,10 +104,7 @@ def test_demo_twice(demo: ModuleType, small: Path, tmp_path: Path):
 def test_demo_takes_no_other_order_for_its_own(
     demo: ModuleType, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    for module in (doedesign.optimization, doedesign.commands.psf):
-        for name in dir(module):
-            if name.startswith("draw_"):  # pictures take most of the time
-                monkeypatch.setattr(module, name, lambda path, *_, **__: write_atomic(path, b"picture"))
+    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.commands.psf)
     runs, masks = tmp_path / "runs", tmp_path / "masks"
     demo.demo(small, runs, masks)
     run, order = runs / "quick", masks / "quick"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import doedesign.optimization
-from fab.files import write_atomic
+from tests.pictures import leave_out_pictures
 
 pytestmark = pytest.mark.slow
 
@@ -36,9 +36,7 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Example]:
         import explain_1to1  # pyright: ignore[reportMissingImports]
         import explain_plates  # pyright: ignore[reportMissingImports]
 
-        for name in dir(doedesign.optimization):
-            if name.startswith("draw_"):  # pictures of the run take longer than the run
-                patch.setattr(doedesign.optimization, name, lambda path, *_, **__: write_atomic(path, b"picture"))
+        leave_out_pictures(patch, doedesign.optimization)
         # Each of these compiles a program of its own for seconds; tests/sim looks at what they do.
         slow = ("rounded corners", "tilted walls", "etch lag", "roughness")
         quick = [plate for plate in explain_plates.singles() if plate.error not in slow]

@@ -8,13 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fab.errors import InputError
+from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.layout.structures import codes_by_depth
 from fab.levels import Levels, height_of, quantise, quantise_wrapped, wrapped_cells
 from fab.manifest.records import read_manifest
 from fab.masks import level_map_from_planes, planes
-from fab.order.preview import preview_png
 from fab.order.write import write_order
+from fab.plots.masks import plot_masks
 from fab.process import Process
 from fab.rules.check import Rules
 from fab.rules.repair import repair
@@ -215,7 +216,7 @@ def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
 def test_the_picture_of_an_order_takes_heights_from_the_levels():
     level_map = np.arange(64, dtype=np.uint8).reshape(8, 8) % 4
     pictures = {
-        preview_png("x", level_map_from(level_map, levels, 1e-6, 8e-6), (4e-6, 8e-6))
+        png_bytes(plot_masks(level_map_from(level_map, levels, 1e-6, 8e-6), (4e-6, 8e-6)))
         for levels in (UNEVEN, SWAPPED, Levels(4, STEP_M))
     }
     assert len(pictures) == 3

@@ -17,7 +17,7 @@ import pytest
 import doedesign.commands.psf
 import doedesign.optimization
 from doedesign.cli import main
-from fab.files import write_atomic
+from tests.pictures import leave_out_pictures
 
 TINY = """
 name = "tiny"
@@ -137,10 +137,7 @@ def copied(finished: Finished, tmp_path: Path) -> Finished:
 @pytest.fixture
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing takes most of the time of a run this small; write a few bytes instead."""
-    for module in (doedesign.optimization, doedesign.commands.psf):
-        for name in dir(module):
-            if name.startswith("draw_"):
-                monkeypatch.setattr(module, name, lambda path, *_, **__: write_atomic(path, b"picture"))
+    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.commands.psf)
 
 
 @pytest.fixture(scope="session")

@@ -73,7 +73,7 @@ def finished_files(finished, content):
         (doedesign.optimization, "steps"),  # before the first step
         (doedesign.optimization, "save_checkpoint"),  # before the first checkpoint
         (doedesign.optimization, "write_history"),  # between the height maps and the rest
-        (doedesign.optimization, "draw_encircled"),  # among the pictures
+        (doedesign.optimization, "plot_encircled"),  # among the pictures
         (doedesign.optimization, "finish_run"),  # when all is written and nothing is said to be done
     ],
 )
@@ -153,7 +153,7 @@ def test_psf_interrupted_keeps_the_earlier_results(copied, cli, content, monkeyp
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("doedesign.commands.psf.draw_mtf", stop)
+    monkeypatch.setattr("doedesign.commands.psf.plot_mtf", stop)
     assert cli("psf", copied.run, "--masks", copied.order).code == 130
     assert content(copied.run) == before
 

@@ -28,19 +28,22 @@ from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code, main
 from doedesign.commands.train import TrainingSettings, train
 from doedesign.recon.weights import read_network
-from doedesign.report.training import ValidationRow, draw_training, draw_validation
+from doedesign.report.history import plot_training
+from doedesign.report.sheet import ValidationRow, plot_validation
 from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import load_spec
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
-from fab.files import read_json, write_atomic
+from fab.figure import save
+from fab.files import read_json
 from fab.level_map import read_level_map
 from fab.pictures import read_display
 from sim.psf_bank import psf_bank
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
+from tests.pictures import leave_out_pictures
 
 ROOT = Path(__file__).parents[2]
 # One colour, a network without transforms of its own and a loss of two terms compile in the least time.
@@ -122,8 +125,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are looked at in a test of their own; drawing them takes longer than all else."""
-    for name in ("draw_training", "draw_validation"):
-        monkeypatch.setattr(command, name, lambda path, *_: write_atomic(path, b"picture"))
+    leave_out_pictures(monkeypatch, command)
 
 
 def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> tuple[int, str]:
@@ -150,8 +152,7 @@ def whole(run: Path, images: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """A training that was never stopped."""
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("draw_training", "draw_validation"):
-            patch.setattr(command, name, lambda path, *_: write_atomic(path, b"picture"))
+        leave_out_pictures(patch, command)
         code, said = trained(run, out, images)
     assert code == 0, said
     return out
@@ -220,7 +221,7 @@ def test_what_is_finished_stays(run: Path, images: Path, whole: Path):
 
 def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     rows = [ValidationRow(f"{k}.png: 20 dB", *rng.random((3, 3, 300, 200), np.float32)) for k in range(6)]
-    draw_validation(tmp_path / "a.png", rows, "small, step 3", "words " * 30)
+    save(plot_validation(rows, "small, step 3", "words " * 30), tmp_path / "a.png")
     scores = {
         kind: {region: {"psnr": 20.0} for region in ("full", "occluded")} for kind in ("capture", "reconstruction")
     }
@@ -228,15 +229,15 @@ def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
     records: list[dict[str, Any]] = [
         {"step": k, "loss": 1 / (k + 1), "parts": {"l1": 0.5 / (k + 1), "masked": 0.1}} for k in range(200)
     ]
-    draw_training(tmp_path / "b.png", [*records, records[-1] | {"step": 200, "validation": scores}], "small")
-    draw_training(tmp_path / "c.png", records, "small")
+    save(plot_training([*records, records[-1] | {"step": 200, "validation": scores}], "small"), tmp_path / "b.png")
+    save(plot_training(records, "small"), tmp_path / "c.png")
     sizes = [np.asarray(Image.open(tmp_path / name)).shape for name in ("a.png", "b.png", "c.png")]
     # Four rows at most, each half as high again as wide.
     assert sizes[0][0] > 4 * 1.5 * sizes[0][1] / 3 * 0.9
     assert sizes[1] == sizes[2]
     assert (tmp_path / "b.png").read_bytes() != (tmp_path / "c.png").read_bytes()
     with pytest.raises(ValueError, match="at least one step"):
-        draw_training(tmp_path / "d.png", [], "small")
+        plot_training([], "small")
 
 
 def test_the_trained_plate_can_be_drawn(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -314,10 +315,10 @@ def test_stopped_between_steps(
     [
         (command, "spec_to_toml"),  # between the manifest and the spec
         (command, "write_checkpoint"),  # between a line of history and the checkpoint
-        (command, "draw_validation"),
+        (command, "plot_validation"),
         (command, "write_results"),  # when all steps are done
         (doedesign.training.results, "write_network"),  # among the results
-        (command, "draw_training"),
+        (command, "plot_training"),
     ],
 )
 def test_stopped_in_between(
@@ -368,8 +369,9 @@ def slowly(self, state, batch):
     time.sleep(0.3)  # long enough to be told between two lines of history
     return step(self, state, batch)
 Trainer.step = slowly
-for name in ("draw_training", "draw_validation"):
-    setattr(command, name, lambda path, *_: write_atomic(path, b"picture"))
+for name in ("plot_training", "plot_validation"):
+    setattr(command, name, lambda *_: None)
+command.save = lambda _, path: write_atomic(path, b"picture")
 run, out, images = map(Path, sys.argv[1:])
 def say(text):
     print(text, file=sys.stderr)

@@ -1,17 +1,20 @@
 """Pictures of calibrations are whole, repeatable, and show what they are given."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
+from matplotlib.figure import Figure
 
 from doedesign.calibration import Calibration, Explanation, Family, Targets, calibrate, load_shots
 from doedesign.calibration.explanations import Curve
-from doedesign.report.calibration import value_text
-from doedesign.report.pictures import draw_check, draw_estimates, draw_family, draw_fitted_psfs
+from doedesign.report.calibration import plot_check, plot_estimates, plot_fitted_psfs
+from doedesign.report.explanations import plot_explanations
+from doedesign.report.labels import value_text
+from fab.figure import png_bytes
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
+from tests.pictures import dots_of, require_place_of_axes, require_whole
 
 pytestmark = pytest.mark.slow
 
@@ -44,21 +47,22 @@ def family() -> Family:
     )
 
 
-def test_every_picture_is_whole_and_repeatable(result: Calibration, tmp_path: Path):
-    for draw in (draw_fitted_psfs, draw_estimates, draw_check):
-        for name in ("a.png", "b.png"):
-            draw(tmp_path / name, result)
-        assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-        picture = imread(tmp_path / "a.png")[..., :3]
-        assert min(picture.shape[:2]) > 200
-        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
-    draw_family(tmp_path / "f.png", family())
-    draw_family(tmp_path / "none.png", family()._replace(singles=[], pairs=[]))
-    assert imread(tmp_path / "f.png").shape[:2] != (0, 0)
-    assert (tmp_path / "f.png").read_bytes() != (tmp_path / "none.png").read_bytes()
+@pytest.mark.parametrize("plot", [plot_fitted_psfs, plot_estimates, plot_check])
+def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callable[..., Figure]):
+    require_whole(plot(result))
+    assert png_bytes(plot(result)) == png_bytes(plot(result))
+    require_place_of_axes(lambda ax: plot(result, ax))
 
 
-def test_a_difference_is_seen(result: Calibration, tmp_path: Path):
+def test_explanations_are_drawn_also_if_there_are_none():
+    without = family()._replace(singles=[], pairs=[])
+    for one in (family(), without):
+        require_whole(plot_explanations(one))
+        require_place_of_axes(lambda ax, one=one: plot_explanations(one, ax))
+    assert png_bytes(plot_explanations(family())) != png_bytes(plot_explanations(without))
+
+
+def test_a_difference_is_seen(result: Calibration):
     """A bright pixel that the model lacks makes a red dot."""
     at, fit = result.fit.at, result.fit
     spoilt = at.matches[0].residual.copy()
@@ -66,9 +70,8 @@ def test_a_difference_is_seen(result: Calibration, tmp_path: Path):
     spoilt[y, x] = 1e3 / np.sqrt(fit.weights[0][y, x])
     changed = at._replace(matches=(at.matches[0]._replace(residual=spoilt), *at.matches[1:]))
     linear = fit.linearization._replace(at=changed)
-    draw_fitted_psfs(tmp_path / "plain.png", result)
-    draw_fitted_psfs(tmp_path / "spoilt.png", replace(result, fit=fit._replace(linearization=linear)))
-    plain, dotted = (imread(tmp_path / name)[..., :3] for name in ("plain.png", "spoilt.png"))
+    spoilt_result = replace(result, fit=fit._replace(linearization=linear))
+    plain, dotted = (dots_of(plot_fitted_psfs(one)) for one in (result, spoilt_result))
     changed = np.abs(plain - dotted).sum(axis=2) > 0.05
     rows, columns = np.nonzero(changed)
     assert rows.size

@@ -1,11 +1,10 @@
 """The contact sheet: it is drawn, the same each time, and shows what it is given the right way up."""
 
-from pathlib import Path
-
 import numpy as np
-from PIL import Image
 
-from doedesign.report.contact import ContactRow, draw_contact
+from doedesign.report.sheet import ContactRow, plot_contact
+from fab.figure import png_bytes
+from tests.pictures import dots_of, require_place_of_axes, require_whole
 
 
 def row(label: str, side: int = 40) -> ContactRow:
@@ -14,21 +13,23 @@ def row(label: str, side: int = 40) -> ContactRow:
     return ContactRow(label, light, light / 2, 2 * light, ramp, ramp)
 
 
-def test_sheet(tmp_path: Path):
+def test_sheet():
     rows = [row("first"), row("second", 700)]
-    for name in ("a.png", "b.png"):
-        draw_contact(tmp_path / name, rows, "a title", "some words on what it was made with " * 5)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    with Image.open(tmp_path / "a.png") as image:
-        values = np.asarray(image.convert("RGB")).astype(int)
-    red = (values[..., 0] > 180) & (values[..., 1:].max(axis=2) < 90)
-    blue = (values[..., 2] > 180) & (values[..., :2].max(axis=2) < 90)
+
+    def draw():
+        return plot_contact(rows, "a title", "some words on how it was made " * 5)
+
+    require_whole(draw())
+    require_place_of_axes(lambda ax: plot_contact(rows, "a title", "some words on how it was made " * 5, ax))
+    assert png_bytes(draw()) == png_bytes(draw())
+    values = dots_of(draw())
+    red = (values[..., 0] > 0.7) & (values[..., 1:].max(axis=2) < 0.35)
+    blue = (values[..., 2] > 0.7) & (values[..., :2].max(axis=2) < 0.35)
     first = slice(0, values.shape[0] // 2)
     assert np.nonzero(red[first])[0].mean() < np.nonzero(blue[first])[0].mean()  # up is +y
     assert values.shape[1] > 1000
 
 
-def test_many_rows_are_cut(tmp_path: Path):
-    draw_contact(tmp_path / "few.png", [row(str(k), 8) for k in range(12)], "", "")
-    draw_contact(tmp_path / "many.png", [row(str(k), 8) for k in range(30)], "", "")
-    assert (tmp_path / "few.png").read_bytes() == (tmp_path / "many.png").read_bytes()
+def test_many_rows_are_cut():
+    few, many = (plot_contact([row(str(k), 8) for k in range(count)], "", "") for count in (12, 30))
+    assert png_bytes(few) == png_bytes(many)

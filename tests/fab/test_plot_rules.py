@@ -1,23 +1,27 @@
+"""The picture of where masks break the rules."""
+
 import numpy as np
 import pytest
-from PIL import Image
 
-from doedesign.report import rules as picture
-from doedesign.report.rules import draw_rules
+from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.levels import Levels
+from fab.plots import rules as picture
 from fab.rules.check import Rules, check
 from tests.fab.maps import level_map_from
+from tests.pictures import dots_of, require_whole
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)
 RULES = Rules(2 * UM, 2 * UM)
 
 
-def draw(path, level_map, rules=RULES, levels=SIXTEEN, share=1.0):
-    aperture = share * min(level_map.shape) * UM
-    draw_rules(path, check(level_map_from(level_map, levels, UM, aperture), rules), "a set")
-    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+def plot(level, rules=RULES, levels=SIXTEEN):
+    return picture.plot_rules(check(level_map_from(level, levels, UM, min(level.shape) * UM), rules), "a set")
+
+
+def draw(level):
+    return np.rint(255 * dots_of(plot(level))).astype(int)
 
 
 def dots(image, colour) -> int:
@@ -30,26 +34,23 @@ def blank(shape=(64, 64)):
     return np.full(shape, 15, np.uint8)
 
 
-def test_every_kind_of_breach_has_its_colour(tmp_path):
-    clean = draw(tmp_path / "clean.png", blank())
+def test_every_kind_of_breach_has_its_colour():
+    clean = draw(blank())
     line, space = blank(), blank()
     line[20:50, 30] = 14
     space[20:50, 20:40] = 14
     space[20:50, 30] = 15
-    for name, level_map, colour in (
-        ("line", line, picture._NARROW_LINE),
-        ("space", space, picture._NARROW_SPACE),
-    ):
-        image = draw(tmp_path / f"{name}.png", level_map)
+    for level, colour in ((line, picture._NARROW_LINE), (space, picture._NARROW_SPACE)):
+        image = draw(level)
         # The window magnifies a strip of 30 pixels to some ten dots each.
         assert dots(clean, colour) == 0
         assert dots(image, colour) > 30 * 10 * 10
 
 
-def test_one_broken_pixel_of_a_large_plate_is_ringed_in_the_overview(tmp_path):
+def test_one_broken_pixel_of_a_large_plate_is_ringed_in_the_overview():
     level_map = blank((1200, 1200))
     level_map[700, 300] = 14
-    image = draw(tmp_path / "one.png", level_map)
+    image = draw(level_map)
     rows, columns = np.nonzero((np.abs(image - [0x00, 0x72, 0xB2]).max(axis=2) <= 60)[: image.shape[0] // 2])
     # A ring of six points across, thinner than two dots, within the first of four masks.
     assert len(rows) > 12
@@ -90,21 +91,20 @@ def test_the_worst_place_is_inside_the_window_even_at_the_rim():
         level_map[y, x] = 14
         grid = Grid((80, 80), UM)
         found = check(level_map_from(level_map, SIXTEEN, UM, 80 * UM), RULES).planes[0]
-        row, column, side = picture._window(found, grid)
+        rows, columns = picture._window(found, grid)
         assert found.line.narrow == 2
-        assert row <= y < row + side <= 80
-        assert column <= x < column + side <= 80
+        assert rows.start <= y < rows.stop <= 80
+        assert columns.start <= x < columns.stop <= 80
+        assert rows.stop - rows.start == columns.stop - columns.start == 40
 
 
 @pytest.mark.parametrize("levels", [Levels(2, 600e-9), Levels(64, 20e-9)])
 @pytest.mark.parametrize("shape", [(1, 1), (7, 30), (61, 44)])
-def test_any_number_of_masks_and_any_shape(tmp_path, levels, shape):
+def test_any_number_of_masks_and_any_shape(levels, shape):
     level_map = np.random.default_rng(1).integers(0, levels.count, shape).astype(np.uint8)
-    assert draw(tmp_path / "any.png", level_map, levels=levels).size > 0
+    require_whole(plot(level_map, levels=levels))
 
 
-def test_the_same_masks_give_the_same_bytes(tmp_path):
+def test_the_same_masks_give_the_same_bytes():
     level_map = np.random.default_rng(1).integers(0, 16, (50, 50)).astype(np.uint8)
-    for name in ("a.png", "b.png"):
-        draw(tmp_path / name, level_map)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert png_bytes(plot(level_map)) == png_bytes(plot(level_map))

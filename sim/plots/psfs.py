@@ -2,41 +2,27 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.report.canvas import (
-    DPI,
-    LIGHT,
-    SMALL,
-    colour_label,
-    depth_positions,
-    length_text,
-    note,
-    picture,
-    place,
-    shrunk,
-    spread,
-    wavelength_order,
-    wrapped,
-)
+from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, shrunk
 from fab.units import UM
-from sim.camera import Camera, Colour
+from sim.camera import Camera
+from sim.plots.colours import colour_label, depth_positions, wavelength_order
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
+    from matplotlib.figure import FigureBase
 
     from sim.psf_bank import PsfBank
 
+__all__ = ["plot_psfs"]
+
 _MOST_COLUMNS = 6
 _MOST_ROWS = 6
-# Inches: room at the left for the labels of the first column, above for titles, between panels and between groups.
-_LEFT, _ABOVE, _GAP, _BETWEEN = 0.85, 0.3, 0.1, 0.4
 # Below the level that the dimmest fiftieth of the light does not exceed, everything is black.
 _BLACK = 0.02
 
@@ -57,56 +43,59 @@ class _Group(NamedTuple):
     norm: "LogNorm"
 
 
-def draw_psfs(
-    path: str | Path, camera: Camera, bank: "PsfBank", near_m: Sequence[float], far_m: Sequence[float]
-) -> None:
+def plot_psfs(
+    bank: "PsfBank", camera: Camera, near_m: Sequence[float], far_m: Sequence[float], ax: "Axes | None" = None
+) -> "FigureBase":
     """Draw the PSFs of a bank: a row per colour, near depths on the left and far ones on the right.
 
     Energies are shown on a logarithmic scale, one for the near and one for the far columns. Three colours make a
     last row in which they stand together. Of more than six depths, or six colours, an even choice is shown.
 
     Args:
-        path: the PNG file.
-        camera: the camera of the bank.
         bank: the PSFs.
+        camera: the camera of the bank.
         near_m: depths of the bank to show as near, metres; may be empty.
         far_m: depths of the bank to show as far, metres; may be empty.
+        ax: axes whose place the picture takes; a new figure by default.
 
     Raises:
         ValueError: no depth is given, or one is not in the bank.
-        InputError: the system refuses the path.
     """
-    shown = {name: _positions(bank, name, near_m, far_m) for name in ("near", "far")}
-    columns = sum(len(depths) for depths in shown.values())
+    most = _MOST_COLUMNS if len(near_m) + len(far_m) <= _MOST_COLUMNS else _MOST_COLUMNS // 2
+    shown = {
+        name: depth_positions(bank.depths_m, depths, most)
+        for name, depths in (("near", near_m), ("far", far_m))
+        if len(depths)
+    }
+    columns = sum(map(len, shown.values()))
     if columns == 0:
         raise ValueError("`near_m` and `far_m` must hold at least one depth, but both are empty")
-    rows = [[i] for i in spread(len(camera.colours), _MOST_ROWS)]
+    rows = [[i] for i in evenly_spaced(len(camera.colours), _MOST_ROWS)]
     if len(camera.colours) == 3:
         rows.append(wavelength_order(camera.colours))
-    # Sides of whole dots, so that one sample is one dot where the window is finer than the picture.
-    side = round(DPI * min(max(10.0 / columns, 1.6), 3.2)) / DPI
-    groups = [_group(bank, name, depths, round(DPI * side)) for name, depths in shown.items() if depths]
-    width = max(_LEFT + columns * (side + _GAP) + _BETWEEN * (len(groups) - 1) + 0.1, 4.5)
-    words = wrapped(_notes(camera, bank, shown), width - 0.3)
-    below = 1.25 + 0.15 * (words.count("\n") + 1)
-    with picture(path, (width, below + len(rows) * (side + _GAP) + _ABOVE)) as figure:
-        left = _LEFT
+    side = min(max(10.0 / columns, 1.6), 3.2)
+    groups = [_group(bank, name, depths, round(DPI * side)) for name, depths in shown.items()]
+    # An empty column keeps the groups apart.
+    widths = [1.0] * len(groups[0].depths) + ([0.15] + [1.0] * len(groups[1].depths) if groups[1:] else [])
+    size = (max(0.9 + sum(widths) * (side + 0.1), 4.5), 1.3 + len(rows) * (side + 0.1))
+    with panels(ax, size, note=_notes(camera, bank, shown), layout="compressed") as figure:
+        grid = figure.subplots(len(rows), len(widths), sharex=True, sharey=True, squeeze=False, width_ratios=widths)
+        first = 0
         for group in groups:
-            _draw_group(figure, (left, below, side), camera, bank, group, rows)
-            across = len(group.depths) * (side + _GAP)
-            _colour_bar(figure, group, (left, below - 0.62, min(across - _GAP, 5.0)))
-            left += across + _BETWEEN
-        note(figure, 0.15, 0.1, words)
-
-
-def _positions(bank: "PsfBank", name: str, near_m: Sequence[float], far_m: Sequence[float]) -> list[int]:
-    """Positions in the bank of the depths to show as near or as far."""
-    most = _MOST_COLUMNS if len(near_m) + len(far_m) <= _MOST_COLUMNS else _MOST_COLUMNS // 2
-    return depth_positions(bank, near_m if name == "near" else far_m, most)
+            panes = grid[:, first : first + len(group.depths)]
+            _draw_group(figure, panes, camera, bank, group, rows)
+            first += len(group.depths) + 1
+        for spare in grid[:, len(groups[0].depths) : first - 1 - len(groups[-1].depths)].flat:
+            spare.set_axis_off()
+        for axes, picked in zip(grid[:, 0], rows, strict=True):
+            name = colour_label(camera.colours[picked[0]]) if len(picked) == 1 else "together"
+            axes.set_ylabel(f"{name}\ny (µm)")
+        grid[0, 0].locator_params(nbins=3, steps=[1, 2, 5, 10])
+    return figure
 
 
 def _group(bank: "PsfBank", name: str, depths: list[int], dots: int) -> _Group:
-    energy = bank.energy[:, depths]
+    energy = np.asarray(bank.energy)[:, depths]
     images = np.stack([[shrunk(image, dots) for image in row] for row in energy])
     return _Group(name, depths, images, _scale(images, float(energy.max())))
 
@@ -141,66 +130,45 @@ def _shade(images: Float[np.ndarray, "w v u"], group: _Group) -> np.ndarray:
 
 
 def _draw_group(
-    figure: "Figure",
-    box_in: tuple[float, float, float],
-    camera: Camera,
-    bank: "PsfBank",
-    group: _Group,
-    rows: list[list[int]],
+    figure: "FigureBase", panes: np.ndarray, camera: Camera, bank: "PsfBank", group: _Group, rows: list[list[int]]
 ) -> None:
-    """Draw the columns of a group; the box is left and bottom of the lowest left panel, and a panel's side."""
-    left, bottom, side = box_in
+    """Draw the columns of a group and its colour scale."""
+    from matplotlib.cm import ScalarMappable
+
     for column, depth in enumerate(group.depths):
         for row, picked in enumerate(rows):
-            box = (left + column * (side + _GAP), bottom + (len(rows) - 1 - row) * (side + _GAP), side)
-            axes = _draw_panel(figure, box, camera, bank, group, column, picked)
-            first = column == 0 and left == _LEFT
-            _tick(axes, first=first, last=row == len(rows) - 1)
-            if first:
-                name = colour_label(camera.colours[picked[0]]) if len(picked) == 1 else "together"
-                axes.set_ylabel(f"{name}\ny (µm)", labelpad=1)
-            if row == 0:
-                axes.set_title(f"{group.name}, {length_text(bank.depths_m[depth])}")
+            _draw_panel(panes[row, column], camera, bank, group, column, picked)
+        panes[0, column].set_title(f"{group.name}, {length_text(bank.depths_m[depth])}")
+        panes[-1, column].set_xlabel("x (µm)")
+    scale = ScalarMappable(group.norm, LIGHT)
+    bar = figure.colorbar(scale, ax=panes.ravel().tolist(), location="bottom", aspect=20 * len(group.depths))
+    bar.set_label(f"{group.name}: share of light per pixel")
+    bar.ax.minorticks_off()
 
 
-def _draw_panel(
-    figure: "Figure",
-    box_in: tuple[float, float, float],
-    camera: Camera,
-    bank: "PsfBank",
-    group: _Group,
-    column: int,
-    picked: list[int],
-) -> "Axes":
-    """Draw one depth in one colour, or in three, into a square given by left, bottom and side in inches."""
-    left, bottom, side = box_in
-    axes = place(figure, left, bottom, side, side)
-    half_um = bank.energy.shape[-1] * bank.pixel_m / UM / 2
-    _show(axes, _shade(group.images[picked, column], group), half_um)
+def _draw_panel(axes: "Axes", camera: Camera, bank: "PsfBank", group: _Group, column: int, picked: list[int]) -> None:
+    """Draw one depth in one colour, or in three."""
+    _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m)
     depth = group.depths[column]
     disc_m = camera.defocus_radius_m(bank.depths_m[depth])
     if disc_m > _least_disc_m(bank):
         _circle(axes, disc_m, "--")
-    shares = {"window": float(bank.energy[picked[0], depth].sum(dtype=np.float64))}
+    shares = {"window": float(np.asarray(bank.energy)[picked[0], depth].sum(dtype=np.float64))}
     if group.name == "far":
-        part = min(0.42 * side, 0.85)
-        inset = place(figure, left + side - part - 0.04, bottom + side - part - 0.04, part, part)
-        middle = _middle(bank.energy[picked, depth], _inset_pixels(camera, bank))
-        _show(inset, _shade(middle, group), middle.shape[-1] * bank.pixel_m / UM / 2)
-        radius_m = _spot_radius_m(camera, camera.colours[picked[0]])
+        inset = axes.inset_axes((0.62, 0.62, 0.36, 0.36))
+        middle = _middle(np.asarray(bank.energy)[picked, depth], _inset_pixels(camera, bank))
+        _show(inset, _shade(middle, group), middle.shape[-2:], bank.pixel_m)
+        radius_m = _spot_radius_m(camera, picked[0])
         _circle(inset, radius_m, ":")
-        inset.set_xticks([])
-        inset.set_yticks([])
-        for spine in inset.spines.values():
-            spine.set_color("white")
+        bare(inset)
+        inset.spines[:].set_color("white")
         shares["spot"] = _energy_within(middle[0], bank.pixel_m, radius_m)
     if len(picked) == 1:
         _write(axes, "\n".join(f"{name} {100 * share:.1f} %" for name, share in shares.items()))
-    return axes
 
 
-def _show(axes: "Axes", shades: np.ndarray, half_um: float) -> None:
-    axes.imshow(shades, origin="lower", extent=(-half_um, half_um, -half_um, half_um), interpolation="auto")
+def _show(axes: "Axes", shades: np.ndarray, shape: tuple[int, ...], pixel_m: float) -> None:
+    axes.imshow(shades, origin="lower", extent=extent_of(shape, pixel_m, UM), interpolation="auto")
 
 
 def _circle(axes: "Axes", radius_m: float, line: str) -> None:
@@ -217,10 +185,10 @@ def _write(axes: "Axes", words: str) -> None:
     axes.text(0.03, 0.03, words, transform=axes.transAxes, color="white", fontsize=SMALL, path_effects=rim, va="bottom")
 
 
-def _spot_radius_m(camera: Camera, colour: Colour) -> float:
+def _spot_radius_m(camera: Camera, colour: int) -> float:
     from sim.metrics import mean_wavelength_m, spot_radius_m
 
-    return spot_radius_m(camera, mean_wavelength_m(colour))
+    return spot_radius_m(camera, mean_wavelength_m(camera.colours[colour]))
 
 
 def _energy_within(psf: Float[np.ndarray, "y x"], pixel_m: float, radius_m: float) -> float:
@@ -231,7 +199,7 @@ def _energy_within(psf: Float[np.ndarray, "y x"], pixel_m: float, radius_m: floa
 
 def _inset_pixels(camera: Camera, bank: "PsfBank") -> int:
     """Pixels on each side of the centre that the inset shows: three radii of the largest far spot."""
-    radius = max(_spot_radius_m(camera, colour) for colour in camera.colours)
+    radius = max(_spot_radius_m(camera, i) for i in range(len(camera.colours)))
     return min(math.ceil(3 * radius / bank.pixel_m), bank.energy.shape[-1] // 2)
 
 
@@ -242,39 +210,18 @@ def _middle(energy: Float[np.ndarray, "w y x"], pixels: int) -> Float[np.ndarray
     return energy[:, cut, cut]
 
 
-def _tick(axes: "Axes", *, first: bool, last: bool) -> None:
-    """Numbers only along the left and the lower border of the whole."""
-    from matplotlib.ticker import MaxNLocator
-
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
-    axes.tick_params(labelbottom=last, labelleft=first, length=2.5, pad=2)
-    if last:
-        axes.set_xlabel("x (µm)", labelpad=1)
-
-
-def _colour_bar(figure: "Figure", group: _Group, box_in: tuple[float, float, float]) -> None:
-    """Draw the scale of a group; the box is left, bottom and width."""
-    from matplotlib.cm import ScalarMappable
-
-    axes = place(figure, *box_in, 0.12)
-    bar = figure.colorbar(ScalarMappable(group.norm, LIGHT), cax=axes, orientation="horizontal")
-    bar.set_label(f"{group.name}: share of light per pixel", labelpad=1)
-    bar.ax.minorticks_off()
-
-
 def _least_disc_m(bank: "PsfBank") -> float:
     """Radius below which a circle would hide what it surrounds, or not be seen at all."""
     return bank.energy.shape[-1] * bank.pixel_m / 80
 
 
 def _notes(camera: Camera, bank: "PsfBank", shown: dict[str, list[int]]) -> str:
-    """What the marks in the panels mean."""
+    """Meaning of the marks in the panels."""
     words = []
     depths = [bank.depths_m[i] for positions in shown.values() for i in positions]
     if any(camera.defocus_radius_m(depth) > _least_disc_m(bank) for depth in depths):
         words.append("dashed: geometric defocus disc")
-    if shown["far"]:
+    if "far" in shown:
         width = 2 * _inset_pixels(camera, bank) + bank.energy.shape[-1] % 2
         words.append(f"inset: central {length_text(width * bank.pixel_m)}")
         words.append("dotted: far spot (first dark ring + 1 pixel)")

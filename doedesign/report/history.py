@@ -1,0 +1,116 @@
+"""Loss curves: the history of an optimisation and of a training."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fab.figure import INK, SERIES, panels, single
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+__all__ = ["plot_history", "plot_training"]
+
+
+def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None) -> "Axes":
+    """Draw the loss of an optimisation and its terms over the steps.
+
+    A long history is drawn faintly under its running mean, since every step sees another depth.
+
+    Args:
+        records: one per step with "step", "loss", "terms" (values, not weighted) and "names" (of the terms).
+        ax: axes to draw on; those of a new figure by default.
+
+    Raises:
+        ValueError: no records.
+    """
+    steps = _steps(records)
+    values = np.array([[record["loss"], *record["terms"]] for record in records], dtype=np.float64)
+    # A user's objective is named "module:function".
+    labels = ["loss", *(name.rpartition(":")[2][:22] for name in records[0]["names"])]
+    # A only term is the loss.
+    series = {
+        label: column
+        for i, (label, column) in enumerate(zip(labels, values.T, strict=True))
+        if i == 0 or not np.allclose(column, values[:, 0])
+    }
+    with single(ax, (6.6, 3.4)) as axes:
+        window = _plot_series(axes, steps, series, faint=True)
+        if values.min() > 0 and values.max() > 30 * values.min():
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=min(0.0, float(values.min())))
+        axes.set_xlabel(f"step (running mean of {window})" if window > 1 else "step")
+        axes.set_ylabel("loss and its terms without weights")
+        axes.grid(True)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
+    return axes
+
+
+def plot_training(records: Sequence[Mapping[str, Any]], title: str = "", ax: "Axes | None" = None) -> "FigureBase":
+    """Draw the loss and its parts over the steps, and beside them the PSNR on scenes that were not trained on.
+
+    Every step sees another scene, so the loss is drawn as a running mean.
+
+    Args:
+        records: lines of the history (`doedesign.training.history`) with "step", "loss", "parts" and, at some,
+            "validation".
+        title: a line above the picture.
+        ax: axes whose place the picture takes; a new figure by default.
+
+    Raises:
+        ValueError: no records.
+    """
+    steps = _steps(records)
+    series = {"loss": np.array([record["loss"] for record in records], np.float64)}
+    for name in records[0]["parts"]:
+        values = np.array([record["parts"].get(name, np.nan) for record in records], np.float64)
+        if np.any(values != 0):  # a term without weight is not computed
+            series[name] = values
+    with panels(ax, (8.4, 4.0), title) as figure:
+        left, right = figure.subplots(1, 2)
+        window = _plot_series(left, steps, series)
+        left.set_ylim(bottom=0)
+        left.set_ylabel(f"loss and its parts (mean of {window})" if window > 1 else "loss and its parts")
+        _plot_scores(right, [record for record in records if record.get("validation")])
+        margin = 0.03 * len(steps)
+        for axes in (left, right):
+            # The same steps in both, however few validations there were.
+            axes.set_xlim(steps[0] - margin, steps[-1] + 1 + margin)
+            axes.grid(True)
+            axes.set_xlabel("step")
+            # Above the panel, so that no line hides behind the names.
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.01), borderaxespad=0.0, ncols=2)
+    return figure
+
+
+def _steps(records: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    if not records:
+        raise ValueError("`records` must hold at least one step, but is empty")
+    return np.array([record["step"] for record in records])
+
+
+def _plot_series(axes: "Axes", steps: np.ndarray, series: Mapping[str, np.ndarray], *, faint: bool = False) -> int:
+    """Plot running means, the first bold, over the values themselves if `faint`; return the steps of a mean."""
+    window = max(1, len(steps) // 60)
+    middle = slice((window - 1) // 2, len(steps) - window // 2)
+    for k, (label, values) in enumerate(series.items()):
+        style: dict[str, Any] = {"color": INK if k == 0 else SERIES[(k - 1) % len(SERIES)], "zorder": 3 - (k > 0)}
+        if faint and window > 1:
+            axes.plot(steps, values, **style, alpha=0.35, lw=0.8)
+        mean = np.convolve(values, np.full(window, 1 / window), mode="valid")
+        axes.plot(steps[middle], mean, **style, lw=2.0 if k == 0 else 1.4, label=label)
+    return window
+
+
+def _plot_scores(axes: "Axes", validations: Sequence[Mapping[str, Any]]) -> None:
+    """PSNR by region: the network's solid, the capture's dashed."""
+    steps = [one["step"] + 1 for one in validations]
+    for k, region in enumerate(("occluded", "full")):
+        for which, style in (("reconstruction", "-"), ("capture", "--")):
+            values = [one["validation"][which][region]["psnr"] for one in validations]
+            numbers = [np.nan if value is None else value for value in values]
+            axes.plot(steps, numbers, style, marker=".", ms=4, color=SERIES[k], label=f"{which}, {region}")
+    axes.set_ylabel("PSNR on held-out pictures (dB)")

@@ -1,0 +1,138 @@
+"""Pictures of marks and test structures: all masks over each other, and what the operator of an aligner sees."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fab.figure import CHROME, SERIES, single
+from fab.layout.geometry import Layer
+from fab.layout.part import Part, Photomask
+from fab.units import UM
+
+if TYPE_CHECKING:
+    from klayout import db
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_part", "plot_through_mask"]
+
+_ZERO = "#5b3a1e"
+_GLASS = "#f4f7fa"
+_MASK = "#2b2d31"
+_WIDTH_IN = 9.0
+
+# x0, y0, x1, y1
+_Box = tuple[float, float, float, float]
+
+
+def plot_part(
+    part: Part, masks: Sequence[Photomask], title: str = "", window_m: _Box | None = None, ax: "Axes | None" = None
+) -> "Axes":
+    """Draw all masks of a part over each other, each in its colour, as in the drawing (polygons filled).
+
+    Args:
+        part: marks or test structures.
+        masks: the photomasks, for the legend, in the order in which they are used.
+        title: a line above the picture.
+        window_m: x0, y0, x1, y1 of what is shown, metres; all by default.
+        ax: axes to draw on; those of a new figure by default.
+    """
+    from matplotlib.patches import Patch
+
+    window = _window_um(part, window_m)
+    height = _WIDTH_IN * (window[3] - window[1]) / (window[2] - window[0])
+    with single(ax, (_WIDTH_IN + 0.8, height + 1.1), title) as axes:
+        for layer in part.shapes:
+            _fill(axes, _cut(part, [layer], window), part.dbu_m, _colour(layer, masks), alpha=0.6)
+        keys = [Patch(color=_colour(mask.on(1), masks), alpha=0.6, label=mask.name) for mask in masks]
+        _finish(axes, window, keys)
+    return axes
+
+
+def plot_through_mask(
+    part: Part, first: Photomask, mask: Photomask, title: str = "", name: str = "finder", ax: "Axes | None" = None
+) -> "Axes":
+    """Draw what a microscope shows through a photomask on the wafer, around the mask's own place in a part.
+
+    Args:
+        part: an alignment site.
+        first: the photomask that made the marks on the wafer; they are coloured.
+        mask: the photomask that lies on the wafer; its chrome hides the wafer.
+        title: a line above the picture.
+        name: which mark is in the middle.
+        ax: axes to draw on; those of a new figure by default.
+    """
+    from matplotlib.patches import Patch
+
+    x, y = part.places[f"{name}, {mask.name}"]
+    window = (x / UM - 340, y / UM - 740, x / UM + 640, y / UM + 340)
+    with single(ax, (6.4, 7.3), title) as axes:
+        wafer, drawn = (_cut(part, [a for a in part.shapes if a.number == p.layer], window) for p in (first, mask))
+        colour = _colour(first.on(1), (first,))
+        _fill(axes, wafer, part.dbu_m, colour)
+        chrome = drawn if mask.tone == "dark" else _everything(part, window) - drawn
+        _fill(axes, chrome, part.dbu_m, _MASK, alpha=0.88)
+        keys = [
+            Patch(color=_MASK, alpha=0.88, label=f"chrome of {mask.name}"),
+            Patch(color=colour, label=f"wafer, {first.name}"),
+        ]
+        _finish(axes, window, keys)
+    return axes
+
+
+def _colour(layer: Layer, masks: Sequence[Photomask]) -> str:
+    mask = next(mask for mask in masks if mask.layer == layer.number)
+    if mask.bit is not None:
+        return SERIES[mask.bit % len(SERIES)]
+    return _ZERO if mask.makes == "zero layer" else CHROME
+
+
+def _fill(axes: "Axes", drawn: "db.Region", dbu_m: float, colour: str, alpha: float = 1.0) -> None:
+    """Fill what is drawn as one outline with holes, since boxes that touch would show hairlines between them."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    outlines = []
+    for polygon in drawn.merged().each():
+        loops = [polygon.each_point_hull(), *(polygon.each_point_hole(n) for n in range(polygon.holes()))]
+        for loop in loops:
+            points = np.array([(point.x, point.y) for point in loop]) * (dbu_m / UM)
+            outlines.append(Outline(np.concatenate([points, points[:1]]), closed=True))
+    if outlines:
+        whole = Outline.make_compound_path(*outlines)
+        axes.add_patch(PathPatch(whole, facecolor=colour, linewidth=0, alpha=alpha, snap=False))
+
+
+def _cut(part: Part, layers: Sequence[Layer], window_um: _Box) -> "db.Region":
+    """Return what some layers hold as far as it lies in a window."""
+    from klayout import db
+
+    drawn = db.Region()
+    for shapes in (part.shapes[layer] for layer in layers):
+        for box in shapes.rectangles.tolist():
+            drawn.insert(db.Box(*box))
+        for polygon in shapes.polygons:
+            drawn.insert(db.Polygon([db.Point(x, y) for x, y in polygon.tolist()]))
+    return drawn & _everything(part, window_um)
+
+
+def _everything(part: Part, window_um: _Box) -> "db.Region":
+    from klayout import db
+
+    return db.Region(db.Box(*(round(edge * UM / part.dbu_m) for edge in window_um)))
+
+
+def _window_um(part: Part, window_m: _Box | None) -> _Box:
+    if window_m is not None:
+        x0, y0, x1, y1 = (edge / UM for edge in window_m)
+        return x0, y0, x1, y1
+    x0, y0, x1, y1 = (edge * part.dbu_m / UM for edge in part.box)
+    margin = 0.02 * max(x1 - x0, y1 - y0)
+    return x0 - margin, y0 - margin, x1 + margin, y1 + margin
+
+
+def _finish(axes: "Axes", window_um: _Box, keys: Sequence[object]) -> None:
+    """Set the view, the labels, and a legend above the panel."""
+    x0, y0, x1, y1 = window_um
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", facecolor=_GLASS, xlabel="x (µm)", ylabel="y (µm)")
+    axes.legend(handles=keys, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(keys), borderaxespad=0.2)

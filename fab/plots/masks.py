@@ -1,0 +1,101 @@
+"""The picture of a mask set: what a person looks at before the files go out.
+
+Overviews show the mean over parts of the map, since its pixels are finer than those of the picture; the windows show
+single pixels. Up is +y, as in the drawing.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
+from fab.level_map import LevelMap
+from fab.plots.maps import Window, box_mm, frame_window, window_around
+from fab.units import MM, NM, UM, format_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+__all__ = ["plot_masks"]
+
+_MOST = 560
+_WINDOW = 48
+_GLASS, _ETCHED = "#eef3f7", "#14507a"
+_SIDE_IN = 2.7
+
+
+def plot_masks(
+    level_map: LevelMap, chrome_m: tuple[float, float], title: str = "", ax: "Axes | None" = None
+) -> "FigureBase":
+    """Draw a mask set: heights, chrome, and every etch mask as a whole and through a window.
+
+    Args:
+        level_map: the DOE.
+        chrome_m: radius of the chrome's opening and its outer radius, metres.
+        title: a line above the picture.
+        ax: axes whose place the picture takes; a new figure by default.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    levels, grid = level_map.levels, level_map.grid
+    # On the x axis, halfway between the centre and the right edge.
+    window = window_around(grid, 0.0, grid.extent_m[1] / 4, _WINDOW)
+    columns = max(3, levels.bits)
+    upper_in, lower_in = _SIDE_IN * columns / 3 + 0.4, 2 * _SIDE_IN + 0.9
+    with panels(ax, (_SIDE_IN * columns + 0.3, upper_in + lower_in + 0.4), title) as figure:
+        above, below = figure.subfigures(2, 1, height_ratios=(upper_in, lower_in))
+        heights, detail, chrome = above.subplots(1, 3)
+        _draw_heights(above, heights, detail, level_map, window)
+        _draw_chrome(chrome, level_map, chrome_m)
+        style = {"cmap": LinearSegmentedColormap.from_list("etch", [_GLASS, _ETCHED]), "vmin": 0, "vmax": 1}
+        panes = below.subplots(2, columns, squeeze=False)
+        for bit, plane in enumerate(level_map.planes()):
+            depth = format_length(levels.etch_depth_m(bit))
+            words = f"mask {bit + 1}: etches {depth}\nwhere blue, {100 * np.count_nonzero(plane) / plane.size:.1f} %"
+            _show(panes[0, bit], shrunk(plane, _MOST), box_mm(grid), words, **style)
+            _show(panes[1, bit], plane[window], box_mm(grid, window), f"mask {bit + 1}, window", **style)
+        for spare in panes[:, levels.bits :].flat:
+            spare.set_axis_off()
+    return figure
+
+
+def _show(axes: "Axes", values: NDArray[Any], box: tuple[float, float, float, float], title: str, **style: Any) -> Any:
+    image = axes.imshow(values, origin="lower", extent=box, interpolation="nearest", **style)
+    axes.set_title(title)
+    scale_bar(axes, (box[1] - box[0]) * MM)
+    return image
+
+
+def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map: LevelMap, window: Window) -> None:
+    """Draw heights as a whole and through the window, with one colour scale."""
+    levels, grid = level_map.levels, level_map.grid
+    stairs_nm = levels.by_height()[1] / NM
+    half = levels.step_m / NM / 2
+    style = {"cmap": HEIGHTS, "vmin": -half, "vmax": float(stairs_nm[-1]) + half}
+    heights_nm = level_map.height_m / np.float32(NM)
+    ny, nx = grid.shape
+    words = f"height: {nx} × {ny} pixels of {grid.pitch_m / UM:.6g} µm"
+    _show(whole, shrunk(heights_nm, _MOST), box_mm(grid), words, **style)
+    frame_window(whole, grid, window)
+    image = _show(detail, heights_nm[window], box_mm(grid, window), "height, the window framed in red", **style)
+    bar = figure.colorbar(image, cax=detail.inset_axes((1.03, 0, 0.05, 1)))
+    bar.set_ticks(stairs_nm[:: max(1, levels.count // 16)].tolist())
+    bar.set_label("height above the deepest floor (nm)")
+
+
+def _draw_chrome(axes: "Axes", level_map: LevelMap, radii_m: tuple[float, float]) -> None:
+    from matplotlib.patches import Circle
+
+    inner, outer = (radius / MM for radius in radii_m)
+    axes.add_patch(Circle((0, 0), outer, color=CHROME, lw=0))
+    axes.add_patch(Circle((0, 0), inner, color=_GLASS, lw=0))
+    aperture_m = min(level_map.aperture_m, math.hypot(*level_map.grid.extent_m))
+    axes.add_patch(Circle((0, 0), aperture_m / 2 / MM, fill=False, ec=MARK, lw=0.8, ls="--"))
+    x0, x1, y0, y1 = box_mm(level_map.grid)
+    axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=INK, lw=0.8)
+    axes.set(xlim=(-1.03 * outer, 1.03 * outer), ylim=(-1.03 * outer, 1.03 * outer), aspect="equal")
+    axes.set_title(f"chrome: opening {2 * inner:.6g} mm,\nclear aperture {aperture_m / MM:.6g} mm (dashed)")
+    scale_bar(axes, 2.06 * outer * MM)

@@ -1,0 +1,176 @@
+"""Curves over colours and depths: MTF and encircled energy of a PSF bank beside the plain lens.
+
+One small panel per depth, far depths above and near ones below, with a line per colour: solid for the DOE, dashed for
+the lens alone.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fab.figure import FAINT, INK, evenly_spaced, length_text, panels
+from fab.units import MM, UM
+from sim.camera import Camera
+from sim.plots.colours import colour_label, depth_positions, line_colours
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+    from matplotlib.lines import Line2D
+
+    from sim.psf_bank import PsfBank
+    from sim.transfer import TransferBank
+
+__all__ = ["plot_encircled", "plot_mtf"]
+
+_MOST_DEPTHS = 3
+_MOST_COLOURS = 6
+_RADII = 96
+_LENS: dict[str, Any] = {"ls": "--", "lw": 0.9}
+
+# Values of every colour and depth, `[w, d, x]`, and the depths.
+_Curves = tuple[Float[np.ndarray, "w d x"], Sequence[float]]
+# Draws the marks of (panel, position of a depth in the bank, "near" or "far").
+_Finish = Callable[["Axes", int, str], None]
+
+
+def plot_mtf(
+    transfer: "TransferBank",
+    camera: Camera,
+    near_m: Sequence[float],
+    far_m: Sequence[float],
+    lens: "TransferBank | None" = None,
+    ax: "Axes | None" = None,
+) -> "FigureBase":
+    """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
+
+    Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of
+    more than three near or far depths, and of more than six colours, an even choice is shown.
+
+    Args:
+        transfer: MTF of lens, DOE and pixel.
+        camera: colours.
+        near_m: near depths to show, metres; may be empty.
+        far_m: far depths to show, metres; may be empty.
+        lens: MTF of the plain lens and pixel at the same depths, dashed.
+        ax: axes whose place the picture takes; a new figure by default.
+
+    Raises:
+        ValueError: no depth is given, or one is not in a bank.
+    """
+    frequencies = transfer.frequencies_per_m * MM
+
+    def finish(axes: "Axes", _: int, group: str) -> None:
+        if group == "near":
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_xlim(frequencies[1] if group == "near" else 0, frequencies[-1])
+
+    both = [(transfer.transfer, transfer.depths_m)] + ([(lens.transfer, lens.depths_m)] if lens is not None else [])
+    words = ("frequency along x (cycles/mm)", "MTF")
+    note = "lens, plate and pixel before sampling; all light counts, also beyond the window"
+    return _plot_curves(camera, frequencies, both, (near_m, far_m), finish, words, note, ax)
+
+
+def plot_encircled(
+    bank: "PsfBank",
+    camera: Camera,
+    near_m: Sequence[float],
+    far_m: Sequence[float],
+    lens: "PsfBank | None" = None,
+    ax: "Axes | None" = None,
+) -> "FigureBase":
+    """Draw the share of the incident light inside centred circles of growing radius.
+
+    Dotted lines stand at the radius of the geometric defocus disc of near depths, and of the far spot of far ones.
+
+    Args:
+        bank: PSFs with the DOE.
+        camera: optics of the bank.
+        near_m: near depths of the bank, metres; may be empty.
+        far_m: far depths of the bank, metres; may be empty.
+        lens: PSFs of the plain lens at the same depths, dashed.
+        ax: axes whose place the picture takes; a new figure by default.
+
+    Raises:
+        ValueError: no depth is given, or one is not in a bank.
+    """
+    from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
+
+    hues = line_colours(camera.colours)
+    radii = bank.pixel_m * np.geomspace(1.0, bank.energy.shape[-1] / np.sqrt(2), _RADII)
+    both = [
+        (encircled_energy(np.asarray(one.energy), one.pixel_m, radii), one.depths_m)
+        for one in (bank, lens)
+        if one is not None
+    ]
+
+    def finish(axes: "Axes", depth: int, group: str) -> None:
+        lines = [(camera.defocus_radius_m(bank.depths_m[depth]), FAINT)]
+        if group == "far":
+            lines = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
+        for radius, hue in lines:
+            axes.axvline(radius / UM, color=hue, ls=":", lw=1.0)
+        axes.set_xscale("log")
+        axes.set_xlim(radii[0] / UM, radii[-1] / UM)
+        axes.xaxis.set_major_formatter("{x:g}")
+
+    marks = [*(["far spot (far)"] if far_m else []), *(["geometric defocus disc (near)"] if near_m else [])]
+    note = "dotted: " + ", ".join(marks)
+    words = ("radius (µm)", "encircled energy")
+    return _plot_curves(camera, radii / UM, both, (near_m, far_m), finish, words, note, ax)
+
+
+def _shown(camera: Camera) -> list[int]:
+    return evenly_spaced(len(camera.colours), _MOST_COLOURS)
+
+
+def _plot_curves(
+    camera: Camera,
+    x: Float[np.ndarray, " x"],
+    both: Sequence[_Curves],
+    depths_m: tuple[Sequence[float], Sequence[float]],
+    finish: _Finish,
+    words: tuple[str, str],
+    note: str,
+    ax: "Axes | None",
+) -> "FigureBase":
+    """Draw a row of panels per group of depths (near, far), curves of the DOE over those of the lens if there are two.
+
+    `words` name the two axes.
+    """
+    named = {"far": depths_m[1], "near": depths_m[0]}
+    groups = {name: depth_positions(both[0][1], depths, _MOST_DEPTHS) for name, depths in named.items() if len(depths)}
+    if not groups:
+        raise ValueError("`near_m` and `far_m` must hold at least one depth, but both are empty")
+    hues = line_colours(camera.colours)
+    columns = max(map(len, groups.values()))
+    with panels(ax, (max(0.7 + 2.8 * columns, 5.4), 2.45 * len(groups) + 0.6), note=note) as figure:
+        grid = figure.subplots(len(groups), columns, sharey=True, squeeze=False)
+        for panes, (name, depths) in zip(grid, groups.items(), strict=True):
+            for axes, depth in zip(panes, depths, strict=False):
+                for (curves, of_m), style in reversed(list(zip(both, ({"lw": 1.2}, _LENS), strict=False))):
+                    at = depth_positions(of_m, [both[0][1][depth]], 1)[0]
+                    for colour in _shown(camera):
+                        axes.plot(x, curves[colour, at], color=hues[colour], **style)
+                finish(axes, depth, name)
+                axes.grid(True)
+                axes.set_title(f"{name}, {length_text(both[0][1][depth])}")
+                axes.set_xlabel(words[0])
+            for spare in panes[len(depths) :]:
+                spare.set_axis_off()
+            panes[0].set_ylabel(words[1])
+        grid[0, 0].set_ylim(0, 1.02)
+        keys = _keys(camera, len(both) > 1)
+        figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), borderpad=0.0)
+    return figure
+
+
+def _keys(camera: Camera, with_lens: bool) -> "list[Line2D]":
+    from matplotlib.lines import Line2D
+
+    hues = line_colours(camera.colours)
+    lines = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
+    return [*lines, *([Line2D([], [], color=INK, **_LENS, label="lens alone")] if with_lens else [])]

@@ -1,0 +1,67 @@
+"""The picture of a pattern: the target beside the achieved light."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from fab.figure import DPI, LIGHT, extent_of, panels, shrunk
+from fab.units import UM
+from sim.camera import Camera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+__all__ = ["plot_pattern"]
+
+_SIDE = 3.2
+
+
+def plot_pattern(
+    target: Float[np.ndarray, "y x"],
+    achieved: Float[np.ndarray, "v u"],
+    camera: Camera,
+    *,
+    efficiency: float,
+    uniformity: float,
+    ax: "Axes | None" = None,
+) -> "FigureBase":
+    """Draw a target pattern and the PSF that should equal it, on one colour scale.
+
+    Colours follow the square root of the energy, so that ghosts of one per cent show.
+
+    Args:
+        target: `[y, x]` wanted share of the incident light per pixel.
+        achieved: `[y, x]` achieved share.
+        camera: pixel pitch of both.
+        efficiency: share of the incident light that lies on the target, written above the picture.
+        uniformity: evenness of the light on the target, 1 for perfect, written above the picture.
+        ax: axes whose place the picture takes; a new figure by default.
+
+    Raises:
+        ValueError: the two differ in shape.
+    """
+    from matplotlib.colors import PowerNorm
+    from matplotlib.ticker import MaxNLocator
+
+    if target.shape != achieved.shape:
+        raise ValueError(f"`achieved` must have the target's shape {target.shape}, but got {achieved.shape}")
+    images = [shrunk(image, round(_SIDE * DPI)) for image in (target, achieved)]
+    # Speckle has rare pixels many times brighter than the rest, which would darken an even target.
+    top = max(float(images[0].max()), float(np.quantile(images[1], 0.9995)), 1e-30)
+    titles = ("target", f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %")
+    with panels(ax, (8.3, 3.95), layout="compressed") as figure:
+        panes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, image, title in zip(panes, images, titles, strict=True):
+            norm = PowerNorm(0.5, 0.0, top, clip=True)
+            box = extent_of(target.shape, camera.pixel_m, UM)
+            shown = axes.imshow(image, origin="lower", extent=box, norm=norm, cmap=LIGHT, interpolation="auto")
+            axes.set_title(title)
+            axes.set_xlabel("x (µm)")
+        panes[0].set_ylabel("y (µm)")
+        panes[0].locator_params(nbins=5, steps=[1, 2, 5, 10])
+        above = "max" if float(images[1].max()) > top else "neither"
+        bar = figure.colorbar(shown, ax=list(panes), extend=above, format="{x:.2g}", ticks=MaxNLocator(4))
+        bar.set_label("share of light per pixel")
+    return figure
