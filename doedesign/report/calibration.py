@@ -206,6 +206,7 @@ def _draw_left_out(axes: "Axes", result: "Calibration") -> None:
 
 
 def _draw_readings(axes: "Axes", readings: Sequence[Any]) -> None:
+    axes.use_sticky_edges = False  # a margin beyond the shades
     rows = np.arange(len(readings))[::-1]
     for row, reading in zip(rows, readings, strict=True):
         (value, sigma), (model, spread) = reading.measured, reading.predicted

@@ -358,7 +358,6 @@ def test_stopped_at_every_few_writes(
 SCRIPT = """
 import sys, time
 from pathlib import Path
-from doedesign.build import camera_of
 from doedesign.cli import exit_code
 from doedesign.commands import train as command
 from doedesign.training.joint import Trainer
@@ -375,7 +374,7 @@ command.save = lambda _, path: write_atomic(path, b"picture")
 run, out, images = map(Path, sys.argv[1:])
 def say(text):
     print(text, file=sys.stderr)
-sys.exit(exit_code(lambda: command.train(run, out, command.Request(images=images), say)))
+sys.exit(exit_code(lambda: command.train(run, out, command.TrainingSettings(images=images), say)))
 """
 
 
