@@ -68,7 +68,8 @@ MAPS = {
 @pytest.mark.parametrize(("level_map", "count"), MAPS.values(), ids=MAPS.keys())
 def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_path, monkeypatch, level_map, count):
     # The picture for people takes most of the time of an order this small.
-    monkeypatch.setattr("fab.order.write.preview_png", lambda *_: b"picture")
+    monkeypatch.setattr("fab.order.order.Order.plot", lambda *_: None)
+    monkeypatch.setattr("fab.order.write.save", lambda _, path: path.write_bytes(b"picture"))
     levels, grid = Levels(count, 1200 * NM / count), Grid(level_map.shape, 2 * UM)
     # A circle wide enough for every pixel is wider than the raster; the aperture may not be, so corners are blank.
     folder = tmp_path / "o"
