@@ -15,19 +15,19 @@ Which roughness a plate has, of all with the same statistics, belongs to the sou
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.process import DEVIATIONS, Process, Variation
+from fab.process import DEVIATIONS, Process, Variation, deviation_of, short_name
 from fab.sampling import (
     corner_scores,
     draw_at,
     normal_draw,
     normal_scores,
     one_at_a_time_scores,
+    sobol_scores,
     source_of,
     varying,
 )
@@ -41,7 +41,6 @@ __all__ = [
     "corner_keys",
     "normal_keys",
     "one_at_a_time_keys",
-    "short_name",
     "sobol_keys",
     "sources_of",
     "variation_at",
@@ -91,12 +90,6 @@ def _words_for(name: str) -> tuple[str, ...]:
     return name, short_name(name), key, short_name(key), source_of(name)
 
 
-def short_name(name: str) -> str:
-    """A flat name without its unit, as specs have it: "overlay_x[2]" for "overlay_x_m[2]"."""
-    key, bracket, mask = name.partition("[")
-    return key.removesuffix("_m").removesuffix("_rad") + bracket + mask
-
-
 def normal_keys(count: int) -> list[str]:
     """Keys of the first `count` Monte-Carlo draws."""
     return [f"normal/{i}" for i in range(count)]
@@ -116,7 +109,7 @@ def one_at_a_time_keys(process: Process) -> list[str]:
         f"one_at_a_time/{name}/{reach:+g}"
         for name in varying(process)
         for reach in _REACHES
-        if reach > 0 or process.spreads[name].mean or not DEVIATIONS[name.partition("[")[0]].one_sided
+        if reach > 0 or process.spreads[name].mean or not deviation_of(name).one_sided
     ]
 
 
@@ -180,23 +173,9 @@ def _index(text: str) -> int:
     return int(text)
 
 
-@lru_cache(maxsize=32)
-def _sobol_points(seed: int, columns: int, power: int) -> NDArray[np.float64]:
-    """The first `2**power` rows of a scrambled Sobol sequence as normal scores; more rows leave them as they are."""
-    if columns == 0:
-        return np.zeros((2**power, 0))
-    from scipy.stats import norm, qmc
-
-    points = qmc.Sobol(columns, rng=np.random.default_rng([seed, 2])).random_base2(power)
-    # A point on the border would be an infinite score.
-    scores = norm.ppf(np.clip(points, 2.0**-33, 1 - 2.0**-33))
-    scores.setflags(write=False)
-    return scores
-
-
 def _sobol_draw(process: Process, seed: int, plate_m: float, half: str, index: int) -> Variation:
     names = varying(process)
-    row = _sobol_points(seed, 2 * len(names), max(index, 1).bit_length())[index]
+    row = sobol_scores(2 * len(names), max(index, 1).bit_length(), seed)[index]
     first, second = row[: len(names)], row[len(names) :]
     # Rare events and the roughness of the two samples are those of an even and of an odd Monte-Carlo draw.
     odd = half == "b"

@@ -8,13 +8,13 @@ seed and a number, so any draw of a study can be repeated alone.
 import itertools
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
-from scipy.stats import norm, qmc
 
-from fab.process import DEVIATIONS, Disc, MaskDisc, Process, Variation, variation_of
+from fab.process import Disc, MaskDisc, Process, Variation, deviation_of, error_names, variation_of
 
 __all__ = [
     "corner_scores",
@@ -32,18 +32,14 @@ _ALL_CORNERS = 6  # errors up to which every combination of signs is tried
 
 def varying(process: Process) -> tuple[str, ...]:
     """Flat names of the errors with a standard deviation above zero, in the order of `DEVIATIONS`."""
-    keys = list(DEVIATIONS)
-    names = [name for name, spread in process.spreads.items() if spread.sigma > 0]
-    return tuple(sorted(names, key=lambda name: (keys.index(_key(name)), name)))
-
-
-def _key(name: str) -> str:
-    return name.partition("[")[0]
+    return tuple(
+        name for name in error_names(process.masks) if name in process.spreads and process.spreads[name].sigma > 0
+    )
 
 
 def source_of(name: str) -> str:
     """Group of a flat error name, such as "overlay"."""
-    return DEVIATIONS[_key(name)].source
+    return deviation_of(name).source
 
 
 def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **rest: object) -> Variation:
@@ -61,7 +57,7 @@ def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **res
     values = {}
     for name, spread in process.spreads.items():
         value = spread.mean + strayed.get(name, 0.0) * spread.sigma
-        values[name] = abs(value) if DEVIATIONS[_key(name)].one_sided else value
+        values[name] = abs(value) if deviation_of(name).one_sided else value
     return variation_of(process.masks, values, seed=seed, **rest)
 
 
@@ -127,21 +123,22 @@ def corner_scores(process: Process, reach: float = 2.0) -> NDArray[np.float64]:
     return reach * np.concatenate([signs, -signs])
 
 
-def sobol_scores(process: Process, count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Quasi-random normal scores from a scrambled Sobol sequence.
-
-    Args:
-        process: the process.
-        count: number of draws; a power of two keeps the sequence balanced.
-        seed: seed of the scrambling.
+@lru_cache(maxsize=32)
+def sobol_scores(errors: int, power: int, seed: int = 0) -> NDArray[np.float64]:
+    """First `2**power` rows of a scrambled Sobol sequence as normal scores; more rows leave them as they are.
 
     Returns:
-        `[draw, error]` scores.
+        `[draw, error]` scores, read-only.
     """
-    errors = len(varying(process))
-    points = qmc.Sobol(errors, rng=np.random.default_rng(seed)).random_base2(math.ceil(math.log2(max(count, 1))))
+    if errors == 0:
+        return np.zeros((2**power, 0))
+    from scipy.stats import norm, qmc
+
+    points = qmc.Sobol(errors, rng=np.random.default_rng([seed, 2])).random_base2(power)
     # A point on the border would be an infinite score.
-    return norm.ppf(np.clip(points[:count], 2.0**-33, 1 - 2.0**-33))
+    scores = norm.ppf(np.clip(points, 2.0**-33, 1 - 2.0**-33))
+    scores.setflags(write=False)
+    return scores
 
 
 def one_at_a_time_scores(process: Process, reaches: Sequence[float] = (-1.0, 1.0)) -> NDArray[np.float64]:

@@ -12,41 +12,21 @@ the masks are printed.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import radians
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
+from fab.deviations import Source, Typical, estimate, sourced
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 
-__all__ = ["IDEAL", "STOCK", "Figure", "Number", "Source", "Stock", "Typical", "process_from"]
-
-
-class Source(NamedTuple):
-    """Where a number comes from.
-
-    Attributes:
-        kind: "sourced" for a published number, "estimate" for one that is not.
-        text: who published it, or what it rests on.
-    """
-
-    kind: Literal["sourced", "estimate"]
-    text: str
+__all__ = ["IDEAL", "STOCK", "Figure", "Number", "Stock", "process_from"]
 
 
 class Figure(NamedTuple):
     """One number and its source; SI units."""
 
     value: float
-    source: Source
-
-
-class Typical(NamedTuple):
-    """Mean and standard deviation of one error, in the unit of `DEVIATIONS`, and their source."""
-
-    mean: float
-    sigma: float
     source: Source
 
 
@@ -140,50 +120,13 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
     return known[given].process(levels)
 
 
-def _degrees(angle: float) -> float:
-    # Fifteen digits, as when text is read, so that it is written as "5 deg" again.
-    return float(f"{radians(angle):.15g}")
+# --- rare events ------------------------------------------------------------------------------------------------------
 
-
-def _sourced(text: str) -> Source:
-    return Source("sourced", text)
-
-
-def _estimate(text: str) -> Source:
-    return Source("estimate", text)
-
-
-# --- etching, the same for all ----------------------------------------------------------------------------------------
-
-_RATE = _estimate("etches stopped by time, with the rate of a test wafer; 2 % is usual without an end point")
-_SCATTER = _estimate("what remains between etches of one day on one machine")
-_UNIFORMITY = _estimate("2 % from the centre to the edge of a 100 mm wafer, class of a parallel-plate etcher")
-_TILT = _estimate("half the radial share: gas flow and clamping are seldom symmetric")
-_WALLS = _estimate("walls of 80 to 88 degrees are usual for silica etched through photoresist")
-_LAG = _estimate(
-    "some 5 % less depth where openings are as narrow as deep; that such plates suffer from lag is published "
-    "(Amata, Fu and Heidrich, Opt. Express 31, 41533, 2023), its size here is not"
-)
-_ROUGHNESS = _estimate("1 to 3 nm rms is usual after 1 um of silica etched with CHF3; SF6 leaves more")
-_CORRELATION = _estimate("grain of micromasked silica as atomic force microscopes show it, a fraction of 1 um")
-
-_ETCHING = {
-    "common_depth_scale": Typical(0.0, 0.02, _RATE),
-    "depth_scale": Typical(0.0, 0.01, _SCATTER),
-    "radial_nonuniformity": Typical(0.0, 0.02, _UNIFORMITY),
-    "linear_nonuniformity_y": Typical(0.0, 0.01, _TILT),
-    "linear_nonuniformity_x": Typical(0.0, 0.01, _TILT),
-    "sidewall_rad": Typical(_degrees(5), _degrees(2), _WALLS),
-    "etch_lag": Typical(0.05, 0.02, _LAG),
-    "roughness_m": Typical(2e-9, 0.5e-9, _ROUGHNESS),
-    "correlation_m": Typical(200e-9, 50e-9, _CORRELATION),
-}
-
-_CAUGHT = _estimate("none: the step height is measured after every etch; set it to see what one would do")
-_DUST = _estimate("one per cm2 and etch, a class 100 cleanroom with manual handling")
-_DUST_RADIUS = _estimate("what settles and stays through a spin rinse is a few um wide")
-_PINHOLES = _estimate("one per cm2 of evaporated chrome 100 nm thick")
-_PINHOLE_RADIUS = _estimate("as wide as the dust that causes them")
+_CAUGHT = estimate("none: the step height is measured after every etch; set it to see what one would do")
+_DUST = estimate("one per cm2 and etch, a class 100 cleanroom with manual handling")
+_DUST_RADIUS = estimate("what settles and stays through a spin rinse is a few um wide")
+_PINHOLES = estimate("one per cm2 of evaporated chrome 100 nm thick")
+_PINHOLE_RADIUS = estimate("as wide as the dust that causes them")
 
 
 def _defects(particles_per_m2: float, dust: Source) -> Mapping[str, Figure]:
@@ -199,20 +142,21 @@ def _defects(particles_per_m2: float, dust: Source) -> Mapping[str, Figure]:
     )
 
 
-def _errors(**typical: Typical) -> Mapping[str, Typical]:
-    return MappingProxyType(_ETCHING | typical)
+def _errors(**printing: Typical) -> Mapping[str, Typical]:
+    """What all processes share, which is etching, and what printing adds."""
+    return MappingProxyType({name: error.stock for name, error in DEVIATIONS.items() if error.stock} | printing)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------
 
 _MA6 = "Karl Suss MA6 contact aligner, mems-exchange.org catalog P1530"
 _PLATE = "International Phototool Company, photomask inspection criteria (photoplotstore.com)"
-_FOUR_INCH = _sourced(f"{_MA6}: fields up to 4 inch")
+_FOUR_INCH = sourced(f"{_MA6}: fields up to 4 inch")
 
-_MA6_OVERLAY = _sourced(f"{_MA6}: alignment tolerance 0.5 um, read as the standard deviation of alignment by eye")
-_MA6_LINE = _sourced(f"{_MA6}: 1 um, in vacuum contact only")
-_PLATE_CD = _sourced(f"{_PLATE}: lines below 10 um to +-0.5 um, read as two standard deviations, half of it per edge")
-_PLATE_OPENING = _sourced(f"{_PLATE}: features above 250 um to +-2.54 um, read as two standard deviations")
+_MA6_OVERLAY = sourced(f"{_MA6}: alignment tolerance 0.5 um, read as the standard deviation of alignment by eye")
+_MA6_LINE = sourced(f"{_MA6}: 1 um, in vacuum contact only")
+_PLATE_CD = sourced(f"{_PLATE}: lines below 10 um to +-0.5 um, read as two standard deviations, half of it per edge")
+_PLATE_OPENING = sourced(f"{_PLATE}: features above 250 um to +-2.54 um, read as two standard deviations")
 
 _CONTACT_ALIGNER = Stock(
     name="contact_aligner",
@@ -220,13 +164,13 @@ _CONTACT_ALIGNER = Stock(
     errors=_errors(
         overlay_y_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
         overlay_x_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
-        rotation_rad=Typical(0.0, 10e-6, _estimate("the overlay at marks 70 mm apart: 0.5 um * sqrt(2) / 70 mm")),
+        rotation_rad=Typical(0.0, 10e-6, estimate("the overlay at marks 70 mm apart: 0.5 um * sqrt(2) / 70 mm")),
         magnification=Typical(
-            0.0, 5e-6, _estimate("a soda-lime plate expands by 8.5e-6 per kelvin more than the wafer; 0.6 kelvin")
+            0.0, 5e-6, estimate("a soda-lime plate expands by 8.5e-6 per kelvin more than the wafer; 0.6 kelvin")
         ),
-        common_cd_bias_m=Typical(0.0, 0.1e-6, _estimate("exposure and development at a gap that varies by a few um")),
+        common_cd_bias_m=Typical(0.0, 0.1e-6, estimate("exposure and development at a gap that varies by a few um")),
         cd_bias_m=Typical(0.0, 0.125e-6, _PLATE_CD),
-        corner_radius_m=Typical(0.5e-6, 0.1e-6, _estimate("half of the narrowest line")),
+        corner_radius_m=Typical(0.5e-6, 0.1e-6, estimate("half of the narrowest line")),
         chrome_y_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
         chrome_x_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
         chrome_diameter_m=Typical(0.0, 1.27e-6, _PLATE_OPENING),
@@ -234,16 +178,14 @@ _CONTACT_ALIGNER = Stock(
     minimum_line_m=Figure(1e-6, _MA6_LINE),
     minimum_space_m=Figure(1e-6, _MA6_LINE),
     wafer_radius_m=Figure(50e-3, _FOUR_INCH),
-    defects=_defects(
-        0.02e6, _estimate("two per cm2 and etch: a class 100 cleanroom, and the plate touches the resist")
-    ),
+    defects=_defects(0.02e6, estimate("two per cm2 and etch: a class 100 cleanroom, and the plate touches the resist")),
 )
 
-_I_LINE = _estimate(
+_I_LINE = estimate(
     "Rayleigh with k1 = 0.7: 0.7 * 365 nm / 0.5; "
     "an older GCA 6200 is listed with 1 um (mems-exchange.org catalog P2260)"
 )
-_STEPPER_OVERLAY = _estimate(
+_STEPPER_OVERLAY = estimate(
     "0.15 um is a usual limit, read as three standard deviations; "
     "an older GCA 6200 is listed with 2 um (mems-exchange.org catalog P2260)"
 )
@@ -254,26 +196,26 @@ _STEPPER = Stock(
     errors=_errors(
         overlay_y_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         overlay_x_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
-        rotation_rad=Typical(0.0, 1e-6, _estimate("the overlay at marks 70 mm apart: 50 nm * sqrt(2) / 70 mm")),
-        magnification=Typical(0.0, 1e-6, _estimate("lens and reticle are trimmed to 1e-6 or 2e-6")),
-        common_cd_bias_m=Typical(0.0, 30e-9, _estimate("dose and focus: 10 % of a line of 0.6 um, half per edge")),
-        cd_bias_m=Typical(0.0, 25e-9, _sourced(f"{_PLATE_CD.text}; a fifth of it on the wafer")),
-        corner_radius_m=Typical(0.25e-6, 50e-9, _estimate("half of the narrowest line")),
+        rotation_rad=Typical(0.0, 1e-6, estimate("the overlay at marks 70 mm apart: 50 nm * sqrt(2) / 70 mm")),
+        magnification=Typical(0.0, 1e-6, estimate("lens and reticle are trimmed to 1e-6 or 2e-6")),
+        common_cd_bias_m=Typical(0.0, 30e-9, estimate("dose and focus: 10 % of a line of 0.6 um, half per edge")),
+        cd_bias_m=Typical(0.0, 25e-9, sourced(f"{_PLATE_CD.text}; a fifth of it on the wafer")),
+        corner_radius_m=Typical(0.25e-6, 50e-9, estimate("half of the narrowest line")),
         chrome_y_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         chrome_x_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
-        chrome_diameter_m=Typical(0.0, 0.254e-6, _sourced(f"{_PLATE_OPENING.text}; a fifth of it on the wafer")),
+        chrome_diameter_m=Typical(0.0, 0.254e-6, sourced(f"{_PLATE_OPENING.text}; a fifth of it on the wafer")),
     ),
     minimum_line_m=Figure(0.5e-6, _I_LINE),
     minimum_space_m=Figure(0.5e-6, _I_LINE),
-    wafer_radius_m=Figure(50e-3, _estimate("many take 100 mm wafers; larger ones move the edge outward")),
+    wafer_radius_m=Figure(50e-3, estimate("many take 100 mm wafers; larger ones move the edge outward")),
     defects=_defects(0.01e6, _DUST),
 )
 
-_DWL = _sourced(
+_DWL = sourced(
     "Heidelberg DWL-200 at the University of Alberta nanoFAB: 1 um with the 4 mm lens, where features below 2 um may "
     "show distortions or fail"
 )
-_WRITER_OVERLAY = _estimate(
+_WRITER_OVERLAY = estimate(
     "a camera reads each mark to 0.1 or 0.2 um, and the stage drifts by as much while it writes; "
     "marks read to below 0.1 um are a research result (Micromachines 16, 871, 2025)"
 )
@@ -284,22 +226,22 @@ _DIRECT_WRITE = Stock(
     errors=_errors(
         overlay_y_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
         overlay_x_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
-        rotation_rad=Typical(0.0, 5e-6, _estimate("the overlay at marks 70 mm apart: 0.25 um * sqrt(2) / 70 mm")),
-        magnification=Typical(0.0, 1e-6, _estimate("silica expands by 0.55e-6 per kelvin; 2 kelvin")),
-        common_cd_bias_m=Typical(0.0, 0.1e-6, _estimate("dose, and focus over a wafer that is not flat")),
-        cd_bias_m=Typical(0.0, 50e-9, _estimate("drift of laser power between layers")),
-        corner_radius_m=Typical(0.5e-6, 0.1e-6, _estimate("half of a laser spot 1 um wide")),
+        rotation_rad=Typical(0.0, 5e-6, estimate("the overlay at marks 70 mm apart: 0.25 um * sqrt(2) / 70 mm")),
+        magnification=Typical(0.0, 1e-6, estimate("silica expands by 0.55e-6 per kelvin; 2 kelvin")),
+        common_cd_bias_m=Typical(0.0, 0.1e-6, estimate("dose, and focus over a wafer that is not flat")),
+        cd_bias_m=Typical(0.0, 50e-9, estimate("drift of laser power between layers")),
+        corner_radius_m=Typical(0.5e-6, 0.1e-6, estimate("half of a laser spot 1 um wide")),
         chrome_y_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
         chrome_x_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
-        chrome_diameter_m=Typical(0.0, 0.2e-6, _estimate("twice the common bias of its edge")),
+        chrome_diameter_m=Typical(0.0, 0.2e-6, estimate("twice the common bias of its edge")),
     ),
     minimum_line_m=Figure(1e-6, _DWL),
     minimum_space_m=Figure(1e-6, _DWL),
-    wafer_radius_m=Figure(50e-3, _estimate("the stage takes more; 100 mm is what fits most etchers")),
+    wafer_radius_m=Figure(50e-3, estimate("the stage takes more; 100 mm is what fits most etchers")),
     defects=_defects(0.01e6, _DUST),
 )
 
-_NOTHING = _estimate("a process without errors and without limits")
+_NOTHING = estimate("a process without errors and without limits")
 
 IDEAL = Stock(
     name="ideal",

@@ -43,7 +43,7 @@ from doedesign.calibration.uncertainty import (
     posterior_of,
     readings,
 )
-from doedesign.calibration.unknowns import Unknowns, unknowns_of
+from doedesign.calibration.unknowns import Unknowns, relative, unknowns_of
 from doedesign.design.design import Design
 from fab.process import Normal, Process
 
@@ -166,7 +166,7 @@ def _estimate(process: Process, unknowns: Unknowns, posterior: Posterior) -> Pro
         for name, value, sigma in zip(unknowns.names, posterior.values, posterior.sigma, strict=True)
     }
     # The others' places are relative to mask 0.
-    references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if unknowns.relative(name)}
+    references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if relative(name)}
     still = {name: Normal(process.spreads.get(name, Normal()).mean, 0.0) for name in references}
     spreads = MappingProxyType({**process.spreads, **still, **found})
     return replace(process, spreads=spreads, name=f"{process.name}, calibrated")
@@ -200,7 +200,7 @@ def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) 
     if result.rises and not all(0.5 < rise < 2 for rise in result.rises):
         text = ", ".join(f"{rise:.2g}" for rise in result.rises)
         out.append(f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1.")
-    if len({name.partition("[")[0] for name in unknowns.names if unknowns.relative(name)}):
+    if any(relative(name) for name in unknowns.names):
         out.append("Places of masks are relative to mask 0; a common shift cannot be seen.")
     return out
 

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from doedesign.calibration.unknowns import ASSUMED, chosen_names, definite_means
+from doedesign.calibration.unknowns import chosen_names, definite_means, prior_sigma
 from doedesign.design.design import Design
 from doedesign.prediction import predict
 from fab.errors import InputError
-from fab.process import DEVIATIONS, Process, variation_of
+from fab.process import Process, deviation_of, variation_of
 from sim.camera import Colour
 
 _DEFAULT = (
@@ -150,7 +150,7 @@ class _Walk:
 
     def _row(self, scores: Mapping[str, float]) -> dict[str, Any] | None:
         values = self.values(scores)
-        if any(value < 0 and DEVIATIONS[name.partition("[")[0]].one_sided for name, value in values.items()):
+        if any(value < 0 and deviation_of(name).one_sided for name, value in values.items()):
             return None
         means = definite_means(self.process)
         try:
@@ -212,7 +212,7 @@ def explanations(
         on_model: told of every plate that is computed.
 
     Returns:
-        the family; errors on which the process is silent are judged by `doedesign.calibration.unknowns.ASSUMED`.
+        the family; errors on which the process is silent are judged by `prior_sigma` of `fab.process.DEVIATIONS`.
 
     Raises:
         InputError: an unknown error, a ratio that is not positive, or a depth at which there is no disc.
@@ -220,16 +220,14 @@ def explanations(
     probe = Colour("probe", (targets.wavelength_m,), (1.0,))
     design = replace(design, camera=replace(design.camera, colours=(probe,)), near_m=(targets.depth_m,), far_m=())
     if not 0 < targets.ring_to_disc < np.inf:
-        raise InputError(
-            "--ring-to-disc", "must be positive", targets.ring_to_disc, "Give ring energy over disc energy."
-        )
+        raise InputError("ring_to_disc", "must be positive", targets.ring_to_disc, "Give ring energy over disc energy.")
     if design.camera.defocus_radius_m(targets.depth_m) < design.camera.pixel_m:
         rule = "the source must be near enough to be blurred by more than a pixel"
-        raise InputError("--depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
+        raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
     names = chosen_names(process.masks, errors or _DEFAULT)
-    stated = {name: process.spreads[name].sigma for name in names if name in process.spreads}
-    assumed = {name: ASSUMED[name.partition("[")[0]] for name in names if not stated.get(name)}
-    walk = _Walk(design, process, {**stated, **assumed}, targets, reach, on_model)
+    sigma = {name: prior_sigma(process, name) for name in names}
+    assumed = {name: sigma[name] for name in names if not (name in process.spreads and process.spreads[name].sigma)}
+    walk = _Walk(design, process, sigma, targets, reach, on_model)
     nominal = walk.row({})
     assert nominal is not None  # otherwise the model has refused it
     singles, none = [], []

@@ -16,7 +16,7 @@ from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
-from fab.process import DEVIATIONS, Process
+from fab.process import Process, deviation_of
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from sim.plots.psfs import plot_psfs
 from sim.store import write_bank
@@ -94,7 +94,7 @@ def _write(
         "level_map_sha256": design.level_map.digest,
         "units": "SI; a depth of null is infinity; null in a comparison is what the sheet does not say",
         "notes": dict(measured.notes),
-        "errors": [{**one._asdict(), "unit": DEVIATIONS[one.error.partition("[")[0]].unit} for one in plate.taken],
+        "errors": [{**one._asdict(), "unit": deviation_of(one.error).unit} for one in plate.taken],
         "etch_lag_per_nm": plate.lag_per_nm,
         "comparison": rows,
         "gratings": gratings_compared(measured, process, plate.variation, design.camera.material),

@@ -16,11 +16,11 @@ from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, evaluate_here, predicted_bank
 from doedesign.tolerancing.sensitivity import Change, Share, as_records, source_shares
 from doedesign.tolerancing.studies import FORMAT, Plates, Study, study
-from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys, short_name
+from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
-from fab.process import DEVIATIONS, error_names
+from fab.process import DEVIATIONS, error_names, short_name
 from fab.units import format_length
 from sim.plots.psfs import plot_psfs
 

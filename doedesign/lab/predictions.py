@@ -26,7 +26,7 @@ from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.levels import Levels
-from fab.process import DEVIATIONS, Normal, Process, Variation
+from fab.process import Normal, Process, Variation, deviation_of
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
 from fab.sampling import varying
 from sim.aperture import circle_coverage
@@ -43,16 +43,6 @@ __all__ = ["SheetPrediction", "grating_orders", "matters_of", "predict_sheet", "
 PROBE_M = 520e-9
 _DEPTH_ERRORS = (-0.05, -0.02, 0.0, 0.02, 0.05)
 _PATCH = 256
-_MEASURED = {
-    "depth": "depth",
-    "overlay": "overlay",
-    "cd": "line width (CD bars)",
-    "uniformity": "depth at the rim of the wafer against its middle",
-    "corners": "rounding of the corners",
-    "sidewalls": "tilt of the walls",
-    "lag": "etch lag (depth of the small pads)",
-    "roughness": "roughness of the floors",
-}
 
 
 def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
@@ -122,7 +112,7 @@ def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[I
     Raises:
         InputError: errors beyond what the model describes.
     """
-    known = [name for name in varying(process) if DEVIATIONS[name.partition("[")[0]].source in _MEASURED]
+    known = [name for name in varying(process) if deviation_of(name).measured]
     kept = replace(process, spreads={n: s if n in known else Normal(s.mean) for n, s in process.spreads.items()})
     if not known:
         return ()
@@ -149,7 +139,7 @@ def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[I
 def _measured(error: str) -> str:
     """Name what is measured to find an error: "overlay of mask 3", "depth of every mask"."""
     key, bracket, mask = error.partition("[")
-    name = _MEASURED[DEVIATIONS[key].source]
+    name = deviation_of(error).measured
     if bracket:
         return f"{name} of mask {int(mask.removesuffix(']')) + 1}"
     return f"{name} of every mask" if key.startswith("common_") else name

@@ -5,7 +5,6 @@ replaces one of them, and without a stock process what is not given is zero. `Pr
 The keys of `[process.errors]` are those of `fab.process.DEVIATIONS` without the unit.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -36,15 +35,11 @@ from doedesign.spec.values import (
 )
 from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK, Stock
-from fab.units import MM, NM, UM
+from fab.units import MM, NM
 
 __all__ = ["DefectsSpec", "ErrorsSpec", "EtchSpec", "LimitSpec", "ProcessSpec", "Quantity", "SpreadSpec"]
 
 Quantity = Literal["zeroth_order", "strehl", "throughput", "outside_window", "ring_to_disc", "far_spot"]
-
-# The largest mean or standard deviation of an error that can be meant, by its unit; some have a limit of their own.
-_LARGEST = {"1": 0.5, "m": 100 * UM, "rad": math.radians(45)}
-_LARGEST_OF = {"rotation_rad": math.radians(1), "magnification": 0.01, "roughness_m": 1 * UM}
 
 Etch = Annotated[float, length(0.1 * NM, 1 * MM)]
 Feature = Annotated[float, length(0.0, 1 * MM)]
@@ -139,10 +134,9 @@ def _for_masks(value_type: Any) -> Any:
 
 
 def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:
-    largest = _LARGEST_OF.get(name, _LARGEST[error.unit])
     of = _for_masks if error.per_mask else _for_plate
-    mean = of(quantity_of(error, 0.0 if error.one_sided else -largest, largest))
-    sigma = of(quantity_of(error, 0.0, largest))
+    mean = of(quantity_of(error, 0.0 if error.one_sided else -error.largest, error.largest))
+    sigma = of(quantity_of(error, 0.0, error.largest))
     fields: dict[str, Any] = {"mean": (mean, optional(0.0)), "sigma": (sigma, optional(0.0))}
     model = create_model(f"_spread_of_{name}", __base__=SpreadSpec, __module__=__name__, **fields)
     globals()[model.__name__] = model  # a spec is found again by its classes' names where it is sent to another process

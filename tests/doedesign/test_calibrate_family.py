@@ -83,9 +83,9 @@ def test_none_is_an_answer(plate: tuple[Design, Process], family: Family):
 
 def test_impossible_targets_are_refused(plate: tuple[Design, Process]):
     design, process = plate
-    with pytest.raises(InputError, match="--ring-to-disc: must be positive"):
+    with pytest.raises(InputError, match="ring_to_disc: must be positive"):
         explanations(design, process, Targets(PROBE_M, NEAR_M, 0.0))
-    with pytest.raises(InputError, match="--depth: the source must be near enough"):
+    with pytest.raises(InputError, match="depth: the source must be near enough"):
         explanations(design, process, Targets(PROBE_M, 1e3, 1.0))
     with pytest.raises(InputError, match="in a definite way, but got weather"):
         explanations(design, process, Targets(PROBE_M, NEAR_M, 1.0), ("weather",))

@@ -27,7 +27,7 @@ SIDE = 1e-3
 @pytest.fixture(scope="module")
 def fakes():
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(Path(__file__).parent)
+        patch.syspath_prepend(Path(__file__).parents[1] / "doedesign")
         yield import_module("tolerance_fakes")
 
 

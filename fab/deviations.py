@@ -1,0 +1,326 @@
+"""Errors of a process: one table of all that a DOE may come back with, and the errors of one DOE.
+
+`Variation` is the table. To add an error, add a field to it here and what it does to the glass to
+`sim/surface/relief.py`: specs, draws, stock processes, tolerance studies, calibration and run sheets read the rest from
+the field. Errors are physical numbers in SI units, and the unit ends the name.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+from fab.units import UM
+
+__all__ = [
+    "DEVIATIONS",
+    "Deviation",
+    "Disc",
+    "MaskDisc",
+    "Source",
+    "Typical",
+    "Variation",
+    "deviation_of",
+    "error_names",
+    "estimate",
+    "short_name",
+    "sourced",
+    "variation_of",
+]
+
+Unit = Literal["1", "m", "rad"]
+
+# The largest mean or standard deviation of an error that can be meant, by its unit.
+_LARGEST = {"1": 0.5, "m": 100 * UM, "rad": math.radians(45)}
+# What a lab measures to find an error, by its source; chrome is not measured.
+_MEASURED = {
+    "depth": "depth",
+    "overlay": "overlay",
+    "cd": "line width (CD bars)",
+    "uniformity": "depth at the rim of the wafer against its middle",
+    "corners": "rounding of the corners",
+    "sidewalls": "tilt of the walls",
+    "lag": "etch lag (depth of the small pads)",
+    "roughness": "roughness of the floors",
+}
+
+
+class Source(NamedTuple):
+    """Where a number comes from.
+
+    Attributes:
+        kind: "sourced" for a published number, "estimate" for one that is not.
+        text: who published it, or what it rests on.
+    """
+
+    kind: Literal["sourced", "estimate"]
+    text: str
+
+
+def sourced(text: str) -> Source:
+    """Source of a published number."""
+    return Source("sourced", text)
+
+
+def estimate(text: str) -> Source:
+    """Source of a number that nobody has published."""
+    return Source("estimate", text)
+
+
+class Typical(NamedTuple):
+    """Mean and standard deviation of one error, SI units, and their source."""
+
+    mean: float
+    sigma: float
+    source: Source
+
+
+class Deviation(NamedTuple):
+    """One kind of error.
+
+    Attributes:
+        source: the group it belongs to in a sensitivity analysis.
+        unit: "1" (a share), "m" or "rad".
+        per_mask: one value per mask instead of one per DOE.
+        meaning: what a value of it does.
+        one_sided: never negative; it is drawn from a folded normal distribution.
+        largest: the largest mean or standard deviation that a spec may give.
+        prior_sigma: standard deviation before a calibration where the process gives none, what a careless lab would
+            still not exceed twice; 0 for an error that no single DOE has in a definite way (roughness).
+        measured: what a lab measures to find it; "" if nothing.
+        stock: mean and standard deviation in every stock process; None where they differ (`fab.stock`) or are zero.
+    """
+
+    source: str
+    unit: Unit
+    per_mask: bool
+    meaning: str
+    one_sided: bool
+    largest: float
+    prior_sigma: float
+    measured: str
+    stock: Typical | None
+
+
+def _error(
+    source: str,
+    unit: Unit,
+    meaning: str,
+    *,
+    per_mask: bool = False,
+    one_sided: bool = False,
+    largest: float | None = None,
+    prior_sigma: float = 0.0,
+    stock: Typical | None = None,
+) -> Any:
+    """A field of `Variation` that is an error; see `Deviation`."""
+    largest, measured = largest or _LARGEST[unit], _MEASURED.get(source, "")
+    deviation = Deviation(source, unit, per_mask, meaning, one_sided, largest, prior_sigma, measured, stock)
+    return field(default=() if per_mask else 0.0, metadata={"deviation": deviation})
+
+
+def _degrees(angle: float) -> float:
+    # Fifteen digits, as when text is read, so that it is written as "5 deg" again.
+    return float(f"{math.radians(angle):.15g}")
+
+
+# Etching is the same in all stock processes.
+_RATE = estimate("etches stopped by time, with the rate of a test wafer; 2 % is usual without an end point")
+_SCATTER = estimate("what remains between etches of one day on one machine")
+_UNIFORMITY = estimate("2 % from the centre to the edge of a 100 mm wafer, class of a parallel-plate etcher")
+_TILT = estimate("half the radial share: gas flow and clamping are seldom symmetric")
+_WALLS = estimate("walls of 80 to 88 degrees are usual for silica etched through photoresist")
+_LAG = estimate(
+    "some 5 % less depth where openings are as narrow as deep; that such plates suffer from lag is published "
+    "(Amata, Fu and Heidrich, Opt. Express 31, 41533, 2023), its size here is not"
+)
+_ROUGHNESS = estimate("1 to 3 nm rms is usual after 1 um of silica etched with CHF3; SF6 leaves more")
+_CORRELATION = estimate("grain of micromasked silica as atomic force microscopes show it, a fraction of 1 um")
+
+
+class Disc(NamedTuple):
+    """A pinhole in the chrome, metres."""
+
+    y_m: float
+    x_m: float
+    radius_m: float
+
+
+class MaskDisc(NamedTuple):
+    """A particle that keeps one mask's etch off a disc, metres."""
+
+    mask: int
+    y_m: float
+    x_m: float
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Variation:
+    """The errors of one DOE; all zero is a DOE exactly as drawn.
+
+    A per-mask error is empty (zero for every mask) or has one value per mask, mask 0 first. Coordinates are those of
+    the height map (`[y, x]`, +y toward higher rows, origin in the middle of the DOE); rotation and magnification of a
+    mask, and the wafer's non-uniformity, act about the middle of the wafer.
+
+    Attributes:
+        repeats: how often each mask was etched more than once: -1 missed, 1 doubled; empty for none.
+        particles: particles that kept etches off.
+        pinholes: holes in the chrome beyond the clear aperture.
+        seed: which roughness, of all with the same statistics.
+    """
+
+    common_depth_scale: float = _error(
+        "depth", "1", "all etches too deep by this share", prior_sigma=0.05, stock=Typical(0.0, 0.02, _RATE)
+    )
+    depth_scale: tuple[float, ...] = _error(
+        "depth",
+        "1",
+        "this etch too deep by this share, besides the common one",
+        per_mask=True,
+        prior_sigma=0.03,
+        stock=Typical(0.0, 0.01, _SCATTER),
+    )
+    radial_nonuniformity: float = _error(
+        "uniformity",
+        "1",
+        "depth gained from wafer centre to edge (r^2)",
+        prior_sigma=0.05,
+        stock=Typical(0.0, 0.02, _UNIFORMITY),
+    )
+    linear_nonuniformity_y: float = _error(
+        "uniformity", "1", "depth gained along y per wafer radius", prior_sigma=0.03, stock=Typical(0.0, 0.01, _TILT)
+    )
+    linear_nonuniformity_x: float = _error(
+        "uniformity", "1", "depth gained along x per wafer radius", prior_sigma=0.03, stock=Typical(0.0, 0.01, _TILT)
+    )
+    overlay_y_m: tuple[float, ...] = _error("overlay", "m", "mask shifted toward +y", per_mask=True, prior_sigma=1e-6)
+    overlay_x_m: tuple[float, ...] = _error("overlay", "m", "mask shifted toward +x", per_mask=True, prior_sigma=1e-6)
+    rotation_rad: tuple[float, ...] = _error(
+        "overlay",
+        "rad",
+        "mask turned from +x toward +y about the wafer's centre",
+        per_mask=True,
+        largest=math.radians(1),
+        prior_sigma=3e-4,
+    )
+    magnification: tuple[float, ...] = _error(
+        "overlay",
+        "1",
+        "mask too large by this share about the wafer's centre",
+        per_mask=True,
+        largest=0.01,
+        prior_sigma=3e-5,
+    )
+    common_cd_bias_m: float = _error("cd", "m", "every etched area grows by this at every edge", prior_sigma=0.3e-6)
+    cd_bias_m: tuple[float, ...] = _error(
+        "cd", "m", "the same for one mask, besides the common one", per_mask=True, prior_sigma=0.2e-6
+    )
+    corner_radius_m: float = _error(
+        "corners", "m", "radius to which square corners are rounded", one_sided=True, prior_sigma=0.5e-6
+    )
+    sidewall_rad: float = _error(
+        "sidewalls",
+        "rad",
+        "tilt of etched walls from the vertical, floors narrower",
+        one_sided=True,
+        prior_sigma=0.1,
+        stock=Typical(_degrees(5), _degrees(2), _WALLS),
+    )
+    etch_lag: float = _error(
+        "lag",
+        "1",
+        "share of depth lost per unit of depth / opening width",
+        one_sided=True,
+        prior_sigma=0.05,
+        stock=Typical(0.05, 0.02, _LAG),
+    )
+    roughness_m: float = _error(
+        "roughness",
+        "m",
+        "rms height of the surface's roughness",
+        one_sided=True,
+        largest=1 * UM,
+        stock=Typical(2e-9, 0.5e-9, _ROUGHNESS),
+    )
+    correlation_m: float = _error(
+        "roughness",
+        "m",
+        "its correlation length, exp(-r^2 / length^2)",
+        one_sided=True,
+        stock=Typical(200e-9, 50e-9, _CORRELATION),
+    )
+    chrome_y_m: float = _error("chrome", "m", "chrome opening shifted toward +y", prior_sigma=2e-6)
+    chrome_x_m: float = _error("chrome", "m", "chrome opening shifted toward +x", prior_sigma=2e-6)
+    chrome_diameter_m: float = _error("chrome", "m", "chrome opening too wide by this", prior_sigma=4e-6)
+    repeats: tuple[int, ...] = ()
+    particles: tuple[MaskDisc, ...] = ()
+    pinholes: tuple[Disc, ...] = ()
+    seed: int = 0
+
+    @property
+    def nominal(self) -> bool:
+        """Whether the DOE is exactly as drawn."""
+        # A correlation length without roughness, and a seed, change nothing.
+        idle = ("seed", "correlation_m")
+        values = (getattr(self, f.name) for f in fields(self) if f.name not in idle)
+        return not any(any(v) if isinstance(v, tuple) else v for v in values)
+
+    def value(self, name: str) -> float:
+        """One error by its flat name, such as "corner_radius_m" or "overlay_x_m[2]"."""
+        key, mask = _split(name)
+        value = getattr(self, key)
+        return float(value) if mask is None else float(value[mask]) if value else 0.0
+
+
+DEVIATIONS: Mapping[str, Deviation] = MappingProxyType(
+    {f.name: f.metadata["deviation"] for f in fields(Variation) if f.metadata}
+)
+"""All kinds of error by their name in `Variation`."""
+
+
+def _split(name: str) -> tuple[str, int | None]:
+    key, bracket, mask = name.partition("[")
+    return key, int(mask.removesuffix("]")) if bracket else None
+
+
+def deviation_of(name: str) -> Deviation:
+    """The kind of an error by its flat name, such as "overlay_x_m[2]"."""
+    return DEVIATIONS[name.partition("[")[0]]
+
+
+def short_name(name: str) -> str:
+    """A flat name without its unit, as specs have it: "overlay_x[2]" for "overlay_x_m[2]"."""
+    key, bracket, mask = name.partition("[")
+    return key.removesuffix("_m").removesuffix("_rad") + bracket + mask
+
+
+def error_names(masks: int, *errors: str) -> tuple[str, ...]:
+    """Flat names of some errors (all by default), such as "overlay_x_m[0]", in the order of `DEVIATIONS`."""
+    chosen = errors or tuple(DEVIATIONS)
+    return tuple(
+        name
+        for key, error in DEVIATIONS.items()
+        if key in chosen
+        for name in ([f"{key}[{k}]" for k in range(masks)] if error.per_mask else [key])
+    )
+
+
+def variation_of(masks: int, values: Mapping[str, float], **rest: Any) -> Variation:
+    """A variation from values by flat name; errors that are not named are zero.
+
+    Args:
+        masks: number of etch masks.
+        values: error values by flat name, SI units.
+        rest: `repeats`, `particles`, `pinholes`, `seed`.
+    """
+    chosen: dict[str, Any] = {}
+    for name, value in values.items():
+        key, mask = _split(name)
+        if mask is None:
+            chosen[key] = value
+        else:
+            chosen.setdefault(key, [0.0] * masks)[mask] = value
+    made = {key: tuple(value) if isinstance(value, list) else value for key, value in chosen.items()}
+    return Variation(**made, **rest)
