@@ -160,9 +160,9 @@ class MaskDisc(NamedTuple):
 class Variation:
     """The errors of one DOE; all zero is a DOE exactly as drawn.
 
-    A per-mask error is empty (zero for every mask) or has one value per mask, mask 0 first. Coordinates are those of
-    the height map (`[y, x]`, +y toward higher rows, origin in the middle of the DOE); rotation and magnification of a
-    mask, and the wafer's non-uniformity, act about the middle of the wafer.
+    Lengths are metres, angles radians. A per-mask error is empty (zero for every mask) or has one value per mask, mask
+    0 first. Coordinates are those of the height map (`[y, x]`, +y toward higher rows, origin in the middle of the DOE);
+    rotation and magnification of a mask, and the wafer's non-uniformity, act about the middle of the wafer.
 
     Attributes:
         repeats: how often each mask was etched more than once: -1 missed, 1 doubled; empty for none.
