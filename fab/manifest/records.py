@@ -4,14 +4,16 @@ Lengths stand here in the units of the order form (nm, um, mm), with the unit in
 depends on the time or the place, so the same inputs give the same manifest.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, get_args, get_origin
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes
@@ -40,6 +42,9 @@ __all__ = [
 
 FORMAT = "doedesign mask order 1"
 
+# Nothing is converted: a number in quotes is no number.
+_STRICT = ConfigDict(strict=True, extra="forbid")
+
 CONVENTIONS = {
     "etch layers": "polygon = etched here (digitised data clear)",
     "chrome layer": "polygon = chrome stays here",
@@ -54,7 +59,7 @@ CONVENTIONS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class LayerEntry:
     """What is drawn on one layer of a cell; the digest is that of `fab.manifest.cells.shapes_digest`."""
 
@@ -65,7 +70,7 @@ class LayerEntry:
     sha256: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class CellEntry:
     """One cell of a mask file: its layers, and the cells it places as [name, x_um, y_um]."""
 
@@ -74,7 +79,7 @@ class CellEntry:
     places: list[list[Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class FileEntry:
     """One file of the folder: its name, kind, size and SHA-256.
 
@@ -90,7 +95,7 @@ class FileEntry:
     cells: list[CellEntry]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class MaskEntry:
     """One etch mask. `box_um` is x0, y0, x1, y1; box, width and space are None where there is none.
 
@@ -115,7 +120,7 @@ class MaskEntry:
     plane_sha256: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class DrawnEntry:
     """What one layer of a split draws: a plane (`bit`) of the level map, its edges moved."""
 
@@ -128,7 +133,7 @@ class DrawnEntry:
     box_um: list[float] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class SplitEntry:
     """A die that draws the DOE differently on purpose: its cell, what is special, which die, and what it draws."""
 
@@ -138,7 +143,7 @@ class SplitEntry:
     layers: list[DrawnEntry]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class PlateEntry:
     """One mask as the shop makes it, in the order of use: what polygons are on the plate, and how it is read."""
 
@@ -153,7 +158,7 @@ class PlateEntry:
     reading: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class WaferEntry:
     """Where everything lies: sizes, the middles of the dies, and the places where people measure, x and y."""
 
@@ -165,7 +170,7 @@ class WaferEntry:
     places_um: dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class ModelEntry:
     """A solid or a height map: its content; by part its volume, how exact that is, and its centre; or its scale.
 
@@ -181,7 +186,7 @@ class ModelEntry:
     window_px: list[int] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class ChromeEntry:
     """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`."""
 
@@ -200,7 +205,7 @@ class ChromeEntry:
     shapes_sha256: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_STRICT)
 class Manifest:
     """A whole mask order; `source` says where the height map came from, in the words of who asked."""
 
@@ -268,37 +273,24 @@ def plane_digest(plane: NDArray[np.uint8]) -> str:
     return sha256_bytes(np.packbits(plane, axis=1).data)
 
 
-def _value(kind: Any, value: Any, where: str) -> Any:
-    """Return `value` as `kind`, which is a plain type, a dataclass, a list of one, or one of these or None."""
-    if isinstance(kind, UnionType):
-        if value is None and NoneType in get_args(kind):
-            return None
-        kind = next(option for option in get_args(kind) if option is not NoneType)
-    if kind is Any:
-        return value
-    if get_origin(kind) is list:
-        if isinstance(value, list):
-            return [_value(get_args(kind)[0], item, f"{where}[{i}]") for i, item in enumerate(value)]
-    elif hasattr(kind, "__dataclass_fields__"):
-        return _entry(kind, value, where)
-    elif get_origin(kind) is dict:
-        if isinstance(value, dict):
-            return value
-    elif kind is float:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-    elif isinstance(value, kind) and not isinstance(value, bool):
-        return value
-    raise InputError(where, f"must be {kind}", repr(value)[:60], "Write the order again.")
+@cache
+def _adapter() -> TypeAdapter[Manifest]:
+    return TypeAdapter(Manifest)
 
 
-def _entry(kind: Any, data: Any, where: str) -> Any:
-    kinds = {field.name: field.type for field in fields(kind)}
-    odd = set(kinds) ^ set(data if isinstance(data, Mapping) else ())
-    if odd:
-        rule = "must hold exactly the keys of a mask order"
-        raise InputError(where, rule, f"a key missing or too many: {min(odd)!r}", "Write the order again.")
-    return kind(**{name: _value(kinds[name], data[name], f"{where}: {name}") for name in kinds})
+def _manifest_from(data: bytes, where: str) -> Manifest:
+    """Read a manifest from JSON; the first thing that is wrong in it is named by its key."""
+    try:
+        return _adapter().validate_json(data)
+    except ValidationError as errors:
+        found = errors.errors(include_url=False)[0]
+        odd = found["type"] in ("missing", "unexpected_keyword_argument")
+        *parents, last = found["loc"]
+        keys = parents if odd else [*parents, last]
+        name = "".join(f"[{key}]" if isinstance(key, int) else f": {key}" for key in keys)
+        rule = "must hold exactly the keys of a mask order" if odd else found["msg"].replace("Input should", "must")
+        got = f"a key missing or too many: {last!r}" if odd else repr(found["input"])[:60]
+        raise InputError(f"{where}{name}", rule, got, "Write the order again.") from errors
 
 
 def read_manifest(folder: str | Path) -> Manifest:
@@ -319,10 +311,11 @@ def read_manifest(folder: str | Path) -> Manifest:
         got = repr(data.get("format"))
         raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give the folder of a mask order.")
     digest = data.pop("sha256", None)
-    if digest != sha256_bytes(canonical_json(data)):
+    content = canonical_json(data)
+    if digest != sha256_bytes(content):
         rule = "its content must have the digest that it states"
         raise InputError(str(path), rule, "another one", "Fetch the manifest again, or write the order again.")
-    manifest: Manifest = _entry(Manifest, data, str(path))
+    manifest = _manifest_from(content, str(path))
     entries = [*manifest.files, *manifest.masks, manifest.chrome, *manifest.plates, *manifest.models]
     names = [entry.file for entry in entries]
     names += [manifest.level_map_file, manifest.combined_gds, manifest.combined_oasis, manifest.preview]
