@@ -27,17 +27,10 @@ _LIMIT = 2**31 - 1
 
 
 def edge_moves(bias_m: Sequence[float], dbu_m: float) -> tuple[int, ...]:
-    """Return how far the edges of every mask must move to undo the bias of the process.
-
-    Args:
-        bias_m: per mask, how far the process moves every edge of an etched area outward, metres.
-        dbu_m: database unit, metres.
-
-    Returns:
-        Moves in database units, positive where etched areas are drawn wider: ``-bias_m``, rounded.
+    """Return how far the edges of every mask must move outward to undo the bias of the process, database units.
 
     Raises:
-        InputError: a bias that is not finite.
+        InputError: a bias (metres, outward) that is not finite.
     """
     if not np.all(np.isfinite(bias_m)):
         raise InputError("CD bias", "must be finite", list(bias_m), "Give one length per mask.")
@@ -133,10 +126,10 @@ class _Raster(NamedTuple):
 
 
 def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shapes:
-    """Draw a plane with all its edges moved.
+    """Draw a plane ``[y, x]`` of 0 and 1 (1 where etched) with all its edges moved.
 
     Args:
-        plane: ``[y, x]`` of 0 and 1, 1 where etched.
+        plane: the plane.
         edges: where the pixel edges fall in the drawing.
         move_units: how far every edge of an etched area moves outward, database units; inward where negative.
 
@@ -163,15 +156,9 @@ def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shape
 
 
 def read_back(shapes: Shapes, edges: PixelEdges, move_units: int) -> NDArray[np.uint8]:
-    """Return the plane that a drawing was made from by `grown`, and prove that it was.
+    """Return the plane ``[y, x]`` that a drawing was made from by `grown`, and prove that it was.
 
-    Args:
-        shapes: the drawing.
-        edges: where the pixel edges fall in it before the move.
-        move_units: how far its edges were moved.
-
-    Returns:
-        ``[y, x]`` of 0 and 1, 1 where etched; drawing it again with this move covers exactly the same area.
+    Drawing it again with this move covers exactly the same area.
 
     Raises:
         InputError: polygons, rectangles that overlap, a coordinate that is no moved pixel edge, or an area that no

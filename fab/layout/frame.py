@@ -50,7 +50,7 @@ class Frame(NamedTuple):
         places: where on the wafer people measure, ``(x_m, y_m)`` by name.
         raster: rows and columns of dies.
         dies: middles of the dies, ``(x_m, y_m)``, row by row from the lowest y.
-        splits: how each of them is drawn, by number; 0 is the plate as ordered.
+        splits: how each of them is drawn, by number; 0 is the DOE as ordered.
         die_m: edge of a die, metres.
     """
 
@@ -77,16 +77,13 @@ def draw_frame(
 
     Args:
         wafer: what is filled.
-        plates: the masks in the order in which they are used.
+        plates: the photomasks in the order in which they are used.
         level_map: the DOE.
-        splits: how the DOE is drawn, the plate as ordered first; the others take one die each, the last ones.
+        splits: how the DOE is drawn, as ordered first; the others take one die each, the last ones.
         stem: name of the job; that of the top cell. The cells of the DOE are named after it and the split's code.
         minimum_line_m: narrowest line that the process prints, metres.
         chrome_m: diameter of the DOE with its chrome, metres.
         dbu_m: database unit, metres.
-
-    Returns:
-        The cells and the places.
 
     Raises:
         InputError: the wafer is too small for what is asked, or the dies lie too close.
@@ -201,11 +198,7 @@ def _raster(dies: tuple[int, int], pitch_m: float) -> tuple[tuple[float, float],
 
 
 def _room(wafer: Wafer, pitch_m: float, site: Part, monitor: Part) -> tuple[tuple[int, int], float, float]:
-    """Find room for the dies, the sites on the x axis, and the test structures below the dies.
-
-    Returns:
-        Rows and columns of dies, x of the right site, y of the test structures, metres.
-    """
+    """Return rows and columns of dies, x of the right site and y of the test structures, metres, that fit."""
     rasters = [(n, n) for n in _USUAL_DIES] if wafer.dies is None else [wafer.dies]
     for raster in rasters:
         found = _beside(wafer, _raster(raster, pitch_m), pitch_m, site, monitor)

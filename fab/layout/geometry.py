@@ -75,7 +75,7 @@ def layer_from(text: str) -> Layer:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What is drawn on one layer.
+    """The rectangles and polygons of one layer.
 
     Attributes:
         rectangles: ``(n, 4)`` int32: x0, y0, x1, y1 with x0 < x1 and y0 < y1, in database units.
@@ -118,12 +118,9 @@ class Reference:
 
     Attributes:
         cell: name of the placed cell.
-        x: where its origin comes to lie, in database units.
-        y: the same along y.
-        columns: copies along x.
-        rows: copies along y.
-        step_x: distance of the columns.
-        step_y: distance of the rows.
+        x: where its origin comes to lie, in database units; likewise `y`.
+        columns: copies along x, `step_x` apart.
+        rows: copies along y, `step_y` apart.
     """
 
     cell: str
@@ -137,13 +134,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A named drawing that others may place.
-
-    Attributes:
-        name: its name.
-        shapes: the layers in the order they are written.
-        references: the cells it places.
-    """
+    """A named drawing that others may place: its layers in the order they are written, and the cells it places."""
 
     name: str
     shapes: Mapping[Layer, Shapes]
@@ -178,7 +169,7 @@ class Layout:
 
 
 def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
-    """Cells put so that each comes after those that it places.
+    """Sort cells so that each comes after those that it places.
 
     Raises:
         ValueError: a name is there twice, a placed cell is missing, cells place each other, or there is not
@@ -267,13 +258,7 @@ def _axis_edges(count: int, pitch_fm: int, unit_fm: int) -> tuple[NDArray[np.int
 
 
 def pixel_edges(grid: Grid) -> PixelEdges:
-    """Place the pixel edges of a grid on a database unit.
-
-    Args:
-        grid: the raster; its centre is the origin of the drawing.
-
-    Returns:
-        The edges and the unit, 1 nm wherever it can be.
+    """Place the pixel edges of a grid on a database unit, 1 nm wherever it can be; the grid's centre is the origin.
 
     Raises:
         InputError: pixels finer than 10 nm, or a raster too large for 32-bit coordinates.
@@ -294,13 +279,7 @@ def pixel_edges(grid: Grid) -> PixelEdges:
 
 
 def require_name(name: str) -> str:
-    """Check the name of a cell or of a mask file (without its suffix).
-
-    Args:
-        name: the name.
-
-    Returns:
-        The same name.
+    """Check the name of a cell or of a mask file (without its suffix) and return it.
 
     Raises:
         InputError: characters other than A-Z, 0-9 and _, more than 32 of them, none, or "MAIN".
@@ -322,15 +301,9 @@ def chrome_layer(levels: Levels) -> Layer:
 
 
 def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
-    """Draw the chrome around the clear aperture as an annulus.
+    """Draw the chrome around the clear aperture as an annulus; a polygon means "chrome here".
 
-    Args:
-        level_map: the DOE.
-        dbu_m: database unit, metres.
-        chrome: overlap, outer radius and chord error.
-
-    Returns:
-        Sectors that share their radial edges; a polygon means "chrome here".
+    The polygons are sectors that share their radial edges, on a database unit of `dbu_m` (metres).
 
     Raises:
         InputError: the radii leave nothing, or do not fit 32-bit coordinates.

@@ -71,16 +71,12 @@ _GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {
 
 
 def letter_boxes(text: str) -> NDArray[np.int32]:
-    """Return the rectangles of a line of text in strokes.
+    """Return the disjoint rectangles of a line of text that stands on y = 0 from x = 0.
 
-    Args:
-        text: A-Z, 0-9, ``. - _ / : +`` and spaces.
-
-    Returns:
-        ``(n, 4)``: x0, y0, x1, y1, disjoint; the text begins at x = 0 and stands on y = 0.
+    They are ``(n, 4)``: x0, y0, x1, y1, in strokes.
 
     Raises:
-        InputError: another character.
+        InputError: another character than A-Z, 0-9, ``. - _ / : +`` and spaces.
     """
     odd = sorted(set(text) - set(_GLYPHS))
     if odd:
@@ -91,18 +87,12 @@ def letter_boxes(text: str) -> NDArray[np.int32]:
 
 
 def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
-    """Draw a line of text.
+    """Draw a line of text that stands on y = 0 from x = 0, with letters of a height in metres.
 
-    Args:
-        text: A-Z, 0-9, ``. - _ / : +`` and spaces.
-        height_m: height of the letters, metres; a stroke is a seventh of it, rounded to whole database units.
-        dbu_m: database unit, metres.
-
-    Returns:
-        Disjoint rectangles; the text begins at x = 0 and stands on y = 0.
+    A stroke is a seventh of the height, rounded to whole database units.
 
     Raises:
-        InputError: another character, or letters too small to be drawn.
+        InputError: a character that cannot be drawn (`letter_boxes`), or letters too small to be drawn.
     """
     stroke = round(height_m / HEIGHT / dbu_m)
     if stroke < 1:
@@ -112,17 +102,7 @@ def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
 
 
 def mask_label(job: str, plate: Photomask, reading: str, digest: str) -> list[str]:
-    """Return what is written on a mask.
-
-    Args:
-        job: name of the job.
-        plate: the mask.
-        reading: reading sense in words, such as "right-reading chrome down".
-        digest: hexadecimal digest of what the mask draws; its first eight digits are written.
-
-    Returns:
-        Lines in capitals, the first on top.
-    """
+    """Return what is written on a mask, in capitals, line by line from the top, with 8 digits of the digest."""
     if plate.bit is not None:
         what = f"mask {plate.bit + 1} bit {plate.bit} etch {plate.depth}"
     else:
@@ -136,7 +116,7 @@ def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: flo
     """Write the labels of several masks one below the other, so that no two meet on the wafer.
 
     Args:
-        labels: plates and their lines, the first on top.
+        labels: photomasks and their lines, the first on top.
         height_m: height of the letters, metres.
         dbu_m: database unit, metres.
 

@@ -185,8 +185,8 @@ def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw a site of the wafer where all masks are aligned.
 
     Args:
-        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`); the first makes the
-            marks.
+        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`); the first makes
+            the marks.
         dbu_m: database unit, metres.
 
     Returns:
@@ -207,13 +207,8 @@ def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
 def die_marks(plates: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw the smaller marks that stand beside a die, to measure the overlay there.
 
-    Args:
-        plates: all plates in the order in which they are used; the first makes the marks.
-        dbu_m: database unit, metres.
-
-    Returns:
-        The boxes with gaps of 5, 3 and 2 um, the verniers and the F of every plate, centred on the origin; layers and
-        places as in `alignment_site`.
+    They are the boxes with gaps of 5, 3 and 2 um, the verniers and the F of every plate, centred on the origin; layers
+    and places as in `alignment_site`.
     """
     first, others = plates[0], plates[1:]
     slots = [_die_slot(first, plate, dbu_m) for plate in others]
@@ -222,7 +217,7 @@ def die_marks(plates: Sequence[Photomask], dbu_m: float) -> Part:
 
 
 def _what_happens(first: Photomask, plate: Photomask) -> str:
-    """Say what working on a plate does to the marks in its slot, and to the others."""
+    """Describe what working on a plate does to the marks in its slot, and to the others."""
     dark_field = plate.tone == "clear"
     others = "The slots of all other masks stay under resist."
     if plate.makes == "etch":
@@ -245,14 +240,7 @@ def _what_happens(first: Photomask, plate: Photomask) -> str:
 
 
 def alignment_notes(plates: Sequence[Photomask]) -> tuple[str, ...]:
-    """Say in words how each mask is aligned and what happens to the marks.
-
-    Args:
-        plates: all plates in the order in which they are used; the first makes the marks.
-
-    Returns:
-        One paragraph for each plate, in their order; the first may end with a warning.
-    """
+    """Describe how each mask is aligned and what happens to the marks, a paragraph per plate."""
     first = plates[0]
     etched = first.makes == "etch"
     made = f"etched {first.depth} deep" if etched else "of chrome"

@@ -74,8 +74,8 @@ class Photomask:
         layer: number of its layer; marks are datatype 1 of it, test structures 2, lettering 3.
         tone: what polygons are on the plate, "clear" or "dark".
         makes: "etch", "liftoff" or "wet etch" of the chrome aperture, or the "zero layer".
-        bit: which bit of the levels it etches; None if it makes chrome.
-        depth_m: how deep it etches, metres; 0 if it makes chrome.
+        bit: bit of the levels that it etches; None if it makes chrome.
+        depth_m: depth that it etches, metres; 0 if it makes chrome.
     """
 
     layer: int
@@ -86,7 +86,7 @@ class Photomask:
 
     @property
     def name(self) -> str:
-        """What people call it: "mask 3", "chrome", "zero layer"; a mask's number is its bit + 1."""
+        """Usual name: "mask 3", "chrome", "zero layer"; a mask's number is its bit + 1."""
         return self.makes if self.makes == "zero layer" else "chrome" if self.bit is None else f"mask {self.bit + 1}"
 
     @property
@@ -96,7 +96,7 @@ class Photomask:
 
     @property
     def depth(self) -> str:
-        """How deep it etches, as text: "300 nm"."""
+        """Depth that it etches, as text: "300 nm"."""
         return f"{self.depth_m / NM:.6g} nm"
 
     def on(self, datatype: Literal[1, 2, 3]) -> Layer:
@@ -111,7 +111,7 @@ def photomasks_of(
     chrome: Literal["liftoff", "etch", "none"],
     zero_layer: bool,
 ) -> tuple[Photomask, ...]:
-    """List the plates of a job in the order in which they are used.
+    """List the photomasks of a job in the order in which they are used.
 
     The resist is the same at every step, so that chrome that is etched away around its polygons needs the other tone
     than chrome that is lifted off, or than an etch.
@@ -139,12 +139,8 @@ def photomasks_of(
 def without(areas: ArrayLike, holes: ArrayLike = ()) -> NDArray[np.float64]:
     """Cover some boxes less some others with disjoint boxes.
 
-    Args:
-        areas: ``(n, 4)``: x0, y0, x1, y1; they may overlap.
-        holes: likewise; what lies in one of them is left out.
-
-    Returns:
-        ``(m, 4)`` boxes in the unit of the arguments; their corners are corners of the arguments.
+    Boxes are ``(n, 4)``: x0, y0, x1, y1. `areas` may overlap; what lies in one of `holes` is left out. The corners of
+    the result are corners of the arguments.
     """
     areas, holes = (np.asarray(boxes, dtype=np.float64).reshape(-1, 4) for boxes in (areas, holes))
     both = np.concatenate([areas, holes])
@@ -164,15 +160,7 @@ def turned(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def block(layer: Layer, boxes_um: ArrayLike, dbu_m: float) -> Part:
-    """Draw boxes on one layer.
-
-    Args:
-        layer: where.
-        boxes_um: ``(n, 4)``: x0, y0, x1, y1 in micrometres, disjoint.
-        dbu_m: database unit, metres.
-
-    Returns:
-        The part; it has no places.
+    """Draw disjoint boxes ``(n, 4)`` (x0, y0, x1, y1 in micrometres) on one layer; the part has no places.
 
     Raises:
         ValueError: a corner that is no whole database unit.
@@ -199,15 +187,7 @@ def _shifted(part: Part, dx: int, dy: int) -> Part:
 
 
 def moved(part: Part, x_m: float, y_m: float) -> Part:
-    """Move a part, its places included.
-
-    Args:
-        part: what is moved.
-        x_m: how far along x, metres; rounded to whole database units.
-        y_m: how far along y.
-
-    Returns:
-        The moved copy.
+    """Move a part and its places by metres, rounded to whole database units.
 
     Raises:
         ValueError: the result does not fit 32-bit coordinates.
@@ -221,13 +201,7 @@ def prefixed(part: Part, prefix: str) -> Part:
 
 
 def joined(parts: Iterable[Part]) -> Part:
-    """Put parts together as they lie.
-
-    Args:
-        parts: one or more, all with the same database unit and with different names of places.
-
-    Returns:
-        One part. Layers come in the order of their numbers and datatypes.
+    """Put parts together as they lie; layers come in the order of their numbers and datatypes.
 
     Raises:
         ValueError: no part, different units, or a name of a place twice.
@@ -248,18 +222,7 @@ def joined(parts: Iterable[Part]) -> Part:
 
 
 def row(parts: Sequence[Part], gap_m: float) -> Part:
-    """Put parts side by side from left to right.
-
-    Args:
-        parts: one or more.
-        gap_m: blank space between the boxes of neighbours, metres.
-
-    Returns:
-        One part whose box begins at (0, 0); the lower edges of the boxes lie on y = 0.
-
-    Raises:
-        ValueError: as for `joined`.
-    """
+    """Put parts side by side from x = 0 on, their lower edges on y = 0, `gap_m` between their boxes."""
     placed, x = [], 0
     for part in parts:
         x0, y0, x1, _ = part.box
@@ -269,18 +232,7 @@ def row(parts: Sequence[Part], gap_m: float) -> Part:
 
 
 def column(parts: Sequence[Part], gap_m: float) -> Part:
-    """Put parts one below the other, the first on top.
-
-    Args:
-        parts: one or more.
-        gap_m: blank space between the boxes of neighbours, metres.
-
-    Returns:
-        One part whose box begins at (0, 0); the left edges of the boxes lie on x = 0.
-
-    Raises:
-        ValueError: as for `joined`.
-    """
+    """Put parts one below the other, the last one on y = 0, left edges on x = 0, `gap_m` between boxes."""
     placed, y = [], 0
     for part in reversed(parts):
         x0, y0, _, y1 = part.box

@@ -89,13 +89,12 @@ def rectangles(
     x_edges: NDArray[np.int32] | None = None,
     y_edges: NDArray[np.int32] | None = None,
 ) -> NDArray[np.int32]:
-    """Cover the set pixels of a bitmap with disjoint rectangles.
+    """Cover the set pixels of a bitmap ``[y, x]`` with disjoint rectangles.
 
     Args:
-        bitmap: ``[y, x]``, zero or not.
-        x_edges: coordinate of each pixel edge along x, increasing, shape ``(nx + 1,)``; pixel numbers
-            if left out.
-        y_edges: the same along y, shape ``(ny + 1,)``.
+        bitmap: zero or not.
+        x_edges: coordinate of each pixel edge along x, increasing, ``(nx + 1,)``; pixel numbers if left out.
+        y_edges: the same along y, ``(ny + 1,)``.
 
     Returns:
         ``(n, 4)`` int32: x0, y0, x1, y1 of each rectangle, sorted by y0, then x0.
@@ -111,7 +110,7 @@ def rectangles(
 
 @dataclass(frozen=True)
 class Painted:
-    """What was wrong with the rectangles of a plane; all zero for a sound one.
+    """Defects of the rectangles of a plane; all zero for a sound one.
 
     Attributes:
         overlaps: how many pixels were covered again.
@@ -166,11 +165,8 @@ def paint(
         rects: ``(n, 4)``: x0, y0, x1, y1, in the units of the edges.
         x_edges: coordinate of each pixel edge along x, increasing and even to half a pixel, ``(nx + 1,)``.
         y_edges: the same along y, ``(ny + 1,)``.
-        bit: which bit of the canvas the plane is, 0 to 7; a pixel where it is set counts as covered.
+        bit: bit of the canvas that is the plane, 0 to 7; a pixel where it is set counts as covered.
         canvas: ``[y, x]``, changed in place: the bit is set wherever a rectangle lies.
-
-    Returns:
-        What was wrong with the rectangles.
     """
     overlaps, strays, first = _paint(rects, x_edges, y_edges, np.uint8(1 << bit), canvas)
     return Painted(int(overlaps), int(strays), int(first))
@@ -195,14 +191,9 @@ def _smallest_runs(bitmap, none):  # pragma: no cover - compiled
 
 
 def smallest_runs(bitmap: NDArray[np.uint8]) -> tuple[int | None, int | None]:
-    """Return the narrowest line and the narrowest gap of a plane, along x or y.
+    """Return the narrowest line and the narrowest gap of a plane ``[y, x]``, along x or y, in pixels.
 
-    Args:
-        bitmap: ``[y, x]``, zero or not.
-
-    Returns:
-        The shortest run of set pixels, and the shortest run of clear pixels between two set ones, in
-        pixels; None where there is no such run.
+    They are the shortest run of set pixels, and of clear pixels between two set ones; None where there is no such run.
     """
     none = max(bitmap.shape) + 1
     lines = (np.ascontiguousarray(bitmap), np.ascontiguousarray(bitmap.T))
@@ -223,29 +214,17 @@ def _run_lengths(bitmap, out):  # pragma: no cover - compiled
 
 
 def run_lengths(bitmap: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return for every set pixel the length of the run of set pixels along x that it belongs to.
-
-    Args:
-        bitmap: ``[y, x]``, zero or not.
-
-    Returns:
-        ``[y, x]`` lengths in pixels, at most 255; 0 where the bitmap is clear.
-    """
+    """Return the length of the run along x of every set pixel ``[y, x]``, at most 255; 0 where it is clear."""
     out = np.zeros(bitmap.shape, dtype=np.uint8)
     _run_lengths(np.ascontiguousarray(bitmap), out)
     return out
 
 
 def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[np.int32]]:
-    """Draw the annulus between two centred circles as sectors without holes.
+    """Draw the annulus between two centred circles as sectors without holes; lengths in database units.
 
     The vertices lie on the circles (rounded to whole units) and the chords inside them, so the opening is
     smaller than the circle by at most the chord error. The number of sectors is a multiple of four.
-
-    Args:
-        inner: radius of the opening, in database units.
-        outer: outer radius, in database units.
-        chord_error: largest distance between a circle and its chords, in database units.
 
     Returns:
         One ``(v, 2)`` int32 polygon of x, y per sector, counter-clockwise from angle 0, at most
@@ -270,14 +249,7 @@ def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[
 
 
 def doubled_area(polygon: NDArray[np.integer]) -> int:
-    """Return twice the signed area of a polygon, exactly.
-
-    Args:
-        polygon: ``(v, 2)`` integer vertices, not closed.
-
-    Returns:
-        Twice the area in squared units; positive for counter-clockwise.
-    """
+    """Return twice the signed area of a polygon ``(v, 2)`` of integers, exact; counter-clockwise is positive."""
     x, y = polygon.astype(np.int64).T
     # Differences from the first vertex keep the products far from the limits of int64.
     x, y = x - x[0], y - y[0]

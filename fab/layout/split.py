@@ -22,7 +22,7 @@ class Split:
 
     Attributes:
         code: end of its cells' names.
-        words: what is special about it; empty for the plate as ordered.
+        words: what is special about it; empty for the DOE as ordered.
         lettering: what is written on its die.
         bits: which plane each mask draws, mask 0 first.
         moves: how far each mask moves the edges of etched areas outward, database units, mask 0 first.
@@ -41,11 +41,11 @@ def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float
     Args:
         wafer: says which are wanted.
         levels: the staircase.
-        moves: how far each mask of the plate as ordered moves its edges outward, database units.
+        moves: how far each mask of the DOE as ordered moves its edges outward, database units.
         dbu_m: database unit, metres.
 
     Returns:
-        The plate as ordered, the line-width splits in the order of the wafer's list, the control of the etch order.
+        The DOE as ordered, the line-width splits in the order of the wafer's list, the control of the etch order.
     """
     bits = tuple(range(levels.bits))
     splits = [Split("DOE", "", "", bits, moves)]

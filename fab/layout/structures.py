@@ -67,14 +67,9 @@ def _group(width_um: float, gaps: bool) -> list[Boxes]:
 def cd_bars(plate: Photomask, dbu_m: float) -> Part:
     """Draw the bars by which line widths are measured.
 
-    Args:
-        plate: the mask.
-        dbu_m: database unit, metres.
-
-    Returns:
-        A line per width, thinnest on top: lines at the left, gaps at the right; in each five side by side and one
-        alone along y, then the same along x. Places: the middle of the lone bar along y, "CD 2 um line, mask 3" and
-        "CD 2 um gap, mask 3".
+    A line per width, thinnest on top: lines at the left, gaps at the right; in each five side by side and one alone
+    along y, then the same along x. Places: the middle of the lone bar along y, "CD 2 um line, mask 3" and "CD 2 um gap,
+    mask 3".
     """
     parts = []
     for number, width in enumerate(BAR_WIDTHS_UM):
@@ -89,15 +84,9 @@ def cd_bars(plate: Photomask, dbu_m: float) -> Part:
 
 
 def depth_pads(plate: Photomask, dbu_m: float) -> Part:
-    """Draw the squares by which a depth is measured.
+    """Draw the squares by which a depth is measured, in a row on y = 0 with 0.15 mm of blank glass between them.
 
-    Args:
-        plate: the mask.
-        dbu_m: database unit, metres.
-
-    Returns:
-        Squares in a row with their middles on y = 0 and 0.15 mm of blank glass between them. Places: the middles,
-        "depth pad 100 um, mask 3", and a flat spot beside them, "flat by the pads, mask 3".
+    Places: the middles, "depth pad 100 um, mask 3", and a flat spot beside them, "flat by the pads, mask 3".
     """
     boxes, places, x = [], {}, 0.0
     for side in PAD_SIDES_UM:
@@ -109,15 +98,7 @@ def depth_pads(plate: Photomask, dbu_m: float) -> Part:
 
 
 def codes_by_depth(levels: Levels, bits: Sequence[int]) -> list[int]:
-    """List what some masks can etch together, from nothing to all of them.
-
-    Args:
-        levels: the staircase.
-        bits: the masks.
-
-    Returns:
-        ``2**len(bits)`` numbers whose bit k says that mask k etches, shallowest first.
-    """
+    """Return all sets of masks that can etch together, shallowest first, as numbers whose bit k is mask k."""
     codes = [sum(1 << bit for i, bit in enumerate(bits) if pick >> i & 1) for pick in range(1 << len(bits))]
     depth = {code: sum(levels.etch_depth_m(bit) for bit in bits if code >> bit & 1) for code in codes}
     return sorted(codes, key=lambda code: (depth[code], code))
@@ -138,16 +119,9 @@ def _stripes(codes: Sequence[int], bits: Sequence[int], width: int, height: int,
 def staircase(levels: Levels, bits: Sequence[int], step_m: float, dbu_m: float) -> Part:
     """Draw all the depths that some masks make together as one staircase down toward +x.
 
-    Args:
-        levels: the whole staircase of the process.
-        bits: the masks that take part.
-        step_m: width of a step, metres.
-        dbu_m: database unit, metres.
-
-    Returns:
-        Steps from the blank glass (which is not drawn) to the deepest floor, from x = 0 on, 0.2 mm high along y.
-        Places: on the blank glass before the first step and behind the last one, "staircase 16 levels, start" and
-        "..., end": a scan from one to the other crosses every step once.
+    Its steps are `step_m` (metres) wide. It goes from the blank glass (which is not drawn) to the deepest floor, from x
+    = 0 on, 0.2 mm high along y. Places: on the blank glass before the first step and behind the last one, "staircase 16
+    levels, start" and "..., end": a scan from one to the other crosses every step once.
     """
     codes = codes_by_depth(levels, bits)
     step, height = round(step_m / dbu_m), round(_STAIR_UM * UM / dbu_m)
@@ -168,16 +142,9 @@ def _stripe(pitch_m: float, dbu_m: float, minimum_line_m: float) -> int:
 
 
 def grating_periods_m(levels: Levels, pitch_m: float, dbu_m: float, minimum_line_m: float) -> tuple[float, float]:
-    """Return the periods of the binary and of the blazed grating, as they are drawn.
+    """Return the periods of the binary and of the blazed grating as they are drawn, metres.
 
-    Args:
-        levels: the staircase.
-        pitch_m: pixel pitch of the DOE, metres; taken as whole database units.
-        dbu_m: database unit, metres.
-        minimum_line_m: narrowest line and gap the process prints, metres.
-
-    Returns:
-        Both in metres: four stripes and as many stripes as levels; a stripe is the fewest pixels that can be printed.
+    They are four stripes and as many stripes as levels; a stripe is the fewest whole pixels that can be printed.
 
     Raises:
         InputError: a pitch below the database unit.
@@ -229,7 +196,7 @@ def process_monitor(
 
     Args:
         levels: the staircase.
-        plates: all plates (`fab.layout.part.photomasks_of`); the zero layer has no test structures.
+        plates: all photomasks (`fab.layout.part.photomasks_of`); the zero layer has no test structures.
         pitch_m: pixel pitch of the DOE, metres; the gratings are made of such pixels.
         dbu_m: database unit, metres.
         minimum_line_m: narrowest line and gap the process prints, metres; the gratings keep to it, the bars do not,

@@ -29,6 +29,9 @@ class Wafer:
             known for (`Process.expected`).
         line_splits_m: for each entry one die whose edges of etched areas are drawn so much further out, metres.
         order_control: whether one die draws the planes in the opposite order of depths (`fab.layout.split`).
+
+    Raises:
+        InputError: a wafer that its blanks do not hold, no die as ordered, or a length that cannot be.
     """
 
     diameter_m: float = 100 * MM
@@ -43,11 +46,7 @@ class Wafer:
     order_control: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: a wafer that its blanks do not hold, no die as ordered, or a length that cannot be.
-        """
+        """Check the values."""
         for name in ("diameter_m", "thickness_m", "blank_m"):
             if not 0 < getattr(self, name) < 1:
                 got = format_length(getattr(self, name))
@@ -64,10 +63,7 @@ class Wafer:
             self.require_room(self.dies)
 
     def require_room(self, dies: tuple[int, int]) -> None:
-        """Check that splits leave a die as ordered.
-
-        Args:
-            dies: rows and columns.
+        """Check that splits leave a die as ordered on so many rows and columns of dies.
 
         Raises:
             InputError: they do not.
