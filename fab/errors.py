@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-__all__ = ["CheckFailed", "InputError"]
-
 
 class InputError(ValueError):
     """Something that the user gave is wrong: a file, a key, a value (exit code 2).

@@ -22,18 +22,6 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 
-__all__ = [
-    "MANIFEST_NAME",
-    "atomic_folder",
-    "canonical_json",
-    "explain_os_error",
-    "read_json",
-    "read_npy",
-    "sha256_bytes",
-    "sha256_file",
-    "write_atomic",
-]
-
 MANIFEST_NAME = "manifest.json"
 
 _CURES = {

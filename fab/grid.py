@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 
-__all__ = ["Grid"]
-
 
 @dataclass(frozen=True)
 class Grid:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["HeightMap", "read_height", "refuse_where", "require_heights"]
 
 _PICTURES = (".png", *TIFF_FILES)
 

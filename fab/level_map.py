@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["LevelMap", "level_digest", "read_level_map", "write_level_map"]
 
 FORMAT = "doedesign level map 1"
 

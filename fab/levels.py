@@ -17,8 +17,6 @@ from fab.errors import InputError
 from fab.height import refuse_where, require_heights
 from fab.units import format_length
 
-__all__ = ["Levels", "height_of", "quantise", "quantise_wrapped", "require_levels", "wrapped_cells"]
-
 # Rows that are handled at once, so that a 4400 x 4400 map needs no second copy in float64.
 _ROWS = 256
 # Depths that agree so closely with 2^k steps are meant to be 2^k steps.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.levels import Levels, require_levels
 
-__all__ = ["level_map_from_planes", "planes"]
-
 
 def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
     """Split a level map into its etch masks.

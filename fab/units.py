@@ -13,8 +13,6 @@ from typing import Any
 
 from fab.errors import InputError
 
-__all__ = ["MM", "NM", "UM", "format_length", "metres", "parse_angle", "parse_length"]
-
 NM = 1e-9
 UM = 1e-6
 MM = 1e-3

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.units import NM, UM
 
-__all__ = ["GdstkReader", "LayerReading"]
-
 # The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
 _MOST_AT_ONCE = 2_200_000
 _BATCH = 100_000
@@ -32,7 +30,7 @@ _BATCH = 100_000
 
 @dataclass(frozen=True, eq=False)
 class LayerReading:
-    """One layer as the other library sees it.
+    """One layer as gdstk sees it.
 
     Attributes:
         cell: the cell of a DOE.
@@ -89,7 +87,7 @@ class _Counter:
             np.add.at(self.steps, rows * width + columns, np.int32(step))
 
     def reading(self) -> LayerReading:
-        """Sum the steps up, in place."""
+        """Sum the steps up, in place, and return the reading."""
         winding = self.steps.reshape(self.edges.y.size, self.edges.x.size)
         np.add.accumulate(winding, axis=0, out=winding)
         np.add.accumulate(winding, axis=1, out=winding)
@@ -113,7 +111,7 @@ class _Collector(_Counter):
         self.polygons.extend(points[~upright])
 
     def reading(self) -> LayerReading:
-        """Put everything together."""
+        """Return everything that was taken."""
         rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
         nothing = np.zeros((0, 0), dtype=np.int32)
         shapes = Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons))
@@ -164,7 +162,7 @@ class _Around:
         self.references: dict[str, tuple[Reference, ...]] = {}
 
     def add(self, cell: Any) -> None:
-        """Take what was read of a cell; its references come with every part of it."""
+        """Take a cell, or a part of it; its references come with every part."""
         self.references[cell.name] = tuple(self._references(cell))
         for polygon in cell.polygons:
             layer = Layer(polygon.layer, polygon.datatype)
@@ -185,7 +183,7 @@ class _Around:
                 yield Reference(name, x, y)
 
     def cells(self) -> list[Cell]:
-        """Hand everything over."""
+        """Return everything."""
         return [
             Cell(name, {layer: _sorted_out(found) for layer, found in self.shapes[name].items()}, references)
             for name, references in self.references.items()
@@ -193,7 +191,7 @@ class _Around:
 
 
 def _sorted_out(polygons: list[NDArray[np.int64]]) -> Shapes:
-    """Rectangles apart from all other polygons."""
+    """Separate the rectangles from all other polygons."""
     fours = np.array([points for points in polygons if len(points) == 4], dtype=np.int64).reshape(-1, 4, 2)
     low, high = fours.min(axis=1), fours.max(axis=1)
     sides = np.count_nonzero(fours != np.roll(fours, -1, axis=1), axis=2)
@@ -248,15 +246,7 @@ class GdstkReader:
             yield from self._taken(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
 
     def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[LayerReading]:
-        """Read an OASIS file, known to be whole, and unfold its repetitions.
-
-        Args:
-            path: the file.
-            layers: the layers of the DOE.
-
-        Yields:
-            One reading per layer, in the order given, and cell of the DOE.
-        """
+        """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell."""
         yield from self._taken(gdstk.read_oas(str(path), unit=UM), list(layers))
 
     def _taken(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:

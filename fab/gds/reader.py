@@ -40,8 +40,6 @@ from fab.gds.writer import (
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order
 from fab.units import UM
 
-__all__ = ["read_gds"]
-
 _BLOCK = 1 << 20
 # No record, and so no element of this kind, is longer than its 16-bit length says.
 _LONGEST = 1 << 17
@@ -71,9 +69,9 @@ def _from_real(data: bytes) -> float:
 def _walk(words, rects, rect_keys, points, ends, keys):  # pragma: no cover - compiled
     """Read whole elements from the front of the words; see `_Found` for the arrays that are filled.
 
-    Every record of a boundary ends on a multiple of four bytes from the start of the element, so an element
-    is a row of 32-bit words: BOUNDARY, LAYER with its number across two words, DATATYPE likewise, XY, points,
-    ENDEL. Returns how many words were read, how many rectangles and polygons, and why it stopped.
+    Every record of a boundary ends on a multiple of four bytes from the start of the element, so an element is a row of
+    32-bit words: BOUNDARY, LAYER with its number across two words, DATATYPE likewise, XY, points, ENDEL. Returns how
+    many words were read, how many rectangles and polygons, and why it stopped.
     """
     p = 0
     count = polygons = used = 0
@@ -154,7 +152,7 @@ class _Found:
         return 4 * int(read), int(why)
 
     def shapes(self) -> dict[Layer, Shapes]:
-        """Hand over everything, by layer number; the block lists are emptied on the way to save memory."""
+        """Return everything, by layer number; the block lists are emptied on the way to save memory."""
         none = [np.empty((0, 4), dtype=np.int32)]
         return {
             Layer(key >> 16 & 0xFFFF, key & 0xFFFF): Shapes(
@@ -272,17 +270,14 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
 def read_gds(path: str | Path) -> Layout:
     """Read a GDSII file of boundaries and upright references, and check every record of it.
 
-    Args:
-        path: the file.
-
     Returns:
         The layout, every cell after those that it places. Axis-parallel boundaries of four points come back as
-        rectangles, in the order of the file, all others (degenerate ones too) as polygons; layers are sorted and
-        have no names.
+        rectangles, in the order of the file, all others (degenerate ones too) as polygons; layers are sorted and have
+        no names.
 
     Raises:
-        InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names
-            the file and the offset.
+        InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the file and the
+            offset.
     """
     try:
         with open(path, "rb", buffering=0) as file:

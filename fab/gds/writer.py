@@ -22,8 +22,6 @@ from fab.files import explain_os_error
 from fab.layout.geometry import Layer, Layout, Reference, require_name
 from fab.units import UM
 
-__all__ = ["oasis_to_gds", "write_gds", "write_oasis"]
-
 # Record types: the kind of record, then the kind of its data.
 HEADER, BGNLIB, LIBNAME, UNITS, ENDLIB = 0x0002, 0x0102, 0x0206, 0x0305, 0x0400
 BGNSTR, STRNAME, ENDSTR, BOUNDARY, ENDEL = 0x0502, 0x0606, 0x0700, 0x0800, 0x1100
@@ -97,9 +95,7 @@ def _write_polygon(stream: BinaryIO, layer: Layer, polygon: NDArray[np.int32]) -
 def write_gds(path: str | Path, layout: Layout) -> None:
     """Write a layout as GDSII; the memory needed does not grow with the file.
 
-    Args:
-        path: the file; write it inside an `atomic_folder` where a half-written one would do harm.
-        layout: the geometry.
+    Write it inside an `atomic_folder` where a half-written file would do harm.
 
     Raises:
         InputError: the system refuses the path or the disk is full.
@@ -120,12 +116,7 @@ def write_gds(path: str | Path, layout: Layout) -> None:
 
 
 def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> None:
-    """Write the content of a GDSII file as compressed OASIS, with layer names.
-
-    Args:
-        path: the OASIS file.
-        gds: a file of `write_gds`.
-        layers: layers whose names are added.
+    """Write the content of a GDSII file of `write_gds` as compressed OASIS, with the names of `layers`.
 
     Raises:
         InputError: a file cannot be read or written.
@@ -149,15 +140,11 @@ def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> N
 
 
 def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:
-    """Write the content of an OASIS file as GDSII, through KLayout.
-
-    Args:
-        path: the OASIS file; it may be broken.
-        gds: the GDSII file.
-        most: how many shapes there may be. A broken count can stand for billions.
+    """Write the content of an OASIS file, which may be broken, as GDSII, through KLayout.
 
     Raises:
-        InputError: KLayout refuses the file, or it holds more shapes.
+        InputError: KLayout refuses the file, or it holds more than `most` shapes; a broken count can stand for
+            billions.
     """
     import klayout.db as kdb
 

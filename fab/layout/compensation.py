@@ -21,8 +21,6 @@ from fab.layout.geometry import PixelEdges, Shapes
 from fab.layout.polygons import rectangles, smallest_runs
 from fab.units import format_length
 
-__all__ = ["edge_moves", "grown", "read_back"]
-
 _LIMIT = 2**31 - 1
 
 

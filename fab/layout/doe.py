@@ -7,8 +7,6 @@ from fab.layout.compensation import grown
 from fab.layout.geometry import Cell, Chrome, Layout, chrome_layer, chrome_shapes, etch_layer, pixel_edges, require_name
 from fab.level_map import LevelMap
 
-__all__ = ["mask_layout"]
-
 
 def mask_layout(
     level_map: LevelMap,

@@ -25,8 +25,6 @@ from fab.layout.wafer import READING, Wafer
 from fab.level_map import LevelMap
 from fab.units import MM, UM, format_length
 
-__all__ = ["APERTURE", "BLANK", "DIE", "OUTLINES", "WAFER", "Frame", "draw_frame"]
-
 BLANK, WAFER = Layer(100, 0, "BLANK_OUTLINE"), Layer(101, 0, "WAFER_OUTLINE")
 APERTURE, DIE = Layer(102, 0, "CLEAR_APERTURE"), Layer(110, 0, "DIE_BOX")
 OUTLINES = (BLANK, WAFER, APERTURE, DIE)

@@ -24,23 +24,6 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, format_length
 
-__all__ = [
-    "Cell",
-    "Chrome",
-    "Layer",
-    "Layout",
-    "PixelEdges",
-    "Reference",
-    "Shapes",
-    "chrome_layer",
-    "chrome_shapes",
-    "etch_layer",
-    "in_order",
-    "layer_from",
-    "pixel_edges",
-    "require_name",
-]
-
 _NAME = re.compile(r"[A-Z0-9_]{1,32}")
 _FEMTO = 10**15
 _NANO_FM = 10**6

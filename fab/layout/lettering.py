@@ -16,8 +16,6 @@ from fab.layout.part import Part, Photomask, column, joined, moved
 from fab.layout.polygons import rectangles
 from fab.units import UM, format_length
 
-__all__ = ["HEIGHT", "label_block", "letter_boxes", "lettering", "mask_label", "written"]
-
 # Strokes in the height of a letter, and from one letter to the next.
 HEIGHT, _ADVANCE = 7, 6
 # From one line of text to the next, and from one label to the next.

@@ -30,8 +30,6 @@ from fab.layout.lettering import HEIGHT, letter_boxes, written
 from fab.layout.part import Part, Photomask, block, centred, column, joined, moved, row, turned, without
 from fab.units import NM, UM
 
-__all__ = ["BOXES", "VERNIER_STEP_M", "alignment_notes", "alignment_site", "die_marks"]
-
 Boxes = NDArray[np.float64]
 
 

@@ -21,22 +21,6 @@ from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.units import NM, UM
 
-__all__ = [
-    "ZERO_LAYER",
-    "Part",
-    "Photomask",
-    "block",
-    "centred",
-    "column",
-    "joined",
-    "moved",
-    "photomasks_of",
-    "prefixed",
-    "row",
-    "turned",
-    "without",
-]
-
 ZERO_LAYER = 10
 
 Tone = Literal["clear", "dark"]

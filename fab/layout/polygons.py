@@ -18,17 +18,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = [
-    "MAX_VERTICES",
-    "Painted",
-    "annulus_sectors",
-    "doubled_area",
-    "paint",
-    "rectangles",
-    "run_lengths",
-    "smallest_runs",
-]
-
 # The classic limit of 200 points per GDSII boundary counts the closing point.
 MAX_VERTICES = 199
 

@@ -13,8 +13,6 @@ from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.units import format_length
 
-__all__ = ["Split", "splits_of"]
-
 
 @dataclass(frozen=True)
 class Split:

@@ -24,18 +24,6 @@ from fab.layout.part import Part, Photomask, block, centred, column, joined, mov
 from fab.levels import Levels
 from fab.units import UM, format_length
 
-__all__ = [
-    "BAR_WIDTHS_UM",
-    "PAD_SIDES_UM",
-    "STEP_M",
-    "cd_bars",
-    "codes_by_depth",
-    "depth_pads",
-    "grating_periods_m",
-    "process_monitor",
-    "staircase",
-]
-
 Boxes = NDArray[np.float64]
 
 BAR_WIDTHS_UM = (1.0, 1.5, 2.0, 3.0, 5.0)

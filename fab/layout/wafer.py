@@ -6,8 +6,6 @@ from typing import Literal
 from fab.errors import InputError
 from fab.units import MM, UM, format_length
 
-__all__ = ["READING", "Wafer"]
-
 READING = "right-reading chrome down"
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}

@@ -9,8 +9,6 @@ from fab.layout.polygons import doubled_area
 from fab.manifest.records import CellEntry, LayerEntry
 from fab.units import UM
 
-__all__ = ["cell_entry", "geometry", "shapes_digest"]
-
 
 def geometry(shapes: Shapes, dbu_m: float) -> dict[str, object]:
     """Count, area and box of shapes in the units of the manifest.

@@ -22,24 +22,6 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, UM
 
-__all__ = [
-    "CONVENTIONS",
-    "FORMAT",
-    "CellEntry",
-    "ChromeEntry",
-    "DrawnEntry",
-    "FileEntry",
-    "LayerEntry",
-    "Manifest",
-    "MaskEntry",
-    "ModelEntry",
-    "PlateEntry",
-    "SplitEntry",
-    "WaferEntry",
-    "plane_digest",
-    "read_manifest",
-]
-
 FORMAT = "doedesign mask order 1"
 
 # Nothing is converted: a number in quotes is no number.

@@ -24,8 +24,6 @@ from fab.manifest.records import (
 from fab.order.order import Order
 from fab.units import MM, NM, UM, format_length
 
-__all__ = ["chrome_entry", "describe_edges", "mask_entry", "plate_entry", "split_entry", "wafer_entry"]
-
 
 def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
     """Return the manifest's entry of an etch mask, from the drawing and from its plane before the edges moved."""

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["OnViolation", "Order", "order_id", "plan_order"]
-
 log = logging.getLogger("doedesign")
 
 OnViolation = Literal["warn", "fail", "fix"]

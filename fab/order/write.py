@@ -63,8 +63,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["Add", "WrittenOrder", "mask_file", "write_order", "write_planned"]
-
 log = logging.getLogger("doedesign")
 _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 

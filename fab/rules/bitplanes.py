@@ -12,20 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = [
-    "ALL",
-    "NONE",
-    "Words",
-    "corners",
-    "count",
-    "count_starts",
-    "erode",
-    "longest_runs",
-    "pack",
-    "split",
-    "windows",
-]
-
 Words = NDArray[np.uint64]
 
 NONE = np.uint64(0)
@@ -68,15 +54,9 @@ def _pack(levels, top, spans, out):  # pragma: no cover - compiled
 
 
 def pack(level_map: NDArray[np.uint8], bits: int, spans: NDArray[np.int64]) -> Words:
-    """Split a level map into packed etch masks.
+    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into packed etch masks ``[bit, y, word]``.
 
-    Args:
-        level_map: C-ordered levels ``[y, x]`` below ``2**bits``.
-        bits: number of masks.
-        spans: ``(ny, 2)`` first column and end column of every row that may be etched; nothing is, beyond.
-
-    Returns:
-        ``[bit, y, word]``, a pixel set where the mask etches it.
+    A pixel is set where the mask etches it; `spans` holds first and end column of every row that may be, ``(ny, 2)``.
     """
     ny, nx = level_map.shape
     top = np.uint64(2**bits - 1)
@@ -153,16 +133,9 @@ def erode(words: Words, axis: int, length: int, outside: np.uint64) -> None:  # 
 
 @njit(cache=True, nogil=True)
 def split(words: Words, axis: int, outside: np.uint64, alone: Words) -> Any:  # pragma: no cover - compiled
-    """Take the runs of one pixel out of a plane and shorten, in place, all others by one at their end.
+    """Take the runs of one pixel out of a plane into `alone`; return how many there were.
 
-    Args:
-        words: the plane.
-        axis: along which the runs lie.
-        outside: what lies beyond its sides.
-        alone: filled with the runs of one pixel.
-
-    Returns:
-        How many there were.
+    All others are shortened, in place, by one at their end. `outside` is what lies beyond the sides of the plane.
     """
     ny, nw = words.shape
     total = 0
@@ -192,15 +165,7 @@ def split(words: Words, axis: int, outside: np.uint64, alone: Words) -> Any:  # 
 
 @njit(cache=True, nogil=True)
 def corners(words: Words, found: Words) -> Any:  # pragma: no cover - compiled
-    """Find where pixels touch only at a corner.
-
-    Args:
-        words: the plane; the outside is clear.
-        found: filled with a set pixel (y, x) for the corner between it and (y + 1, x + 1).
-
-    Returns:
-        How many corners there are.
-    """
+    """Mark pixel (y, x) in `found` where (y, x) and (y + 1, x + 1) touch only at a corner; return how many."""
     ny, nw = words.shape
     total = 0
     found[ny - 1] = NONE

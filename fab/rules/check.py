@@ -41,18 +41,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = [
-    "OffGrid",
-    "PlaneRules",
-    "Rules",
-    "RulesReport",
-    "Violation",
-    "Widths",
-    "check",
-    "rules_from",
-    "shortest_run",
-]
-
 Kind = Literal["line", "space", "kissing corner"]
 
 _MOST_PLACES = 20
@@ -63,13 +51,16 @@ _FEMTO = 10**15
 
 @dataclass(frozen=True)
 class Rules:
-    """What a mask may hold.
+    """Limits of what a mask may hold.
 
     Attributes:
         minimum_line_m: narrowest etched line, metres; 0 for any.
         minimum_space_m: narrowest gap between etched lines, metres; 0 for any.
         address_m: address unit of the mask writer, metres; None for the database unit of the drawing.
         window_m: side of the square windows in which the density is compared, metres.
+
+    Raises:
+        InputError: a length that is negative or not finite, or an address unit or window of no size.
     """
 
     minimum_line_m: float = 0.0
@@ -78,11 +69,7 @@ class Rules:
     window_m: float = 100 * UM
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: a length that is negative or not finite, or an address unit or window of no size.
-        """
+        """Check the values."""
         cure = "Give a length such as 1e-6."
         for name in ("minimum_line_m", "minimum_space_m"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -137,7 +124,7 @@ class Widths:
 
 @dataclass(frozen=True)
 class PlaneRules:
-    """What the rules say of one etch mask.
+    """Lines, spaces, corners and densities of one etch mask.
 
     Attributes:
         bit: the mask's bit; its number is one more.
@@ -161,7 +148,7 @@ class PlaneRules:
 
     @property
     def breaks(self) -> int:
-        """How many places break a rule of the process; one that prints everything is broken by nothing."""
+        """Number of places that break a rule of the process; a process that prints everything has no rules."""
         fine = self.line.minimum_m == self.space.minimum_m == 0
         return 0 if fine else self.line.narrow + self.space.narrow + self.kissing
 
@@ -185,7 +172,7 @@ class OffGrid:
 
 @dataclass(frozen=True, eq=False)
 class RulesReport:
-    """What the rules say of a mask set.
+    """Rules checked on every etch mask of a level map; lengths in metres.
 
     Attributes:
         level_map: the DOE that was checked.
@@ -206,7 +193,7 @@ class RulesReport:
 
     @property
     def printable(self) -> bool:
-        """Whether no line and no space is too narrow. Touching corners print, though nobody knows as what."""
+        """Whether no line and no space is too narrow. Touching corners print, but nobody knows as what."""
         return not any(plane.line.narrow or plane.space.narrow for plane in self.planes)
 
     def plot(self, ax: "Axes | None" = None, title: str = "") -> "FigureBase":
@@ -220,7 +207,7 @@ class RulesReport:
         return html_of(f"Rules of {self.level_map.name}", rows, self.plot())
 
     def headlines(self) -> tuple[str, ...]:
-        """Say in one sentence per mask why the process cannot print it; empty if it can."""
+        """Return one sentence per mask that the process cannot print, saying why."""
         return tuple(text for plane in self.planes for text in _headline(plane))
 
     def as_record(self) -> dict[str, Any]:
@@ -356,11 +343,7 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
 
     Args:
         level_map: the DOE; outside its clear aperture nothing is etched.
-        process: what the masks may hold: rules, or a process or the name of a stock process, whose rules are the
-            narrowest line and space that it prints.
-
-    Returns:
-        The numbers of every mask, its worst places, and the raster against the address grid.
+        process: rules; or a process, or the name of a stock process, whose narrowest line and space are the rules.
 
     Raises:
         InputError: a process of another staircase, or one of an unknown name.

@@ -29,8 +29,6 @@ from fab.process import Process
 from fab.rules.check import Rules, RulesReport, check, shortest_run
 from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
 
-__all__ = ["Repair", "RepairCost", "repair", "repaired"]
-
 # How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
 _WEIGHTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 # So much that no gain of light is worth a broken rule.
@@ -43,14 +41,14 @@ _WIDEST = 32
 
 @dataclass(frozen=True)
 class RepairCost:
-    """What a repair changed and what it costs, over the clear aperture.
+    """Extent and cost of a repair, over the clear aperture.
 
     Attributes:
         changed_share: share of the pixels that got another level.
         rms_height_m: rms of the change of height, metres.
         efficiency: |mean exp(2 pi i dh waves_per_metre)|^2: share of the light that still goes where it was meant to.
         broken_before: places that broke a rule, over all masks.
-        broken_after: places that still do.
+        broken_after: places that still do: corners that touch, at worst; no narrow line and no narrow space.
     """
 
     changed_share: float
@@ -70,14 +68,7 @@ class RepairCost:
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A repaired level map.
-
-    Attributes:
-        level_map: the repaired map.
-        cost: what changed. `RepairCost.broken_after` says honestly what could not be repaired: corners that touch, at
-            worst; no narrow line and no narrow space.
-        rules: the rules checked on the repaired map.
-    """
+    """A repaired level map: the map, the cost of its repair, and the rules checked on it."""
 
     level_map: LevelMap
     cost: RepairCost
@@ -174,7 +165,7 @@ def _sweep_all(task: RepairTask, weight: float, changed_too: bool) -> int:
 
 
 def _freeze_all(task: RepairTask, shift: int) -> bool:
-    """Freeze squares, all shifted alike, until no line or space is too narrow; tell whether anything was broken."""
+    """Freeze squares, all shifted alike, until no line or space is too narrow; return whether anything was broken."""
     side = max(task.line, task.space)
     origin = task.pad - shift % side
     frozen = np.zeros([-(-(n - task.pad - origin) // side) for n in task.etched.shape], dtype=np.uint8)

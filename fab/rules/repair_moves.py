@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["RepairTask", "broken", "loss", "offends", "sweep"]
-
 
 class RepairTask(NamedTuple):
     """A level map in work, on maps that are padded by `pad` pixels of blank glass.
@@ -76,7 +74,7 @@ def _kissing(etched, y0, x0, y1, x1):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def broken(task, y0, x0, y1, x1):  # pragma: no cover - compiled
-    """Return what is broken by and about the pixels of a rectangle: all that a change of them can change."""
+    """Return how much is broken by and about the pixels of a rectangle: all that a change of them can change."""
     reach = max(task.line, task.space)
     missing = 0
     if reach > 1:
@@ -89,7 +87,7 @@ def broken(task, y0, x0, y1, x1):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def offends(task, y, x):  # pragma: no cover - compiled
-    """Tell whether a pixel itself lies in a short run or at a kissing corner."""
+    """Whether a pixel itself lies in a short run or at a kissing corner."""
     if _kissing(task.etched, y, x, y + 1, x + 1):
         return True
     own = np.int64(task.etched[y, x])

@@ -9,8 +9,6 @@ import numpy as np
 
 from fab.rules import bitplanes as bits
 
-__all__ = ["NarrowRuns", "count_bounded", "narrow_runs", "shortest"]
-
 _MOST_PLACES = 5
 # Runs that are measured to find long ones, so that a map of millions costs no more than one of thousands.
 _LOOKS = 20_000

@@ -17,8 +17,6 @@ from fab.level_map import LevelMap
 from fab.runsheet.write import BARS, FORMAT, PADS
 from fab.units import NM, UM
 
-__all__ = ["AsBuilt", "ChromeMeasured", "MaskMeasured", "read_as_built"]
-
 
 class MaskMeasured(NamedTuple):
     """What was measured of one etch mask; metres, None where it was not.

@@ -18,19 +18,6 @@ from fab.levels import Levels
 from fab.process import Normal, Process
 from fab.units import NM, UM, format_length
 
-__all__ = [
-    "RATES_M_PER_S",
-    "Action",
-    "Step",
-    "depths_m",
-    "etch_time_s",
-    "next_target_m",
-    "resist_thickness_m",
-    "spread_of",
-    "steps_of",
-    "tone_words",
-]
-
 Deposition = Literal["evaporated", "sputtered"]
 
 # What plasmas of different power and gas do to silica; 20 nm/min is usual for plain reactive ion etching.

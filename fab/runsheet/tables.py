@@ -14,8 +14,6 @@ from fab.level_map import LevelMap
 from fab.process import Process
 from fab.units import NM
 
-__all__ = ["Die", "Grating", "Importance", "PhotomaskFile", "PredictedMetrics", "Predictions", "RunSheet"]
-
 
 class PhotomaskFile(NamedTuple):
     """The file of one plate.

@@ -30,8 +30,6 @@ from fab.runsheet.recipe import (
 from fab.runsheet.tables import Predictions, RunSheet
 from fab.units import MM, NM, UM, format_length
 
-__all__ = ["BARS", "FORMAT", "PADS", "html_page", "record", "write_run_sheet"]
-
 FORMAT = "doedesign run sheet 1"
 
 # The blanks of every mask: CD bars and depth pads by name, with their drawn width in metres.

@@ -16,8 +16,6 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 
-__all__ = ["Columns", "PixelWindow", "reduced_cells", "whole", "window_cells"]
-
 _MOST_CELLS = 4_000_000
 # Heights that differ by less than this part of the relief are one height that was rounded differently.
 _CLOSEST = 1e-9

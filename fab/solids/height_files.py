@@ -31,8 +31,6 @@ from fab.solids.columns import PixelWindow, whole
 from fab.solids.model import DoeModel, ModelKind, Stated, window_of
 from fab.units import MM, format_length
 
-__all__ = ["KINDS", "write_greymap", "write_npy", "write_tiff", "write_zemax_sag"]
-
 # OpticStudio's manual asks for this many points along either axis.
 _FEWEST_ZEMAX = 5
 _SAG_CELLS = 500

@@ -21,8 +21,6 @@ from fab.errors import CheckFailed, InputError
 from fab.solids.columns import Columns
 from fab.units import UM, format_length
 
-__all__ = ["Mesh", "closed_volume_m3", "relief_mesh"]
-
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -236,15 +234,10 @@ def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0
 
 
 def closed_volume_m3(mesh: Mesh) -> float:
-    """Let manifold3d judge whether a mesh is closed, and measure it.
+    """Return the volume of a mesh that manifold3d finds to be closed, cubic metres.
 
-    The library works in float32 here, on micrometres, as the files do.
-
-    Args:
-        mesh: the mesh; triangles without common vertices, as in an STL file, are joined where they touch.
-
-    Returns:
-        The volume that the library finds, cubic metres.
+    The library works in float32 here, on micrometres, as the files do. Triangles without common vertices, as in an STL
+    file, are joined where they touch.
 
     Raises:
         CheckFailed: the mesh is open, turned inside out or otherwise not the skin of a solid.

@@ -18,8 +18,6 @@ from fab.solids.model import BASE_M, MESH_CELLS, DoeModel, MeshedRelief, ModelKi
 from fab.solids.step_files import volume_problems
 from fab.units import MM
 
-__all__ = ["PATCHES", "RELIEFS"]
-
 # What is left of a volume: picometres as text or single precision.
 _RELATIVE_ERROR, _SINGLE = 1e-6, 2.0**-23
 
@@ -47,7 +45,7 @@ def _problems(path: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
 
 
 def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
-    """Look at what faces up: it must cover every column once, at the height of that column."""
+    """Check that what faces up covers every column once, at the height of that column."""
     a, b, c = (mesh.vertices_m[mesh.triangles[:, corner]] for corner in range(3))
     along, across = b - a, c - a
     areas = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2

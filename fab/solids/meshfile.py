@@ -22,8 +22,6 @@ from fab.files import explain_os_error, write_atomic
 from fab.solids.mesh import Mesh
 from fab.units import MM, UM
 
-__all__ = ["Unit", "read_mesh", "write_3mf", "write_glb", "write_stl"]
-
 Unit = Literal["mm", "um"]
 _UNIT_M = {"mm": MM, "um": UM}
 _3MF_UNITS = {"mm": "millimeter", "um": "micron"}
@@ -106,12 +104,7 @@ def _rows_of_xml(values: NDArray[np.int64], decimals: int, words: tuple[bytes, .
 
 
 def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
-    """Write a mesh as 3MF, which states its unit; numbers are rounded to a picometre.
-
-    Args:
-        path: the file.
-        mesh: the mesh.
-        unit: ``"mm"`` or ``"um"``.
+    """Write a mesh as 3MF, which states its unit (``"mm"`` or ``"um"``); numbers are rounded to a picometre.
 
     Raises:
         InputError: the file cannot be written.
@@ -147,10 +140,6 @@ def write_glb(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh as binary glTF for viewers: metres, as the format demands, float32.
 
     A viewer's up is +y, so the one node turns z up; what was +y points away from the viewer.
-
-    Args:
-        path: the file.
-        mesh: the mesh.
 
     Raises:
         InputError: the file cannot be written.
@@ -193,12 +182,9 @@ def write_glb(path: str | Path, mesh: Mesh) -> None:
 
 
 def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
-    """Write a mesh as binary STL, float32; the format knows no unit, so the header says it in words.
+    """Write a mesh as binary STL, float32, in ``"mm"`` or ``"um"``.
 
-    Args:
-        path: the file; let its name say the unit too.
-        mesh: the mesh.
-        unit: ``"mm"`` or ``"um"``.
+    The format knows no unit, so the header says it in words; let the name of the file say it too.
 
     Raises:
         InputError: the file cannot be written.
@@ -251,8 +237,8 @@ def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
         The triangles in metres, z up (the axes of a glTF file are turned back).
 
     Raises:
-        InputError: the file is missing, damaged, of another kind, or holds no mesh or several; or the unit
-            of an STL file is not given.
+        InputError: the file is missing, damaged, of another kind, or holds no mesh or several; or the unit of an STL
+            file is not given.
     """
     path = Path(path)
     kind = path.suffix.lower()

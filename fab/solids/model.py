@@ -15,8 +15,6 @@ from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.patch import Patch
 from fab.units import format_length
 
-__all__ = ["BASE_M", "MESH_CELLS", "DoeModel", "MeshedRelief", "ModelKind", "Stated", "window_of"]
-
 MESH_CELLS = 400
 # Glass below the deepest floor of a mesh or a patch.
 BASE_M = 10e-6
@@ -80,7 +78,7 @@ def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> Me
 
 @dataclass(frozen=True)
 class Stated:
-    """What the manifest says of a model's file; the fields are those of `fab.manifest.records.ModelEntry`."""
+    """What a writer states of its file for the manifest (`fab.manifest.records.ModelEntry`)."""
 
     content: str
     volumes_mm3: Mapping[str, float] = field(default_factory=dict)

@@ -20,8 +20,6 @@ from fab.solids.columns import Columns, PixelWindow, window_cells
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
-__all__ = ["Patch", "patch_body", "patch_step"]
-
 _MOST_BOXES = 2000
 _NO_MORE_BOXES = 20_000
 _MOST_PIXELS = 1000
@@ -48,7 +46,7 @@ class Patch:
         """Return the pixels nearest to the patch.
 
         Raises:
-            InputError: it has no pixel or reaches beyond the map.
+            InputError: there is none, or the patch reaches beyond the map.
         """
         (ny, nx), pitch_m = grid.shape, grid.pitch_m
         count = round(self.width_m / pitch_m) if abs(self.width_m) < math.inf else 0
@@ -120,7 +118,7 @@ def patch_step(
         level_map: the DOE.
         window: the pixels to write.
         base_m: glass below the deepest floor, metres.
-        most_boxes: refuse windows that need more; at most 20000, which make a file of about 140 MB.
+        most_boxes: most boxes allowed, up to 20000, which make a file of about 140 MB.
 
     Raises:
         InputError: too many boxes, a window off the map, or a file that cannot be written.

@@ -15,8 +15,6 @@ from fab.level_map import LevelMap
 from fab.solids.substrate import Rings
 from fab.units import NM
 
-__all__ = ["pixel_share", "ring_levels", "rings_from_levels"]
-
 # A narrower rest of a ring at the aperture belongs to the ring before it.
 _REST_M = 1 * NM
 _CLOSEST_M = 0.3 * NM
@@ -56,11 +54,9 @@ def _ring_levels(level_map, inside, out):  # pragma: no cover - compiled
 
 
 def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
-    """Return the rings that a map is the raster of.
+    """Return the level of every ring that a map is the raster of, from the axis to the edge of the aperture, ``(n,)``.
 
-    Returns:
-        The level of every ring from the axis to the edge of the aperture, ``(n,)``; or None if the map is no raster of
-        rings. Rings in which no pixel's centre lies are not etched.
+    None if the map is no raster of rings. Rings in which no pixel's centre lies are not etched.
     """
     grid, aperture_m = level_map.grid, level_map.aperture_m
     count = max(1, math.ceil((aperture_m / 2 - _REST_M) / grid.pitch_m))
@@ -71,7 +67,7 @@ def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
 
 
 def rings_from_levels(ring_level: NDArray[np.uint8], level_map: LevelMap) -> Rings:
-    """Return the rings of a map as they are turned: one pixel wide each, the last one as far as the clear aperture."""
+    """Return the rings of a map: one pixel wide each, the last one as far as the clear aperture."""
     levels = level_map.levels
     outer_m = np.arange(1, len(ring_level) + 1) * np.float64(level_map.grid.pitch_m)
     outer_m[-1] = level_map.aperture_m / 2

@@ -22,31 +22,12 @@ from fab.errors import CheckFailed, InputError
 from fab.files import explain_os_error, write_atomic
 from fab.units import MM
 
-__all__ = [
-    "Body",
-    "boxes",
-    "copies",
-    "disc",
-    "outline",
-    "plate",
-    "revolved",
-    "slab",
-    "step_bodies",
-    "step_volumes_m3",
-    "write_step",
-]
-
 _HEADER_TIME = "2000-01-01T00:00:00"
 _COUNTED = re.compile(rb"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\()'\d+',([^;]*);")
 
 
 class Body(NamedTuple):
-    """What a part weighs, and where.
-
-    Attributes:
-        volume_m3: its volume, cubic metres.
-        centre_m: its centre of mass x, y, z, metres.
-    """
+    """Volume of a part, cubic metres, and its centre of mass x, y, z, metres."""
 
     volume_m3: float
     centre_m: tuple[float, float, float]
@@ -179,15 +160,12 @@ def _rim(shell: Any, radius_m: float) -> Any:
 
 
 def plate(surface: Any, thickness_m: float, profile_m: list[tuple[float, float]]) -> Any:
-    """Return a plate below a face at z = 0, with a revolved relief set into the face.
+    """Return a plate below a face at z = 0, with a revolved relief set into the face, as one solid.
 
     Args:
         surface: the face of the plate's outline.
         thickness_m: thickness, metres.
         profile_m: corners r, z of the relief from the axis to its rim at z = 0, metres.
-
-    Returns:
-        One solid.
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace, BRepBuilderAPI_MakeSolid, BRepBuilderAPI_MakeWire
@@ -234,12 +212,7 @@ def _recount() -> Callable[[re.Match[bytes]], bytes]:
 
 
 def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
-    """Write named parts as one STEP assembly whose bytes depend on them alone.
-
-    Args:
-        path: the file.
-        name: name of the assembly.
-        parts: what the functions of this file return, by name.
+    """Write named parts, shapes of the kernel, as one STEP assembly whose bytes depend on them alone.
 
     Raises:
         InputError: the file cannot be written.
@@ -289,13 +262,7 @@ def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
 
 
 def step_bodies(path: str | Path) -> dict[str, Body]:
-    """Read a STEP file back and weigh its solids.
-
-    Args:
-        path: the file.
-
-    Returns:
-        Volume and centre of mass by part name; parts without a volume are left out.
+    """Read a STEP file back and return its bodies by part name; parts without a volume are left out.
 
     Raises:
         InputError: the file is missing or holds no STEP parts.

@@ -18,8 +18,6 @@ from fab.solids.step import Body, step_bodies
 from fab.solids.substrate import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
 from fab.units import MM, format_length
 
-__all__ = ["DIE", "PATCH", "WAFER", "volume_problems"]
-
 # Double precision, less what the kernel loses.
 _RELATIVE_ERROR = 1e-11
 

@@ -22,17 +22,6 @@ from fab.errors import InputError
 from fab.solids.step import Body, copies, disc, outline, plate, revolved, slab, write_step
 from fab.units import NM, format_length
 
-__all__ = [
-    "ChromeRing",
-    "Rings",
-    "Substrate",
-    "substrate_bodies",
-    "substrate_step",
-    "substrate_volumes_m3",
-    "wafer_bodies",
-    "wafer_step",
-]
-
 # The kernel takes points 1e-7 mm apart for one; edges must be clearly longer.
 _SHORTEST_M = 0.3 * NM
 _SAME_M = 1e-3 * NM
@@ -47,6 +36,9 @@ class Substrate:
         width_m: side of the square or diameter of the disc, metres.
         thickness_m: thickness, metres.
         flat_m: length of the wafer's flat, metres; 0 for none.
+
+    Raises:
+        InputError: a length is not positive, or the flat does not fit the outline.
     """
 
     outline: Literal["die", "wafer"]
@@ -55,11 +47,7 @@ class Substrate:
     flat_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: a length is not positive, or the flat does not fit the outline.
-        """
+        """Check the values."""
         for name, value in (("width", self.width_m), ("thickness", self.thickness_m)):
             if not 0 < value < math.inf:
                 raise InputError(
@@ -97,12 +85,10 @@ class Substrate:
 
 @dataclass(frozen=True)
 class ChromeRing:
-    """The chrome around the clear aperture.
+    """The chrome around the clear aperture: radius of the opening, outer radius and thickness of the film, metres.
 
-    Attributes:
-        inner_m: radius of the opening, metres.
-        outer_m: outer radius, metres.
-        thickness_m: thickness of the film, metres.
+    Raises:
+        InputError: the radii leave no ring, or the film has no thickness.
     """
 
     inner_m: float
@@ -110,11 +96,7 @@ class ChromeRing:
     thickness_m: float = 100 * NM
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: the radii leave no ring, or the film has no thickness.
-        """
+        """Check the values."""
         if not (0 < self.inner_m < self.outer_m < math.inf and _SHORTEST_M <= self.thickness_m < math.inf):
             got = ", ".join(format_length(v) for v in (self.inner_m, self.outer_m, self.thickness_m))
             rule = "inner radius, outer radius and thickness must be positive and make a ring"
@@ -141,6 +123,10 @@ class Rings:
         outer_m: outer radius of every ring, metres, increasing, ``(n,)``.
         height_m: height of every ring above the deepest floor, metres, ``(n,)``.
         blank_m: height of the blank surface above the deepest floor, metres.
+
+    Raises:
+        InputError: other shapes, radii that do not increase, heights off the glass, or a ring or a step too small for
+            STEP's numbers (0.3 nm).
     """
 
     outer_m: NDArray[np.floating]
@@ -148,12 +134,7 @@ class Rings:
     blank_m: float
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: other shapes, radii that do not increase, heights off the glass, or a ring or a step
-                too small for STEP's numbers (0.3 nm).
-        """
+        """Check the values."""
         radii, heights = self.outer_m, self.height_m
         if radii.ndim != 1 or radii.shape != heights.shape or not radii.size:
             got = f"{radii.shape} and {heights.shape}"
@@ -241,14 +222,8 @@ def substrate_step(
 ) -> None:
     """Write the plate as STEP: glass, chrome and the clear aperture in the datum plane.
 
-    Without rings the surface is flat, with the clear aperture as a face of its own.
-
-    Args:
-        path: the file.
-        substrate: the glass.
-        aperture_m: diameter of the clear aperture, metres.
-        chrome: the chrome on it, if any. It lies flat at z = 0, also where it reaches over etched rings.
-        rings: the relief, if it is radial.
+    Without rings the surface is flat, with the clear aperture (its diameter in metres) as a face of its own. The chrome
+    lies flat at z = 0, also where it reaches over etched rings.
 
     Raises:
         InputError: something does not fit, or the file cannot be written.

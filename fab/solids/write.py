@@ -20,8 +20,6 @@ from fab.manifest.records import ModelEntry
 from fab.solids import height_files, mesh_files, step_files
 from fab.solids.model import DoeModel, ModelKind
 
-__all__ = ["KINDS", "model_problems", "write_models"]
-
 KINDS: tuple[ModelKind, ...] = (
     step_files.DIE,
     step_files.WAFER,

@@ -22,8 +22,6 @@ from fab.units import MM, NM, UM
 
 Drawn = MaskEntry | DrawnEntry
 
-__all__ = ["Expected", "cell_problems", "layout_problems", "reading_problems"]
-
 
 @dataclass(frozen=True, eq=False)
 class Expected:

@@ -22,8 +22,6 @@ from fab.rules.check import Rules, check
 from fab.units import MM, UM, format_length
 from fab.verification.compare import Expected
 
-__all__ = ["drawing_problems", "number_problems"]
-
 _LEAST_ANGLE_RAD = math.pi / 4
 # A right angle or half of one whose corners were rounded to the database unit.
 _SLACK = 1e-3

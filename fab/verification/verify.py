@@ -43,8 +43,6 @@ from fab.verification.shop_checks import drawing_problems, number_problems
 if TYPE_CHECKING:
     from fab.order.write import WrittenOrder
 
-__all__ = ["Check", "VerificationReport", "read_drawn_levels", "verify"]
-
 _GDS, _OASIS = "GDSII", "OASIS"
 
 
