@@ -26,12 +26,7 @@ _HEADER, _DIGEST = "header", "sha256"
 
 
 def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays and what is said about them.
-
-    Args:
-        path: the file; its folder is made if missing.
-        header: for JSON.
-        arrays: arrays by name, of kinds that numpy's files know.
+    """Write a header for JSON and named arrays; the folder of the file is made if missing.
 
     Raises:
         InputError: the system refuses the path.
@@ -45,15 +40,9 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
 
 
 def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read what `write_archive` wrote, after every check on the way.
+    """Read the header and the arrays by name that `write_archive` wrote, after every check on the way.
 
-    Args:
-        path: the file.
-        what: what it should be, for messages: "checkpoint".
-        cure: what to do if it is not, for messages.
-
-    Returns:
-        the header and the arrays by name.
+    Messages say that it should be a whole `what` ("checkpoint"), and end with `cure`.
 
     Raises:
         InputError: the file is missing, cut off, another archive, or changed since it was written.

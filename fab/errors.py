@@ -4,20 +4,19 @@ from collections.abc import Sequence
 
 
 class InputError(ValueError):
-    """Something that the user gave is wrong: a file, a key, a value (exit code 2).
+    """A mistake in what the user gave: a file, a key, a value (exit code 2).
 
     The message is one sentence and its cure: ``{where}: {rule}, but got {got}. {cure}``.
+
+    Attributes:
+        where: the file, or "file: key", that holds the mistake.
+        rule: what has to hold, without a full stop ("levels must be a power of two").
+        got: what came instead.
+        cure: what to do about it, a full sentence.
     """
 
     def __init__(self, where: str, rule: str, got: object, cure: str) -> None:
-        """Build the message from its four parts.
-
-        Args:
-            where: the file, or "file: key", that holds the mistake.
-            rule: what has to hold, without a full stop ("levels must be a power of two").
-            got: what came instead.
-            cure: what to do about it, a full sentence.
-        """
+        """Build the message from its four parts."""
         self.where = where
         self.rule = rule
         self.got = got
@@ -30,14 +29,10 @@ class InputError(ValueError):
 
 
 class CheckFailed(Exception):
-    """A verification found differences (exit code 1); nothing is wrong with the input itself."""
+    """Differences that a verification found, each naming its file (exit code 1); the input itself is not wrong."""
 
     def __init__(self, differences: Sequence[str]) -> None:
-        """Collect the differences.
-
-        Args:
-            differences: one sentence per difference, each naming the file it was found in.
-        """
+        """Collect the differences, one sentence each."""
         self.differences = tuple(differences)
         super().__init__(self.differences)
 

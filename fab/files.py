@@ -39,15 +39,7 @@ _CURES = {
 
 
 def explain_os_error(error: OSError, path: str | Path) -> InputError:
-    """Turn an operating-system error into the message a user can act on.
-
-    Args:
-        error: what the system said.
-        path: the file or folder the caller was working on.
-
-    Returns:
-        The `InputError` to raise from it.
-    """
+    """Turn an operating-system error about a path into the `InputError` to raise from it."""
     rule, cure = _CURES.get(error.errno or 0, ("the path must be usable", "Check the path and the disk."))
     return InputError(str(path), rule, f'"{error.strerror or error}"', cure)
 
@@ -61,11 +53,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a whole file: temporary sibling, fsync, rename.
-
-    Args:
-        path: the final path; its folder is made if missing.
-        data: the content.
+    """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing.
 
     Raises:
         InputError: the system refuses the path (read-only, full, not a folder ...).
@@ -144,12 +132,8 @@ def _swap(fresh: Path, path: Path) -> None:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Fill a folder that appears at its final path only when everything in it is on the disk.
 
-    Args:
-        path: the final folder. It may be missing, empty, or an earlier result (a folder that holds
-            ``manifest.json``), which is then replaced whole.
-
-    Yields:
-        A temporary folder beside it to write into. It is removed if the body raises.
+    The final folder may be missing, empty, or an earlier result (one that holds ``manifest.json``), which is then
+    replaced whole. What is yielded is a temporary folder beside it to write into; it is removed if the body raises.
 
     Raises:
         InputError: the path is a file, a folder with foreign content, or refused by the system.
@@ -196,13 +180,7 @@ def sha256_file(path: str | Path) -> str:
 
 
 def canonical_json(value: object) -> bytes:
-    """Write a value as JSON whose bytes depend on the value alone.
-
-    Args:
-        value: dictionaries, lists, text, finite numbers, booleans and None.
-
-    Returns:
-        UTF-8 text with sorted keys, one-space indent and a newline at the end.
+    """Return a value as JSON whose bytes depend on it alone: sorted keys, one-space indent, newline at the end.
 
     Raises:
         ValueError: the value holds NaN or an infinity, which JSON cannot say.
@@ -212,12 +190,6 @@ def canonical_json(value: object) -> bytes:
 
 def read_json(path: str | Path) -> dict[str, Any]:
     """Read a JSON file that holds one object.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The object.
 
     Raises:
         InputError: the file is missing, is not JSON, or holds something else than an object.
@@ -238,14 +210,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 
 def read_npy(path: str | Path, most: int = 1 << 28) -> NDArray[Any]:
-    """Read an array file; objects that would have to be unpickled are refused.
-
-    Args:
-        path: a ``.npy`` file.
-        most: the largest number of elements.
-
-    Returns:
-        The array, in memory.
+    """Read an array file of at most `most` elements into memory; objects that would have to be unpickled are refused.
 
     Raises:
         InputError: the file is missing, cut off, corrupt, an archive, too large, or holds objects.

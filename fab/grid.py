@@ -13,23 +13,22 @@ from fab.errors import InputError
 class Grid:
     """A raster of square pixels centred on the optical axis.
 
-    The origin lies in the middle of the raster: between two samples for an even count, on the middle
-    sample for an odd one. Row 0 is the lowest y.
+    The origin lies in the middle of the raster: between two samples for an even count, on the middle sample for an odd
+    one. Row 0 is the lowest y.
 
     Attributes:
         shape: pixels ``(ny, nx)``.
         pitch_m: edge of one pixel, metres.
+
+    Raises:
+        InputError: a count below one, or a pitch that is not positive and finite.
     """
 
     shape: tuple[int, int]
     pitch_m: float
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: a count below one, or a pitch that is not positive and finite.
-        """
+        """Check the values."""
         ny, nx = self.shape
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")
@@ -42,26 +41,12 @@ class Grid:
         return self.shape[0] * self.pitch_m, self.shape[1] * self.pitch_m
 
     def axis_m(self, axis: Literal["x", "y"]) -> NDArray[np.float64]:
-        """Return the pixel centres along one axis.
-
-        Args:
-            axis: ``"x"`` or ``"y"``.
-
-        Returns:
-            Coordinates ``(i - (n - 1) / 2) * pitch_m`` in metres, increasing, shape ``(n,)``.
-        """
+        """Return the pixel centres along ``"x"`` or ``"y"``, metres: ``(i - (n - 1) / 2) * pitch_m``, ``(n,)``."""
         n = self.shape[1] if axis == "x" else self.shape[0]
         return (np.arange(n, dtype=np.float64) - (n - 1) / 2) * np.float64(self.pitch_m)
 
     def inside_circle(self, diameter_m: float) -> NDArray[np.bool_]:
-        """Tell which pixels belong to a centred circle.
-
-        Args:
-            diameter_m: diameter of the circle, metres.
-
-        Returns:
-            ``[y, x]`` true where the centre of the pixel lies inside the circle or on it.
-        """
+        """Return ``[y, x]`` true where a pixel's centre lies inside a centred circle (diameter in metres) or on it."""
         y_squared = self.axis_m("y") ** 2
         x_squared = self.axis_m("x") ** 2
         # The slack of one part in 1e12 keeps pixels whose centre is exactly on the circle.

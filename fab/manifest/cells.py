@@ -1,4 +1,4 @@
-"""What the manifest says of a cell: how much is drawn on each layer, what is placed where, and a digest of it."""
+"""Cells as the manifest states them: how much is drawn on each layer, what is placed where, and a digest."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,9 @@ from fab.units import UM
 
 
 def geometry(shapes: Shapes, dbu_m: float) -> dict[str, object]:
-    """Count, area and box of shapes in the units of the manifest.
+    """Return count, area and box of shapes in the units of the manifest.
 
-    Args:
-        shapes: what is drawn.
-        dbu_m: database unit, metres.
-
-    Returns:
-        `polygons`, `area_um2` and `box_um` (x0, y0, x1, y1, or None where there is nothing).
+    They are `polygons`, `area_um2` and `box_um` (x0, y0, x1, y1, or None where there is nothing).
     """
     box, unit_um = shapes.box, dbu_m / UM
     return {
@@ -29,7 +24,7 @@ def geometry(shapes: Shapes, dbu_m: float) -> dict[str, object]:
 
 
 def _from_lowest(polygon: NDArray[np.integer]) -> bytes:
-    """A polygon as bytes, counter-clockwise from its lowest vertex on, whatever the writer began with."""
+    """Return a polygon as bytes, counter-clockwise from its lowest vertex on, wherever the writer began."""
     points = np.asarray(polygon, np.int64)
     if doubled_area(points) < 0:
         points = points[::-1]
@@ -50,15 +45,7 @@ def shapes_digest(shapes: Shapes) -> str:
 
 
 def cell_entry(cell: Cell, dbu_m: float) -> CellEntry:
-    """What the manifest says of a cell.
-
-    Args:
-        cell: the cell.
-        dbu_m: database unit, metres.
-
-    Returns:
-        its entry; layers sorted, empty ones left out; every copy of a placed cell by itself, sorted.
-    """
+    """Return the manifest's entry of a cell: layers and copies of placed cells sorted, empty layers left out."""
     layers = [
         LayerEntry(layer=str(layer), sha256=shapes_digest(shapes), **geometry(shapes, dbu_m))  # type: ignore[arg-type]
         for layer, shapes in sorted(cell.shapes.items(), key=lambda pair: _numbers(pair[0]))

@@ -43,7 +43,7 @@ CONVENTIONS = {
 
 @dataclass(frozen=True, config=_STRICT)
 class LayerEntry:
-    """What is drawn on one layer of a cell; the digest is that of `fab.manifest.cells.shapes_digest`."""
+    """Shapes on one layer of a cell; the digest is that of `fab.manifest.cells.shapes_digest`."""
 
     layer: str
     polygons: int
@@ -104,7 +104,7 @@ class MaskEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class DrawnEntry:
-    """What one layer of a split draws: a plane (`bit`) of the level map, its edges moved."""
+    """One layer of a split: a plane (`bit`) of the level map, its edges moved."""
 
     layer: int
     datatype: int
@@ -142,7 +142,7 @@ class PlateEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class WaferEntry:
-    """Where everything lies: sizes, the middles of the dies, and the places where people measure, x and y."""
+    """Layout of the wafer: sizes, the middles of the dies, and the places where people measure, x and y."""
 
     diameter_mm: float
     thickness_mm: float
@@ -189,7 +189,7 @@ class ChromeEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class Manifest:
-    """A whole mask order; `source` says where the height map came from, in the words of who asked."""
+    """A whole mask order; `source` says where the level map came from, in the words of who asked."""
 
     format: str
     name: str
@@ -276,13 +276,7 @@ def _manifest_from(data: bytes, where: str) -> Manifest:
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read the manifest of a mask order and check that it is one.
-
-    Args:
-        folder: the order.
-
-    Returns:
-        The manifest; every file name in it is a plain name inside the folder.
+    """Read the manifest of a mask order and check it; every file name in it is a plain name in the folder.
 
     Raises:
         InputError: the manifest is missing, corrupt, of another format, or holds impossible values.

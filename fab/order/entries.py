@@ -114,7 +114,7 @@ def split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float
 
 
 def describe_edges(edges: PixelEdges) -> str:
-    """Say in words how pixel edges were rounded to the database unit."""
+    """Return in words how pixel edges were rounded to the database unit."""
     unit = format_length(edges.dbu_m)
     if edges.shift_m == 0:
         return f"every pixel edge is a whole number of {unit}"

@@ -81,7 +81,7 @@ class Order:
 
     @property
     def splits(self) -> tuple[Split, ...]:
-        """How the dies draw the DOE, the plate as ordered first."""
+        """The ways in which the dies draw the DOE, as ordered first."""
         return splits_of(self.wafer, self.level_map.levels, self.edge_moves(), self.dbu_m)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
@@ -99,7 +99,7 @@ class Order:
 
     @property
     def stem(self) -> str:
-        """What all file names begin with."""
+        """Beginning of all file names."""
         return f"DOE_{order_id(self.level_map.name, self.level_map.digest)}"
 
     def mask_stem(self, bit: int) -> str:
@@ -146,13 +146,8 @@ def plan_order(
 def order_id(name: str, digest: str) -> str:
     """Turn a name into what mask shops accept in file and cell names.
 
-    Args:
-        name: any text.
-        digest: SHA-256 of the level map, which keeps shortened names apart.
-
-    Returns:
-        The name in capitals, with _ for everything that is not a letter or digit; if that is longer
-        than 13 characters, its first 8 and 4 of the digest.
+    It is the name in capitals, with _ for everything that is not a letter or digit; if that is longer than 13
+    characters, its first 8 and 4 of `digest`, that of the level map, which keeps shortened names apart.
 
     Raises:
         InputError: nothing of the name is left.

@@ -71,7 +71,7 @@ Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
 class FileContent(NamedTuple):
-    """What the manifest says of a file besides its bytes; of a mask file also top cell, DOE layers and other cells."""
+    """Format of a file, for the manifest; of a mask file also top cell, DOE layers and other cells."""
 
     file: str
     format: str
@@ -88,13 +88,7 @@ def _merged(parts: list[Shapes]) -> Shapes:
 
 
 def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
-    """The drawing of one plate: one layer number, every datatype of it merged onto datatype 0.
-
-    Args:
-        layout: the whole drawing.
-        layer: the layer of the plate, datatype 0.
-        top: name of the top cell.
-    """
+    """Return the drawing of one photomask: one layer number, every datatype of it merged onto datatype 0."""
     cells = []
     for cell in layout.cells:
         parts = [shapes for other, shapes in cell.shapes.items() if other.number == layer.number and len(shapes)]
@@ -124,12 +118,12 @@ def _frame(order: Order, dbu_m: float) -> Frame:
 
 
 def _around(order: Order, layout: Layout) -> list[CellEntry]:
-    """What the manifest says of every cell but those of the DOE, which come first."""
+    """Return the manifest's entries of every cell but those of the DOE, which come first."""
     return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[len(order.splits) :]]
 
 
 def _drawn_does(order: Order) -> Layout:
-    """Draw the DOE in all the ways that the dies ask for, the plate as ordered first."""
+    """Draw the DOE in all the ways that the dies ask for, as ordered first."""
     drawn = [
         mask_layout(order.level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
         for split in order.splits

@@ -19,7 +19,7 @@ from fab.units import NM, UM
 
 
 class MaskMeasured(NamedTuple):
-    """What was measured of one etch mask; metres, None where it was not.
+    """Measurements of one etch mask; metres, None where there is none.
 
     Attributes:
         overlay_x_m: how far the mask lies toward +x of the first plate's marks, at the die.
@@ -40,7 +40,7 @@ class MaskMeasured(NamedTuple):
 
 
 class ChromeMeasured(NamedTuple):
-    """What was measured of the chrome; metres, None where it was not.
+    """Measurements of the chrome; metres, None where there is none.
 
     Attributes:
         overlay_x_m: how far its opening lies toward +x.
@@ -55,7 +55,7 @@ class ChromeMeasured(NamedTuple):
 
 @dataclass(frozen=True)
 class AsBuilt:
-    """Everything that was measured of one wafer.
+    """All measurements of one wafer.
 
     Attributes:
         level_map_sha256: digest of the design that the wafer was made from.
@@ -121,7 +121,7 @@ class _Table:
         return InputError(f"{self.name}.{key}", rule, _short(got), cure)
 
     def finish(self) -> None:
-        """Refuse keys that nobody asked for."""
+        """Check that every key was asked for."""
         for key in self._data:
             if key not in self._asked:
                 near = get_close_matches(str(key), self._asked, 1) or sorted(self._asked)
@@ -235,17 +235,10 @@ def _edge_moves_m(path: Path, data: Mapping[str, Any]) -> dict[str, float]:
 
 
 def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
-    """Read a run sheet that was filled in.
-
-    Args:
-        path: the JSON file.
-        level_map: the design that the wafer was made from.
-
-    Returns:
-        What was measured.
+    """Read a run sheet of a design that was filled in.
 
     Raises:
-        InputError: no run sheet, one of another design, or a value that cannot be, named by its key.
+        InputError: no run sheet, one of another design, or an impossible value, named by its key.
     """
     data = read_json(path)
     if data.get("format") != FORMAT:

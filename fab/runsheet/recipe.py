@@ -29,13 +29,7 @@ _LIFTOFF_FOLD: Mapping[str, int] = {"evaporated": 5, "sputtered": 10}
 
 
 class Action(NamedTuple):
-    """One thing to do.
-
-    Attributes:
-        task: what it is called, "Bake".
-        how: how it is done, whole sentences.
-        fill: what is written down, each with its unit.
-    """
+    """One thing to do: its name ("Bake"), how it is done, and what is written down, each with its unit."""
 
     task: str
     how: str
@@ -43,10 +37,10 @@ class Action(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What is done with one plate.
+    """Actions with one photomask.
 
     Attributes:
-        plate: the plate.
+        plate: the photomask.
         before: actions up to the developed resist, in order.
         after: actions from there to the sign-off.
         deepest_m: depth of the deepest floor once this step is done, metres.
@@ -67,21 +61,15 @@ def depths_m(levels: Levels) -> tuple[float, ...]:
 
 
 def etch_time_s(depth_m: float, rate_m_per_s: float) -> float:
-    """Return how long a depth takes, seconds: depth / rate."""
+    """Return the time that a depth takes, seconds: depth / rate."""
     return depth_m / rate_m_per_s
 
 
 def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
-    """Return the next etch's target that keeps the sum of all depths right.
+    """Return the next etch's target that keeps the sum of all depths right, metres.
 
-    Args:
-        target_m: what this etch should have been, metres.
-        measured_m: what it is.
-        next_m: nominal depth of an etch that is still to come.
-
-    Returns:
-        ``next_m - (measured_m - target_m)``: areas that both masks etch come out right, areas that neither etches
-        stay right, and areas of the next mask alone become wrong by as much as those of this one are.
+    It is ``next_m - (measured_m - target_m)``. Areas that both masks etch come out right, areas that neither etches
+    stay right, and areas of the next mask alone become wrong by as much as those of this one are.
     """
     return next_m - (measured_m - target_m)
 
@@ -89,14 +77,8 @@ def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
 def resist_thickness_m(plate: Photomask, chrome_m: float, deposition: Deposition) -> float:
     """Return the least thickness of the resist, metres.
 
-    Args:
-        plate: the plate.
-        chrome_m: thickness of the chrome, metres.
-        deposition: how the chrome is laid down.
-
-    Returns:
-        For lift-off five times the metal if it is evaporated and ten times if it is sputtered, because sputtered
-        metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
+    For lift-off it is five times the metal if that is evaporated and ten times if it is sputtered, because sputtered
+    metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
     """
     if plate.makes == "etch":
         return max(_THINNEST_M, 2 * plate.depth_m / _SELECTIVITY)
@@ -109,20 +91,13 @@ def lifts_off(plate: Photomask) -> bool:
 
 
 def spread_of(process: Process, bit: int, common: str, own: str) -> Normal:
-    """Return mean and standard deviation of an error of one mask, its common part included.
-
-    Args:
-        process: the process.
-        bit: the mask.
-        common: name of the part that all masks share; "" if there is none.
-        own: name of the part of each mask, as in `fab.process.DEVIATIONS`.
-    """
+    """Return mean and standard deviation of an error of one mask, the part common to all masks included."""
     parts = [process.spreads.get(name, Normal()) for name in (common, f"{own}[{bit}]")]
     return Normal(sum(part.mean for part in parts), math.hypot(*(part.sigma for part in parts)))
 
 
 def tone_words(plate: Photomask) -> str:
-    """Say what the polygons of a plate are on the glass."""
+    """Return in words what the polygons of a photomask are on the glass."""
     if plate.tone == "clear":
         return "polygons are CLEAR: chrome all over, light passes in the polygons (dark-field plate)"
     return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
@@ -215,18 +190,15 @@ def steps_of(
     chrome_m: float,
     deposition: Deposition,
 ) -> tuple[Step, ...]:
-    """List what is done with every plate.
+    """List the steps of a job, one per photomask.
 
     Args:
-        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`).
+        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
         process: how far depths stray.
-        files: the mask file of every plate, by the plate's name.
-        notes: how each plate is aligned (`fab.layout.marks.alignment_notes`), in the order of the plates.
+        files: the file of every photomask, by its name.
+        notes: how each one is aligned (`fab.layout.marks.alignment_notes`), in the same order.
         chrome_m: thickness of the chrome, metres.
         deposition: how it is laid down.
-
-    Returns:
-        A step per plate.
     """
     steps, deepest_m = [], 0.0
     for number, (plate, note) in enumerate(zip(plates, notes, strict=True)):

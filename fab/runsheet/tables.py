@@ -16,14 +16,10 @@ from fab.units import NM
 
 
 class PhotomaskFile(NamedTuple):
-    """The file of one plate.
+    """The file of one photomask: its name, digest and top cell.
 
-    Attributes:
-        file: its name.
-        sha256: its digest.
-        cell: its top cell.
-        edge_move_m: how far every edge of the DOE was moved outward on the mask to make up for what the process does;
-            test structures and marks are drawn without it.
+    `edge_move_m` is how far every edge of the DOE was moved outward on the mask to make up for what the process does;
+    test structures and marks are drawn without it.
     """
 
     file: str
@@ -42,7 +38,7 @@ class Die(NamedTuple):
 
 
 class PredictedMetrics(NamedTuple):
-    """What one colour of a point at one depth (None for infinity) does; shares of the light are 0 to 1."""
+    """Metrics of one colour of a point at one depth (None for infinity); shares of the light are 0 to 1."""
 
     colour: str
     depth_m: float | None
@@ -62,7 +58,7 @@ class Grating(NamedTuple):
 
 
 class Importance(NamedTuple):
-    """Which share of the plates' variance in Strehl ratio and in 0th order a measured number explains."""
+    """Shares of the variance of Strehl ratio and 0th order, over all DOEs made, that a measured number explains."""
 
     measured: str
     strehl: float
@@ -71,14 +67,14 @@ class Importance(NamedTuple):
 
 @dataclass(frozen=True)
 class Predictions:
-    """What the lab should see.
+    """Light that the lab should see.
 
     Attributes:
-        drawn: the plate exactly as drawn.
-        expected: the plate with every error of the process at its mean.
-        design_m: design wavelength.
-        full_wave_m: wavelength at which the full height of the levels is one wave; None if there is none.
-        probe_m: wavelength of the laser that the lab tests with.
+        drawn: the DOE exactly as drawn.
+        expected: the DOE with every error of the process at its mean.
+        design_m: design wavelength, metres.
+        full_wave_m: wavelength at which the full height of the levels is one wave, metres; None if there is none.
+        probe_m: wavelength of the laser that the lab tests with, metres.
         probe_waves: the full height in waves at the probe.
         gratings: what the test gratings show at the probe, against an empty window; a depth error of 0 among them.
         matters: measured numbers, the most important first; empty if the process has no errors.
@@ -101,19 +97,22 @@ class RunSheet:
     Attributes:
         stem: what all files of the order begin with.
         level_map: the DOE; its digest tells one design from another.
-        plates: all plates in the order in which they are used (`fab.layout.part.photomasks_of`).
-        files: the file of every plate, by the plate's name.
+        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
+        files: the file of every photomask, by its name.
         process: what the lab does and how far it strays.
-        opening_m: diameter of the opening in the chrome.
+        opening_m: diameter of the opening in the chrome, metres.
         wafer: the substrate, and the blanks of the masks.
         places: named points to measure at, from the middle of the wafer in metres, named as in `fab.layout.marks` and
             `fab.layout.structures` with the place before them ("left site: vernier x, mask 3"). Line widths and depths
             are measured at the first place of each name, overlay at all of them.
         dies: the dies.
         material: what the substrate is made of.
-        chrome_m: thickness of the chrome.
+        chrome_m: thickness of the chrome, metres.
         deposition: how the chrome is laid down.
         outlook: what the lab should see; None if nothing is known about the light.
+
+    Raises:
+        InputError: a photomask without a file, or etches that are not those of the process, in its order.
     """
 
     stem: str
@@ -131,11 +130,7 @@ class RunSheet:
     outlook: Predictions | None = None
 
     def __post_init__(self) -> None:
-        """Check that every plate has its file, and every etch its plate.
-
-        Raises:
-            InputError: a plate without a file, or etches that are not those of the process, in its order.
-        """
+        """Check that every photomask has its file, and every etch its photomask."""
         if missing := [plate.name for plate in self.plates if plate.name not in self.files]:
             cure = "Give the file of every plate."
             raise InputError("run sheet", "every plate must have a file", f"none for {missing[0]}", cure)

@@ -213,7 +213,7 @@ def _outlook_record(outlook: Predictions) -> dict[str, Any]:
 
 
 def _blanks(sheet: RunSheet) -> dict[str, Any]:
-    """Everything that may be measured, unfilled; `fab.runsheet.as_built` says what each key means."""
+    """Return everything that may be measured, unfilled; `fab.runsheet.as_built` says what each key means."""
     overlay = {"overlay_x_um": None, "overlay_y_um": None}
     widths = {"cd_bias_um": None, "cd_um": dict.fromkeys(BARS)}
     mask = {**overlay, **widths, "times_etched": None, "depth_nm": None, "depth_by_pad_nm": dict.fromkeys(PADS)}
@@ -230,13 +230,9 @@ def _blanks(sheet: RunSheet) -> dict[str, Any]:
 
 
 def record(sheet: RunSheet) -> dict[str, Any]:
-    """Return the run sheet as JSON values.
+    """Return the run sheet as JSON values, with the unit of every length in its key.
 
-    Args:
-        sheet: the sheet.
-
-    Returns:
-        A dictionary with the unit of every length in its key. Everything under "measured" is null, to be filled in.
+    Everything under "measured" is null, to be filled in.
     """
     files = {name: one.file for name, one in sheet.files.items()}
     notes = alignment_notes(sheet.plates)
@@ -278,15 +274,12 @@ def record(sheet: RunSheet) -> dict[str, Any]:
 
 
 def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None = None) -> str:
-    """Return the run sheet as one page that needs nothing else.
+    """Return the run sheet as one page of HTML that needs nothing else, for A4 and for the screen.
 
     Args:
         content: what `record` returned.
         json_name: name of the JSON file, which the page tells the reader to fill in.
         picture: PNG of the PSFs, if there is one.
-
-    Returns:
-        HTML without scripts or links, for A4 and for the screen.
     """
     import jinja2
 
@@ -316,15 +309,9 @@ def _clock(seconds: float) -> str:
 
 
 def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:
-    """Write the run sheet as a page and as JSON.
+    """Write the run sheet as a page and as JSON; return the names "<stem>_RUNSHEET.html" and "<stem>_RUNSHEET.json".
 
-    Args:
-        folder: where.
-        sheet: the sheet.
-        picture: PNG of the PSFs that the finished plate should show, if there is one.
-
-    Returns:
-        Names of both files, "<stem>_RUNSHEET.html" and "<stem>_RUNSHEET.json".
+    `picture` is a PNG of the PSFs that the finished DOE should show, if there is one.
 
     Raises:
         InputError: the system refuses the folder.

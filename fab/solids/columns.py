@@ -23,14 +23,7 @@ _CLOSEST = 1e-9
 
 @dataclass(frozen=True)
 class PixelWindow:
-    """A rectangle of pixels of a grid.
-
-    Attributes:
-        row: first row, 0 at the lowest y.
-        column: first column, 0 at the lowest x.
-        rows: how many rows.
-        columns: how many columns.
-    """
+    """A rectangle of pixels of a grid: its first row and column (0 at the lowest y and x), and how many of each."""
 
     row: int
     column: int
@@ -55,14 +48,7 @@ class PixelWindow:
         return values[self.row : self.row + self.rows, self.column : self.column + self.columns]
 
     def edges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where the pixel edges of the window lie.
-
-        Args:
-            grid: the grid; its centre is the origin.
-
-        Returns:
-            Edges along x ``(columns + 1,)`` and along y ``(rows + 1,)``, metres.
-        """
+        """Return the pixel edges along x ``(columns + 1,)`` and y ``(rows + 1,)``, metres from the grid's centre."""
         ny, nx = grid.shape
         x = self.column + np.arange(self.columns + 1) - nx / 2
         y = self.row + np.arange(self.rows + 1) - ny / 2
@@ -70,7 +56,7 @@ class PixelWindow:
         return x * pitch_m, y * pitch_m
 
     def centre_m(self, grid: Grid) -> tuple[float, float]:
-        """Return the coordinates x, y of the window's centre, metres; the grid's centre is the origin."""
+        """Return x and y of the window's centre, metres from the grid's centre."""
         ny, nx = grid.shape
         x = (2 * self.column + self.columns - nx) / 2 * grid.pitch_m
         return x, (2 * self.row + self.rows - ny) / 2 * grid.pitch_m

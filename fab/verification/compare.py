@@ -25,7 +25,7 @@ Drawn = MaskEntry | DrawnEntry
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What the files of an order should hold.
+    """Content that the files of an order should have.
 
     Attributes:
         manifest: the manifest of the order.
@@ -127,16 +127,7 @@ def _moved_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expecte
 
 
 def layout_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
-    """Compare a file, as this package's own reader found it, with what it should hold.
-
-    Args:
-        layout: the content of the file.
-        entry: the manifest's entry of the file.
-        expected: what the order should hold.
-
-    Returns:
-        One sentence per difference.
-    """
+    """Compare a file, as this package's own reader found it, with what it should hold; one sentence per difference."""
     problems = []
     if layout.top.name != entry.cell:
         problems.append(f"the top cell is named {layout.top.name!r} instead of {entry.cell!r}")
@@ -173,16 +164,7 @@ def _doe_problems(
 
 
 def cell_problems(cells: Iterable[Cell], entry: FileEntry, dbu_m: float) -> list[str]:
-    """Compare the cells around the DOE (marks, labels, dies, plate) with the manifest.
-
-    Args:
-        cells: every cell of the file but that of the DOE.
-        entry: the manifest's entry of the file.
-        dbu_m: database unit of the order, metres.
-
-    Returns:
-        One sentence per difference.
-    """
+    """Compare the cells around the DOE (marks, labels, dies, plate) with the manifest; one sentence per difference."""
     found = {cell.name: cell_entry(cell, dbu_m) for cell in cells}
     stated = {cell.cell: cell for cell in entry.cells}
     problems = [f"cell {name} should not be there" for name in sorted(set(found) - set(stated))]
@@ -209,16 +191,7 @@ def _entry_problems(found: CellEntry, stated: CellEntry) -> list[str]:
 
 
 def reading_problems(reading: LayerReading, entry: FileEntry, expected: Expected) -> list[str]:
-    """Compare one layer, as the other library found it, with what it should hold.
-
-    Args:
-        reading: the layer.
-        entry: the manifest's entry of the file.
-        expected: what the order should hold.
-
-    Returns:
-        One sentence per difference.
-    """
+    """Compare one layer, as the other library found it, with what it should hold; one sentence per difference."""
     problems = _reading_problems(reading, expected.etch_layers(entry)[reading.cell].get(reading.layer), expected)
     plate = reading.cell == expected.manifest.doe_cell
     return problems if plate else [f"cell {reading.cell}: {problem}" for problem in problems]

@@ -30,16 +30,7 @@ _MOST_LOOKED_AT = 2000
 
 
 def drawing_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
-    """Look at every shape and every name of a file, at where all of it lies, and at the stated areas.
-
-    Args:
-        layout: the content of the file.
-        entry: the manifest's entry of the file.
-        expected: what the order should hold.
-
-    Returns:
-        One sentence per kind of defect, cell and layer.
-    """
+    """Check every shape and name of a file, where all of it lies, and stated areas; a sentence per kind of defect."""
     problems = [problem for cell in layout.cells for problem in _cell_problems(cell)]
     problems += _place_problems(layout, expected.manifest.wafer.blank_mm * MM)
     return problems + _stated_problems(layout, entry, expected)
@@ -58,7 +49,7 @@ def _cell_problems(cell: Cell) -> Iterator[str]:
 
 
 def _defects(polygon: NDArray[np.integer]) -> Iterator[str]:
-    """Yield what a mask writer would not take of a polygon."""
+    """Yield the reasons why a mask writer would not take a polygon."""
     points = np.asarray(polygon, dtype=np.int64)
     if len(points) > MAX_VERTICES:
         yield f"of more than {MAX_VERTICES} vertices"
@@ -79,7 +70,7 @@ def _defects(polygon: NDArray[np.integer]) -> Iterator[str]:
 
 
 def _side(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
-    """On which side of the line a-b the point c lies: 1, -1, or 0 on it."""
+    """Return on which side of the line a-b the point c lies: 1, -1, or 0 on it."""
     u, v = b - a, c - a
     return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
@@ -107,7 +98,7 @@ def _around(boxes: list[Box]) -> Box:
 
 
 def _boxes(cell: Cell, done: Mapping[str, dict[Layer, Box]]) -> dict[Layer, Box]:
-    """Return what each layer of a cell covers, with all that it places."""
+    """Return the box of each layer of a cell, with all that it places."""
     found: dict[Layer, list[Box]] = {}
     for layer, shapes in cell.shapes.items():
         box = shapes.box
@@ -164,7 +155,7 @@ def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> li
 
 
 def number_problems(expected: Expected) -> dict[str, list[str]]:
-    """Take the numbers of the order form again from the level map: one sentence per difference, by file."""
+    """Compute the numbers of the order form again from the level map: one sentence per difference, by file."""
     manifest, pitch_m = expected.manifest, expected.level_map.grid.pitch_m
     problems: dict[str, list[str]] = {}
     for mask in manifest.masks:

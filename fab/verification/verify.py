@@ -48,13 +48,7 @@ _GDS, _OASIS = "GDSII", "OASIS"
 
 @dataclass(frozen=True)
 class Check:
-    """One question and its answer.
-
-    Attributes:
-        file: the file that was asked about.
-        question: what was asked.
-        problems: one sentence per difference; empty if there is none.
-    """
+    """One question about a file, and its answer: a sentence per difference, none if it holds."""
 
     file: str
     question: str
@@ -132,7 +126,7 @@ def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None
 def read_drawn_levels(
     path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
 ) -> NDArray[np.uint8]:
-    """Rebuild the level numbers that a combined GDSII file draws, with this package's own reader.
+    """Rebuild the level numbers ``[y, x]`` that a combined GDSII file draws, with this package's own reader.
 
     Args:
         path: the combined file, bit k on layer k + 1.
@@ -140,9 +134,6 @@ def read_drawn_levels(
         edges: where the pixel edges fall in the drawing.
         cell: name of the cell with the planes.
         moves: how far the edges of every mask were moved outward, database units (`Manifest.edge_moves`).
-
-    Returns:
-        Level numbers ``[y, x]``.
 
     Raises:
         InputError: the file is missing or corrupt, or draws something else than a plane of pixels.
@@ -264,12 +255,9 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
     Args:
         order: the folder that `write_order` wrote, or what it returned.
 
-    Returns:
-        The checks; `VerificationReport.require` raises if any failed.
-
     Raises:
         InputError: the folder is not a mask order, or its manifest is corrupt.
-        CheckFailed: no level map is left to compare with.
+        CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
     """
     folder = Path(order) if isinstance(order, str | Path) else order.folder
     manifest = read_manifest(folder)

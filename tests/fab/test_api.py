@@ -92,8 +92,6 @@ class _Sound(HTMLParser):
 def test_a_check_draws_itself(process):
     from matplotlib.figure import FigureBase
 
-    pytest.importorskip("fab.plots")
-
     level_map = level_map_from(np.random.default_rng(0).integers(0, 16, (30, 30)), aperture_m=30 * UM, name="quick")
     given = process or fab.STOCK["contact_aligner"].process(level_map.levels)
     report = fab.check(level_map, given)
@@ -117,7 +115,6 @@ def test_an_order_is_written_proved_and_shown(tmp_path):
         report.require()
         assert report.checks == order.report.checks
     assert _Sound(order.report._repr_html_()).open == 0
-    pytest.importorskip("fab.plots")
     assert "DOE_QUICK_ALL.gds" in order._repr_html_()
     (order.folder / "DOE_QUICK_CHROME.gds").unlink()
     with pytest.raises(fab.CheckFailed, match="the file is missing"):
