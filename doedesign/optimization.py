@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from doedesign.design.design import Design
-from doedesign.design.etch_depths import heights_of, light_cost
+from doedesign.design.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
 from doedesign.design.optimize import (
     OptimizationState,
@@ -164,7 +164,7 @@ def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
     """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
     camera, binary = problem.camera, Levels(design.levels.count, design.levels.step_m)
     area = circle_coverage(camera.grid, camera.aperture_m)
-    heights = heights_of(np.asarray(design.continuous_m), area, binary.period_m, camera)
+    heights = height_histogram(np.asarray(design.continuous_m), area, binary.period_m, camera)
     return {
         "depths_nm": [round(depth / NM, 1) for depth in design.levels.depths_m],
         "light_cost": light_cost(heights, design.levels),
@@ -197,10 +197,9 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if design.history:
         save(plot_history(design.history), run.path("history.png"))
         names.append("history.png")
-    targets = [t for t, o in zip(problem.terms, spec.objectives, strict=True) if o.name == "target_pattern"]
+    targets = [term.target for term in problem.terms if term.target is not None]
     if targets:
-        target = targets[0].value.keywords["target"]  # pyright: ignore[reportFunctionMemberAccess]
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
-        save(plot_pattern(target, achieved, camera, **patterns[0]), run.path("pattern.png"))
+        save(plot_pattern(targets[0], achieved, camera, **patterns[0]), run.path("pattern.png"))
         names.append("pattern.png")
     return names

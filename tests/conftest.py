@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
-DESIGN = Path(__file__).parent.parent / "doedesign"
+ROOT = Path(__file__).parent.parent
+WITH_ARRAYS = [path for path in (ROOT / "doedesign").rglob("*.py") if "jaxtyping" in path.read_text("utf-8")]
 
 # Before any test imports them: from here on the annotations of all modules with arrays are checked at every call,
 # shapes included. (The specs are left to pydantic.) As everywhere in Python, an int may stand for a float.
 install_import_hook(
-    [
-        "sim",
-        "doedesign.recon",
-        *(f"doedesign.{path.stem}" for path in DESIGN.glob("*.py") if "jaxtyping" in path.read_text("utf-8")),
-    ],
+    ["sim", *(".".join(path.relative_to(ROOT).with_suffix("").parts) for path in WITH_ARRAYS)],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 

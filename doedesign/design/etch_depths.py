@@ -1,22 +1,22 @@
-"""Which depths the etches should have: the set that rounds a design's heights at the least cost in light.
+"""Etch depths that round a design's heights at the least loss of light.
 
 A height h that is rounded to q(h) turns the light of wavelength lambda by 2 pi (n - 1) (h - q(h)) / lambda. The cost of
-a set of depths is what that takes from the amplitude, averaged over the plate and the colours c with their weights:
+a set of depths is what that takes from the amplitude, averaged over the DOE and the colours c with their weights:
 
     cost = sum_c w_c mean_h [1 - cos(2 pi (n_c - 1) (h - q(h)) / lambda_c)],    sum_c w_c = 1.
 
 q is the nearest level where heights repeat after one wave of the design (`fab.levels.quantise_wrapped`). Between two
-neighbouring edges of q all heights go to one level H, so with the plate's heights in a histogram and its running sums
+neighbouring edges of q all heights go to one level H, so with the heights in a histogram and its running sums
 C_c(x) = sum over h < x of exp(2 pi i (n_c - 1) h / lambda_c) the cost is
 
     1 - sum_c w_c Re sum_levels [C_c(upper edge) - C_c(lower edge)] exp(-2 pi i (n_c - 1) H / lambda_c),
 
-whatever the size of the plate. NLopt searches it without gradient: DIRECT-L (D. R. Jones et al. 1993) over all sets,
+whatever the size of the DOE. NLopt searches it without gradient: DIRECT-L (D. R. Jones et al. 1993) over all sets,
 then Sbplx from the best of them and from 2^k steps. The result is what a recipe can hold, whole tenths of a nanometre.
 
 This serves designs that are optimised without rounding. With rounding in the loop the depths are parameters like the
-others (`doedesign.design.optimize`): a set that is best for the heights of the moment, put in between steps, upsets
-what they have settled to, and ends worse than 2^k steps where levels are few.
+others (`doedesign.design.optimize`): a set that is best for the heights of one step, put in between steps, disturbs
+the optimisation and ends worse than 2^k steps where levels are few.
 """
 
 import contextlib
@@ -32,8 +32,6 @@ from fab.levels import Levels, wrapped_cells
 from fab.units import NM
 from sim.camera import Camera
 
-__all__ = ["Heights", "choose_depths", "heights_of", "held", "light_cost"]
-
 _BINS = 4096
 _GLOBAL, _LOCAL = 3000, 1500
 _WORST = 2.0
@@ -41,70 +39,70 @@ _WORST = 2.0
 _SHALLOWEST, _CLOSEST = 0.25, 0.05
 
 
-class Heights(NamedTuple):
-    """How much of a plate stands at which height, as the light of every line sees it.
+class HeightHistogram(NamedTuple):
+    """Share of a DOE at every height, with the phase that light of each wavelength has there.
 
     Attributes:
-        running: `[line, edge]` sum of share times exp(2 pi i rate h) below each edge of the histogram, whose bins
-            divide one wave of the design evenly.
-        rates: `[line]` waves per metre of height.
+        running: `[line, edge]` sum of share times exp(2 pi i waves_per_metre h) below each edge of the histogram, whose
+            bins divide one wave of the design evenly.
+        waves_per_metre: `[line]` waves per metre of height.
         weights: `[line]` weight of each line; they sum to 1.
         period_m: height of one wave of the design.
     """
 
     running: NDArray[np.complex128]
-    rates: NDArray[np.float64]
+    waves_per_metre: NDArray[np.float64]
     weights: NDArray[np.float64]
     period_m: float
 
 
-def heights_of(
+def height_histogram(
     height_m: Float[np.ndarray, "*s"], area: Float[np.ndarray, "*s"], period_m: float, camera: Camera
-) -> Heights:
-    """Count the heights of a design before rounding.
+) -> HeightHistogram:
+    """Return the histogram of a design's heights before rounding.
 
     Args:
-        height_m: heights, taken modulo one wave.
+        height_m: heights, metres, taken modulo one wave.
         area: how much each of them counts, such as the open share of its cell.
         period_m: height of one wave of the design.
         camera: its colours weigh alike, the lines of a colour by their weights.
     """
     lines = [(w, share) for c in camera.colours for w, share in zip(c.wavelengths_m, c.weights, strict=True)]
-    rates = np.array([camera.waves_per_metre(wavelength) for wavelength, _ in lines])
+    waves_per_metre = np.array([camera.waves_per_metre(wavelength) for wavelength, _ in lines])
     weights = np.array([share for _, share in lines]) / len(camera.colours)
     place = (np.mod(np.asarray(height_m, np.float32), np.float32(period_m)) * np.float32(_BINS / period_m)).astype(int)
     counts = np.bincount(np.minimum(place, _BINS - 1).ravel(), np.asarray(area, np.float64).ravel(), _BINS)
     middles = (np.arange(_BINS) + 0.5) * period_m / _BINS
-    seen = counts / counts.sum() * np.exp(2j * np.pi * rates[:, None] * middles)
+    shares = counts / counts.sum() * np.exp(2j * np.pi * waves_per_metre[:, None] * middles)
     running = np.zeros((len(lines), _BINS + 1), np.complex128)
-    np.cumsum(seen, axis=1, out=running[:, 1:])
-    return Heights(running, rates, weights / weights.sum(), period_m)
+    np.cumsum(shares, axis=1, out=running[:, 1:])
+    return HeightHistogram(running, waves_per_metre, weights / weights.sum(), period_m)
 
 
-def light_cost(heights: Heights, levels: Levels) -> float:
-    """Return what rounding to a staircase costs, 0 to 2; the formula stands at the head of this file."""
+def light_cost(heights: HeightHistogram, levels: Levels) -> float:
+    """Return the light lost by rounding to a staircase, 0 to 2; the formula stands at the head of this file."""
     edges, cells = wrapped_cells(levels)
     places = np.clip(np.concatenate([[0.0], edges / heights.period_m, [1.0]]), 0, 1) * _BINS
     below = np.minimum(places.astype(int), _BINS - 1)
     part = places - below
     sums = heights.running[:, below] * (1 - part) + heights.running[:, below + 1] * part
-    turned = np.exp(-2j * np.pi * heights.rates[:, None] * levels.heights_m()[cells])
+    turned = np.exp(-2j * np.pi * heights.waves_per_metre[:, None] * levels.heights_m()[cells])
     kept = np.sum(np.diff(sums, axis=1) * turned, axis=1).real
     return float(1 - heights.weights @ kept)
 
 
-def held(depths_m: Sequence[float] | NDArray[np.floating]) -> tuple[float, ...]:
+def recipe_depths_m(depths_m: Sequence[float] | NDArray[np.floating]) -> tuple[float, ...]:
     """Return depths as a recipe holds them: shallow to deep, whole tenths of a nanometre."""
     # By way of text, so that 80.1 nm is the same number as in a spec.
     return tuple(float(f"{round(float(depth) / NM, 1)!r}e-9") for depth in sorted(depths_m))
 
 
-def choose_depths(heights: Heights, start: Levels) -> Levels:
-    """Choose the depths that round a design's heights at the least cost in light.
+def optimal_levels(heights: HeightHistogram, start: Levels) -> Levels:
+    """Return the staircase that rounds a design's heights at the least loss of light.
 
     Args:
-        heights: the design.
-        start: the staircase to begin with; its own depths stay if none are better.
+        heights: heights of the design.
+        start: the staircase to begin with; it is returned if none is better.
 
     Returns:
         The staircase; its depths rise from mask to mask.
@@ -142,7 +140,7 @@ def choose_depths(heights: Heights, start: Levels) -> Levels:
     if not tried:
         return start
     try:
-        best = Levels(start.count, step, held(min(tried, key=lambda one: one[0])[1] * step))
+        best = Levels(start.count, step, recipe_depths_m(min(tried, key=lambda one: one[0])[1] * step))
     except InputError:
         return start
     return best if light_cost(heights, best) < light_cost(heights, start) else start

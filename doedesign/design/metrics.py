@@ -1,4 +1,4 @@
-"""What a design does, in numbers: the same table for every design, whatever it was optimised for."""
+"""Table of a design's numbers, the same for every design, whatever it was optimised for."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from doedesign.design.objectives import Term
 from doedesign.design.patterns import spot_centres_m
 from doedesign.spec import Spec
 from fab.units import parse_length
-from sim.camera import Camera, Colour
+from sim.camera import Camera
 from sim.metrics import (
     airy_radius_m,
     energy_budget,
@@ -28,11 +28,11 @@ from sim.psf_bank import PsfBank
 def design_metrics(
     camera: Camera, height_m: Float[np.ndarray, "y x"], bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank
 ) -> list[dict[str, Any]]:
-    """One row per depth and colour of a bank.
+    """Return one row per depth and colour of a bank.
 
     Args:
         camera: optics.
-        height_m: `[y, x]` the map the bank was made from.
+        height_m: `[y, x]` heights the bank was computed from, metres.
         bank: its PSFs on the axis.
         near_m: which of the bank's depths are obstructions.
         lens: PSFs of the plain lens at the same depths.
@@ -50,7 +50,10 @@ def design_metrics(
         for c in range(len(camera.colours))
         for z in far_m
     }
-    orders = [_zeroth_order(camera, height_m, colour) for colour in camera.colours]
+    orders = [
+        sum(w * zeroth_order(camera, height_m, line) for line, w in zip(c.wavelengths_m, c.weights, strict=True))
+        for c in camera.colours
+    ]
     rows = []
     for d, depth in enumerate(bank.depths_m):
         for c, colour in enumerate(camera.colours):
@@ -70,11 +73,6 @@ def design_metrics(
     return rows
 
 
-def _zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], colour: Colour) -> float:
-    pairs = zip(colour.wavelengths_m, colour.weights, strict=True)
-    return sum(weight * zeroth_order(camera, height_m, wavelength) for wavelength, weight in pairs)
-
-
 def pattern_metrics(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[dict[str, float]]:
     """Efficiency and uniformity of every `target_pattern` objective, for the first colour and far depth.
 
@@ -85,18 +83,18 @@ def pattern_metrics(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term
     far = bank.energy[0, bank.depths_m.index(spec.scene.far_m[0])]
     rows = []
     for objective, term in zip(spec.objectives, terms, strict=True):
-        if objective.name != "target_pattern":
+        if (target := term.target) is None:
             continue
         if objective.options.get("pattern") == "spots":
             shares = _spot_energies(camera, far, objective.options)
+            efficiency = shares.sum()
             uniformity = 1 - (shares.max() - shares.min()) / (shares.max() + shares.min())
-            rows.append({"efficiency": float(shares.sum()), "uniformity": float(uniformity)})
-            continue
-        target = term.value.keywords["target"]  # pyright: ignore[reportFunctionMemberAccess]
-        area = target > target.max() / 2
-        inner = far[_eroded(area, airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m)]
-        uniformity = 1 - inner.std() / inner.mean() if inner.size and inner.mean() > 0 else 0.0
-        rows.append({"efficiency": float(far[area].sum(dtype=np.float64)), "uniformity": float(uniformity)})
+        else:
+            area = target > target.max() / 2
+            efficiency = far[area].sum(dtype=np.float64)
+            inner = far[_eroded(area, airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m)]
+            uniformity = 1 - inner.std() / inner.mean() if inner.size and inner.mean() > 0 else 0.0
+        rows.append({"efficiency": float(efficiency), "uniformity": float(uniformity)})
     return rows
 
 

@@ -1,10 +1,10 @@
-"""What a design is judged by: small functions from PSFs to one number that is minimised.
+"""Objectives: small functions from PSFs to one number that is minimised.
 
-An objective takes a `PsfSet` and its options and returns a scalar. A user's own is named `module:function` in the
-spec and has the same signature:
+An objective takes a `PsfSet` and its options and returns a scalar. A built-in one is listed, under its name, in
+`doedesign.spec.values.OBJECTIVES`; a user's own is named `module:function` in the spec and has the same signature:
 
-    def dark_centre(view: View, *, power: float = 1.0) -> Array:
-        return jnp.mean(jnp.sum(view.near, axis=(-2, -1))) ** power
+    def dark_centre(psfs: PsfSet, *, power: float = 1.0) -> Array:
+        return jnp.mean(jnp.sum(psfs.near, axis=(-2, -1))) ** power
 
 Energies are per unit power incident on the clear aperture, so light that is lost anywhere counts as lost.
 """
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from doedesign.design.patterns import target_pattern_image
+from doedesign.design.patterns import target_image
 from doedesign.spec import Spec
 from fab.errors import InputError
 from sim.camera import Camera
@@ -29,7 +29,7 @@ from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_rad
 
 
 class PsfSet(eqx.Module):
-    """What an objective sees in one step.
+    """PSFs of one step, as objectives take them.
 
     Attributes:
         near: `[w, n, y, x]` PSFs of obstruction depths (none if the scene has none).
@@ -44,51 +44,59 @@ class PsfSet(eqx.Module):
     camera: Camera = eqx.field(static=True)
 
 
-Objective = Callable[[PsfSet], Array]
-
-
 class Term(NamedTuple):
-    """One weighted objective; the loss is the sum of weight times value."""
+    """Weighted objective; the loss is the sum of weight times value.
+
+    Attributes:
+        name: name of the objective.
+        weight: its factor.
+        value: the objective with its options.
+    """
 
     name: str
     weight: float
-    value: Objective
+    value: partial[Array]
+
+    @property
+    def target(self) -> Float[np.ndarray, "y x"] | None:
+        """Target image of a `target_pattern`: energy per pixel, summing to 1."""
+        return self.value.keywords.get("target")
 
 
 def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
-    """For every colour, the share of each pixel inside the far spot (`sim.metrics.spot_radius_m`)."""
+    """Share of each pixel inside the far spot of every colour (`sim.metrics.spot_radius_m`)."""
     shape = (camera.window, camera.window)
     return np.stack(
         [disc_weights(shape, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(c))) for c in camera.colours]
     )
 
 
-def far_spot(view: PsfSet) -> Array:
+def far_spot(psfs: PsfSet) -> Array:
     """Share of the scene's light that misses the sharp spot, 0-1, averaged over colours and far depths."""
-    inside = jnp.einsum("wfyx,wyx->wf", view.far, spot_weights(view.camera))
+    inside = jnp.einsum("wfyx,wyx->wf", psfs.far, spot_weights(psfs.camera))
     return 1.0 - jnp.mean(inside)
 
 
-def near_spread(view: PsfSet) -> Array:
+def near_spread(psfs: PsfSet) -> Array:
     """Concentration of near PSFs relative to the plain lens: sum p² / sum p_lens², 1 for no effect.
 
     The coherent part of the light cannot tell depths apart, so a design with far-spot energy s keeps at least s² of
-    it (design.md §4): with weights 1 for `far_spot` and w for this term the ideal plate has s = 1 / (2w).
+    it (design.md §4): with weights 1 for `far_spot` and w for this term the ideal DOE has s = 1 / (2w).
     """
-    return jnp.mean(participation(view.near) / view.lens_participation)
+    return jnp.mean(participation(psfs.near) / psfs.lens_participation)
 
 
-def window_loss(view: PsfSet) -> Array:
+def window_loss(psfs: PsfSet) -> Array:
     """Share of the light that misses the sensor window, 0-1, averaged over colours and depths.
 
     Without it `near_spread` and `far_spot` agree on sending unwanted light to angles beyond the window, where it
     becomes stray light on the rest of the sensor.
     """
-    images = jnp.concatenate([view.near, view.far], axis=1)
+    images = jnp.concatenate([psfs.near, psfs.far], axis=1)
     return 1.0 - jnp.mean(jnp.sum(images, axis=(-2, -1)))
 
 
-def handcrafted(view: PsfSet, *, near_weight: float = 1.0) -> Array:
+def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
     """The paper's hand-crafted variant (§4): far PSF towards a point, near PSF towards an even window.
 
     Squared distances, each relative to its target's: |p_far - delta|² where delta is all light in the far spot,
@@ -96,47 +104,26 @@ def handcrafted(view: PsfSet, *, near_weight: float = 1.0) -> Array:
     """
     if not isinstance(near_weight, int | float):
         raise InputError("handcrafted: near_weight", "must be a number", repr(near_weight), "For example 1.0.")
-    spots = spot_weights(view.camera)
-    even = 1.0 / view.camera.window**2
+    spots = spot_weights(psfs.camera)
+    even = 1.0 / psfs.camera.window**2
     delta = spots / spots.sum(axis=(1, 2), keepdims=True)
-    far = jnp.sum((view.far - delta[:, None]) ** 2, axis=(-2, -1)) / np.sum(delta**2, axis=(1, 2))[:, None]
-    near = jnp.sum((view.near - even) ** 2, axis=(-2, -1)) / (even**2 * view.camera.window**2)
+    far = jnp.sum((psfs.far - delta[:, None]) ** 2, axis=(-2, -1)) / np.sum(delta**2, axis=(1, 2))[:, None]
+    near = jnp.sum((psfs.near - even) ** 2, axis=(-2, -1)) / (even**2 * psfs.camera.window**2)
     return jnp.mean(far) + near_weight * jnp.mean(jnp.log1p(near))
 
 
-def target_pattern(view: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
+def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     """Squared distance of every far PSF from a target that holds all light, relative to the target's own square."""
-    return jnp.mean(jnp.sum((view.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
+    return jnp.mean(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
 
 
-_BUILT_IN: dict[str, Callable[..., Array]] = {
-    "far_spot": far_spot,
-    "near_spread": near_spread,
-    "window_loss": window_loss,
-    "handcrafted": handcrafted,
-    "target_pattern": target_pattern,
+BUILT_IN: dict[str, Callable[..., Array]] = {
+    function.__name__: function for function in (far_spot, near_spread, window_loss, handcrafted, target_pattern)
 }
 
 
-def _imported(name: str, where: str) -> Callable[..., Array]:
-    """A user's objective from "module:function"."""
-    module_name, function_name = name.split(":")
-    try:
-        function = getattr(importlib.import_module(module_name), function_name)
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            where,
-            "a user's objective must be an importable module:function",
-            f'"{name}" ({error})',
-            "Put the module on PYTHONPATH and check both names.",
-        ) from error
-    if not callable(function):
-        raise InputError(where, "a user's objective must be a function", f'"{name}"', "Name a function.")
-    return cast("Callable[..., Array]", function)
-
-
-def terms_of(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
-    """The spec's objectives, with options bound and images read.
+def terms_from_spec(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
+    """Return a spec's objectives, with options bound and images read.
 
     Args:
         spec: the spec.
@@ -151,24 +138,32 @@ def terms_of(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Ter
         where = f"objective[{i}] {objective.name}"
         options: dict[str, Any] = dict(objective.options)
         if objective.name == "target_pattern":
-            options = {
-                "target": target_pattern_image(camera, options, files.get(f"objective[{i}].options.image"), where)
-            }
-        function = _BUILT_IN[objective.name] if objective.name in _BUILT_IN else _imported(objective.name, where)
-        bound = partial(function, **options)
-        _require_options(bound, where)
-        terms.append(Term(objective.name, objective.weight, bound))
+            options = {"target": target_image(camera, options, files.get(f"objective[{i}].options.image"), where)}
+        function = BUILT_IN[objective.name] if objective.name in BUILT_IN else _imported(objective.name, where)
+        _require_options(function, options, where)
+        terms.append(Term(objective.name, objective.weight, partial(function, **options)))
     return tuple(terms)
 
 
-def _require_options(function: partial[Array], where: str) -> None:
-    """Check before a long run that the function takes one view and the given options."""
+def _imported(name: str, where: str) -> Callable[..., Array]:
+    """Return a user's objective from "module:function"."""
+    module_name, function_name = name.split(":")
     try:
-        inspect.signature(function.func).bind(None, **function.keywords)
+        function = getattr(importlib.import_module(module_name), function_name)
+    except (ImportError, AttributeError) as error:
+        rule = "a user's objective must be an importable module:function"
+        cure = "Put the module on PYTHONPATH and check both names."
+        raise InputError(where, rule, f'"{name}" ({error})', cure) from error
+    if not callable(function):
+        raise InputError(where, "a user's objective must be a function", f'"{name}"', "Name a function.")
+    return cast("Callable[..., Array]", function)
+
+
+def _require_options(function: Callable[..., Array], options: Mapping[str, Any], where: str) -> None:
+    """Check before a long run that the function takes one `PsfSet` and the given options."""
+    signature = inspect.signature(function)
+    try:
+        signature.bind(None, **options)
     except TypeError as error:
-        raise InputError(
-            f"{where}: options",
-            f"must be options of {function.func.__name__}{inspect.signature(function.func)}",
-            str(error).removeprefix("got "),
-            "Correct or remove the option.",
-        ) from error
+        rule, got = f"must be options of {function.__name__}{signature}", str(error).removeprefix("got ")
+        raise InputError(f"{where}: options", rule, got, "Correct or remove the option.") from error

@@ -9,6 +9,7 @@ Where the depths of the etches are to be chosen, they are further parameters of 
 and how high that level stands has a true gradient.
 """
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,10 @@ import optax
 from jaxtyping import Array, Float
 
 from doedesign.design.design import Design
-from doedesign.design.etch_depths import choose_depths, heights_of, held
+from doedesign.design.etch_depths import height_histogram, optimal_levels, recipe_depths_m
 from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
-from doedesign.design.starts import start_heights
+from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import STARTS, Spec
 from fab.errors import InputError
@@ -92,15 +93,14 @@ def initial_state(
     """
     camera = problem.camera
     if spec.optimize.start in STARTS:
-        heights = start_heights(
-            spec.optimize.start,
-            spec.optimize.start_options,
+        setup = StartSetup(
             camera,
-            radial=problem.radial,
-            wavelength_m=spec.optics.design_wavelength_m,
-            seed=spec.optimize.seed,
-            judge=lambda h: judge_height(problem, scene, h),
+            problem.radial,
+            spec.optics.design_wavelength_m,
+            spec.optimize.seed,
+            lambda heights: judge_height(problem, scene, heights),
         )
+        heights = start_heights(spec.optimize.start, spec.optimize.start_options, setup)
     else:
         path = files["optimize.start"]
         heights = read_start(path)
@@ -208,15 +208,12 @@ def finished_design(
 def _chosen_levels(
     spec: Spec, problem: Problem, state: OptimizationState, continuous_m: Float[np.ndarray, "y x"]
 ) -> Levels:
-    """The staircase that was chosen, as a recipe holds it: the one learnt, or that which suits the heights best."""
-    start = problem.parametrization.levels
+    """Return the chosen staircase as a recipe holds it: the one learnt, or that which suits the heights best."""
+    parametrization, camera = problem.parametrization, problem.camera
+    start = parametrization.levels
     if state.log_depth_ratio is not None:
-        try:
-            return Levels(
-                start.count, start.step_m, held(np.asarray(problem.parametrization.depths_m(state.log_depth_ratio)))
-            )
-        except InputError:
-            pass  # two levels met
-    camera = problem.camera
+        depths_m = recipe_depths_m(np.asarray(parametrization.depths_m(state.log_depth_ratio)))
+        with contextlib.suppress(InputError):  # two levels met
+            return Levels(start.count, start.step_m, depths_m)
     area = circle_coverage(camera.grid, camera.aperture_m)
-    return choose_depths(heights_of(continuous_m, area, start.period_m, camera), start)
+    return optimal_levels(height_histogram(continuous_m, area, start.period_m, camera), start)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from doedesign.build import camera_from_spec, levels_from_spec
-from doedesign.design.objectives import PsfSet, Term, terms_of
+from doedesign.design.objectives import PsfSet, Term, terms_from_spec
 from doedesign.design.parametrize import LevelParametrization
 from doedesign.spec import Spec
 from fab.levels import Levels
@@ -156,7 +156,7 @@ def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
     radial = spec.optimize.parametrization == "radial"
     direct = spec.optics.propagation == "fresnel"
     sparse = _is_sparse(spec)
-    terms = terms_of(spec, camera, files)
+    terms = terms_from_spec(spec, camera, files)
     lines = []
     for index, colour in enumerate(camera.colours):
         for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):

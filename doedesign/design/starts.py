@@ -1,79 +1,70 @@
 """Baseline designs by name. Each is a start of the optimiser, and a design of its own with `steps = 0`.
 
-They return heights in metres: a profile over rings for the radial parametrisation, a map otherwise.
+A start is a function of a `StartSetup` and its options, under its name in `doedesign.spec.values.STARTS`. It returns
+heights in metres: a profile over rings for the radial parametrisation, a map otherwise.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.design.patterns import positive_length
+from doedesign.spec import STARTS
 from fab.errors import InputError
-from fab.units import parse_length
 from sim.camera import Camera
 from sim.material import full_wave_height_m
 from sim.propagation.hankel import ring_count
 
 Heights = Float[np.ndarray, "*s"]
-Judge = Callable[[Heights], float]
+_WHERE = "optimize.start_options"
 
 
-def _radii_m(camera: Camera, radial: bool) -> Heights:
-    if radial:
-        return (np.arange(ring_count(camera)) + 0.5) * camera.grid.pitch_m
-    return np.hypot(camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x")[None, :])
+class StartSetup(NamedTuple):
+    """Design task of a start.
+
+    Attributes:
+        camera: optics.
+        radial: whether heights are a profile over rings instead of a map.
+        wavelength_m: design wavelength.
+        seed: seed of random starts.
+        loss: loss of given heights.
+    """
+
+    camera: Camera
+    radial: bool
+    wavelength_m: float
+    seed: int = 0
+    loss: Callable[[Heights], float] = lambda _: 0.0
+
+    @property
+    def wave_m(self) -> float:
+        """Height of one wave."""
+        return full_wave_height_m(self.camera.material, self.wavelength_m)
+
+    def radii_m(self) -> Heights:
+        """Distance from the axis of every cell, or of the middle of every ring."""
+        grid = self.camera.grid
+        if self.radial:
+            return (np.arange(ring_count(self.camera)) + 0.5) * grid.pitch_m
+        return np.hypot(grid.axis_m("y")[:, None], grid.axis_m("x")[None, :])
 
 
-def _number(options: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
-    value = options.get(key, default)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
-        raise InputError(
-            f"optimize.start_options.{key}", f"must be a number from {low:g} to {high:g}", repr(value), "Correct it."
-        )
-    return float(value)
+def lens(setup: StartSetup, power_per_m: float) -> Heights:
+    """Fresnel lens of optical power 1/f_DOE, wrapped at one wave: phase -pi r² power / lambda."""
+    return np.mod(-(setup.radii_m() ** 2) * power_per_m / (2 * setup.wavelength_m), 1.0) * setup.wave_m
 
 
-def _length(options: Mapping[str, Any], key: str, default_m: float) -> float:
-    if key not in options:
-        return default_m
-    try:
-        length = parse_length(str(options[key]))
-    except ValueError as error:
-        raise InputError(
-            f"optimize.start_options.{key}", "must be a length", repr(options[key]), 'Such as "5.6 um".'
-        ) from error
-    if not length > 0:
-        raise InputError(f"optimize.start_options.{key}", "must be positive", repr(options[key]), 'Such as "5.6 um".')
-    return length
-
-
-def flat(camera: Camera, radial: bool) -> Heights:
-    """No relief: the plain lens."""
-    return np.zeros_like(_radii_m(camera, radial))
-
-
-def random(camera: Camera, radial: bool, wavelength_m: float, seed: int, feature_m: float) -> Heights:
-    """A random diffuser: heights uniform over one wave, constant over squares (or rings) of side `feature_m`."""
-    shape = _radii_m(camera, radial).shape
-    cells = min(max(1, round(feature_m / camera.grid.pitch_m)), max(shape))
-    coarse = tuple(-(-n // cells) for n in shape)
-    heights = np.random.default_rng(seed).uniform(0, full_wave_height_m(camera.material, wavelength_m), coarse)
-    for axis in range(heights.ndim):
-        heights = np.repeat(heights, cells, axis=axis)
-    return heights[tuple(slice(0, n) for n in shape)]
-
-
-def ring(camera: Camera, radial: bool, wavelength_m: float, far_energy: float, period_m: float) -> Heights:
-    """A circular binary grating: `far_energy` of the light stays in the 0th order, the rest draws a ring.
+def grating(setup: StartSetup, far_energy: float, period_m: float) -> Heights:
+    """Circular binary grating: `far_energy` of the light stays in the 0th order, the rest draws a ring.
 
     Half of each period is raised by h with cos²(phi/2) = far_energy, phi = 2 pi (n-1) h / lambda, the 0th-order
     efficiency of a binary grating (J. W. Goodman, *Introduction to Fourier Optics*, §4.4). From a far source the ring
     has radius lambda f / period; a near one widens it by the defocus disc.
     """
-    phase = 2 * np.arccos(np.sqrt(far_energy))
-    height = full_wave_height_m(camera.material, wavelength_m) * phase / (2 * np.pi)
-    return np.where(np.mod(_radii_m(camera, radial) / period_m, 1.0) < 0.5, height, 0.0)
+    height = setup.wave_m * (2 * np.arccos(np.sqrt(far_energy))) / (2 * np.pi)
+    return np.where(np.mod(setup.radii_m() / period_m, 1.0) < 0.5, height, 0.0)
 
 
 def ring_period_m(camera: Camera) -> float:
@@ -83,24 +74,49 @@ def ring_period_m(camera: Camera) -> float:
     return max(longest * camera.sensor_distance_m / reach, 3.03 * camera.grid.pitch_m)
 
 
-def lens(camera: Camera, radial: bool, wavelength_m: float, power_per_m: float) -> Heights:
-    """A Fresnel lens of optical power 1/f_DOE, wrapped at one wave: phase -pi r² power / lambda."""
-    wave = full_wave_height_m(camera.material, wavelength_m)
-    return np.mod(-(_radii_m(camera, radial) ** 2) * power_per_m / (2 * wavelength_m), 1.0) * wave
+def flat(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """No relief: the plain lens."""
+    del options
+    return np.zeros_like(setup.radii_m())
 
 
-def fresnel(camera: Camera, radial: bool, wavelength_m: float, judge: Judge, evaluations: int) -> Heights:
-    """The Fresnel lens whose one free focal length is best for the objective, found by NLopt.
+def random(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Random diffuser: heights uniform over one wave, constant over squares (or rings) of side `feature`."""
+    pitch_m, shape = setup.camera.grid.pitch_m, setup.radii_m().shape
+    cells = min(max(1, round(_length(options, "feature", pitch_m) / pitch_m)), max(shape))
+    heights = np.random.default_rng(setup.seed).uniform(0, setup.wave_m, tuple(-(-n // cells) for n in shape))
+    for axis in range(heights.ndim):
+        heights = np.repeat(heights, cells, axis=axis)
+    return heights[tuple(slice(0, n) for n in shape)]
+
+
+def ring(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Circular `grating` of `far_energy` and `period` that the optimiser can leave.
+
+    A perfect grating is a stationary point in many directions; a little `roughness`, in waves, lets the optimiser leave
+    it. The quarter wave below keeps the floor of the grating away from the wrap at zero.
+    """
+    far_energy = _number(options, "far_energy", 0.25, 0.0, 1.0)
+    heights = grating(setup, far_energy, _length(options, "period", ring_period_m(setup.camera)))
+    noise = np.random.default_rng(setup.seed).standard_normal(heights.shape)
+    return heights + setup.wave_m * (0.25 + _number(options, "roughness", 0.02, 0.0, 1.0) * noise)
+
+
+def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Fresnel lens of `focal_length`, or whose focal length gives the least loss in `evaluations` of it.
 
     The paper's "Fresnel" baseline. The power is searched between minus and plus 40 edge waves with DIRECT-L (global,
     no gradient; D. R. Jones et al. 1993, as in NLopt) for most of the evaluations, then with Sbplx from the best point.
     """
     import nlopt
 
-    limit = 40 * 2 * wavelength_m / (camera.aperture_m / 2) ** 2
+    if "focal_length" in options:
+        return lens(setup, 1.0 / _length(options, "focal_length", 1.0))
+    evaluations = int(_number(options, "evaluations", 30, 3, 10_000))
+    limit = 40 * 2 * setup.wavelength_m / (setup.camera.aperture_m / 2) ** 2
 
     def loss(power: np.ndarray, _gradient: np.ndarray) -> float:
-        return judge(lens(camera, radial, wavelength_m, float(power[0]) * limit))
+        return setup.loss(lens(setup, float(power[0]) * limit))
 
     best = np.zeros(1)
     for algorithm, count in ((nlopt.GN_DIRECT_L, evaluations * 2 // 3), (nlopt.LN_SBPLX, evaluations // 3)):
@@ -111,65 +127,36 @@ def fresnel(camera: Camera, radial: bool, wavelength_m: float, judge: Judge, eva
         search.set_initial_step(0.02)
         search.set_maxeval(max(count, 1))
         best = search.optimize(best)
-    return lens(camera, radial, wavelength_m, float(best[0]) * limit)
+    return lens(setup, float(best[0]) * limit)
 
 
-_OPTIONS = {
-    "flat": (),
-    "random": ("feature",),
-    "fresnel": ("focal_length", "evaluations"),
-    "ring": ("far_energy", "period", "roughness"),
-}
+BUILT_IN = {start.__name__: start for start in (flat, random, fresnel, ring)}
 
 
-def start_heights(
-    name: str,
-    options: Mapping[str, Any],
-    camera: Camera,
-    *,
-    radial: bool,
-    wavelength_m: float,
-    seed: int,
-    judge: Judge,
-) -> Heights:
-    """Heights of a named start.
+def start_heights(name: str, options: Mapping[str, Any], setup: StartSetup) -> Heights:
+    """Heights of a named start, metres.
 
     Args:
-        name: "flat", "random", "fresnel" or "ring".
+        name: one of `doedesign.spec.values.STARTS`.
         options: `optimize.start_options` of the spec.
-        camera: optics.
-        radial: a profile over rings instead of a map.
-        wavelength_m: design wavelength.
-        seed: seed of random starts.
-        judge: the objective's value for given heights (used by "fresnel").
+        setup: the design task.
 
     Raises:
-        InputError: an option the start does not know, or an impossible value.
+        InputError: an option that the start does not take, or an impossible value.
     """
-    unknown = [key for key in options if key not in _OPTIONS[name]]
-    if unknown:
-        known = ", ".join(_OPTIONS[name]) or "none"
-        raise InputError(
-            "optimize.start_options", f'options of start "{name}" are: {known}', unknown[0], "Remove or rename it."
-        )
-    if name == "flat":
-        return flat(camera, radial)
-    if name == "random":
-        return random(camera, radial, wavelength_m, seed, _length(options, "feature", camera.grid.pitch_m))
-    if name == "fresnel":
-        if "focal_length" in options:
-            return lens(camera, radial, wavelength_m, 1.0 / _length(options, "focal_length", 1.0))
-        evaluations = int(_number(options, "evaluations", 30, 3, 10_000))
-        return fresnel(camera, radial, wavelength_m, judge, evaluations)
-    heights = ring(
-        camera,
-        radial,
-        wavelength_m,
-        _number(options, "far_energy", 0.25, 0.0, 1.0),
-        _length(options, "period", ring_period_m(camera)),
-    )
-    wave = full_wave_height_m(camera.material, wavelength_m)
-    # A perfect grating is a stationary point in many directions; a little roughness lets the optimiser leave it. The
-    # quarter wave below keeps the floor of the grating away from the wrap at zero.
-    rough = _number(options, "roughness", 0.02, 0.0, 1.0) * np.random.default_rng(seed).standard_normal(heights.shape)
-    return heights + wave * (0.25 + rough)
+    if unknown := [key for key in options if key not in STARTS[name]]:
+        known = ", ".join(STARTS[name]) or "none"
+        raise InputError(_WHERE, f'options of start "{name}" are: {known}', unknown[0], "Remove or rename it.")
+    return BUILT_IN[name](setup, options)
+
+
+def _number(options: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
+    value = options.get(key, default)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
+        rule = f"must be a number from {low:g} to {high:g}"
+        raise InputError(f"{_WHERE}.{key}", rule, repr(value), "Correct it.")
+    return float(value)
+
+
+def _length(options: Mapping[str, Any], key: str, default_m: float) -> float:
+    return positive_length(options[key], f"{_WHERE}.{key}") if key in options else default_m

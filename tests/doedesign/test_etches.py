@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.etch_depths import choose_depths, heights_of, held, light_cost
+from doedesign.design.etch_depths import height_histogram, light_cost, optimal_levels, recipe_depths_m
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
 from doedesign.design.parametrize import DEPTH_SCALE, LevelParametrization
 from doedesign.design.problem import losses, problem_of, view_of
@@ -56,19 +56,19 @@ def test_even_levels_of_even_heights_cost_one_minus_the_sinc(count: int) -> None
     line = camera(550e-9)
     wave = 1 / line.waves_per_metre(550e-9)
     heights = (np.arange(40_000) + 0.5) / 40_000 * wave
-    seen = heights_of(heights, everywhere(heights), wave, line)
+    seen = height_histogram(heights, everywhere(heights), wave, line)
     levels = Levels(count, wave / count)
     # The histogram and its rounded bins of 1 / 4096 wave: squares of 2 pi / 4096 over 24, far below 1e-6.
     assert light_cost(seen, levels) == pytest.approx(1 - np.sinc(1 / count), abs=1e-6)
     # No other set does better for even heights of one colour.
-    assert light_cost(seen, choose_depths(seen, levels)) >= 1 - np.sinc(1 / count) - 1e-6
+    assert light_cost(seen, optimal_levels(seen, levels)) >= 1 - np.sinc(1 / count) - 1e-6
 
 
 @pytest.mark.parametrize("levels", [Levels(4, 300e-9), UNEVEN, Levels(8, 150e-9, (500e-9, 170e-9, 320e-9))])
 def test_the_running_sums_give_what_every_single_height_gives(levels: Levels) -> None:
     colours = camera(486e-9, 656e-9)
     heights = np.random.default_rng(1).gamma(3.0, 150e-9, 20_000) % levels.period_m
-    seen = heights_of(heights, everywhere(heights), levels.period_m, colours)
+    seen = height_histogram(heights, everywhere(heights), levels.period_m, colours)
     off = heights - height_of(quantise_wrapped(heights[None], levels), levels)[0]
     each = [np.mean(1 - np.cos(2 * np.pi * colours.waves_per_metre(w) * off)) for w in (486e-9, 656e-9)]
     # Heights in the middle of bins of 0.3 nm: 0.15 nm is 1e-3 of a radian.
@@ -84,7 +84,7 @@ def test_two_etches_of_one_wave_each_serve_two_colours_at_once() -> None:
     a, b = 1 / rates[0], 1 / rates[1]
     heights = np.repeat([0.0, a, b, a + b], 50)
     even = Levels(4, 660e-9)
-    seen = heights_of(heights, everywhere(heights), even.period_m, colours)
+    seen = height_histogram(heights, everywhere(heights), even.period_m, colours)
     # By hand: 0 -> 0, a = 1.05 um -> 1.32 um, b = 1.44 um -> 1.32 um, and a + b = 2.49 um -> 0, one wave less.
     rounded = np.array([0.0, 1320e-9, 1320e-9, 0.0])
     off = np.array([0.0, a, b, a + b]) - rounded
@@ -92,7 +92,7 @@ def test_two_etches_of_one_wave_each_serve_two_colours_at_once() -> None:
     assert lost > 0.3
     # Bins of 2640 nm / 4096 = 0.6 nm: their middles are 0.3 nm off, 4e-3 of a radian, against a slope of at most 1.
     assert light_cost(seen, even) == pytest.approx(lost, abs=4e-3)
-    chosen = choose_depths(seen, even)
+    chosen = optimal_levels(seen, even)
     # 0.35 nm of bin and recipe is 5e-3 of a radian: 1e-5 of the light.
     assert light_cost(seen, chosen) < 2e-5
     np.testing.assert_allclose(chosen.depths_m, (a, b), atol=1 * NM)
@@ -101,19 +101,19 @@ def test_two_etches_of_one_wave_each_serve_two_colours_at_once() -> None:
 def test_heights_outside_the_aperture_do_not_count() -> None:
     line = camera(550e-9)
     heights = np.array([0.0, 600e-9, 350e-9])
-    seen = heights_of(heights, np.array([1.0, 1.0, 0.0]), 1.2e-6, line)
+    seen = height_histogram(heights, np.array([1.0, 1.0, 0.0]), 1.2e-6, line)
     # 0.15 nm of a bin: 1e-3 of a radian.
     assert light_cost(seen, Levels(2, 600e-9)) < 1e-6
 
 
 def test_depths_are_what_a_recipe_holds() -> None:
-    assert held([300.04e-9, 80.06e-9]) == (80.1e-9, 300.0e-9)
+    assert recipe_depths_m([300.04e-9, 80.06e-9]) == (80.1e-9, 300.0e-9)
 
 
 def test_where_nothing_is_better_2_to_the_k_steps_stay() -> None:
     line = camera(550e-9)
-    seen = heights_of(np.zeros(10), np.ones(10), 1.2e-6, line)
-    assert choose_depths(seen, Levels(16, 75e-9)) == Levels(16, 75e-9)
+    seen = height_histogram(np.zeros(10), np.ones(10), 1.2e-6, line)
+    assert optimal_levels(seen, Levels(16, 75e-9)) == Levels(16, 75e-9)
 
 
 # --- depths as parameters ---------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
     design = finished_design(spec, problem, state)
     area = np.asarray(problem.coverage)
     assert design.continuous_m is not None
-    seen = heights_of(design.continuous_m, area, design.levels.period_m, problem.camera)
+    seen = height_histogram(design.continuous_m, area, design.levels.period_m, problem.camera)
     assert light_cost(seen, design.levels) < light_cost(seen, Levels(4, 300e-9))
 
 

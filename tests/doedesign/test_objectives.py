@@ -8,11 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.objectives import PsfSet, far_spot, handcrafted, near_spread, terms_of, window_loss
-from doedesign.design.patterns import target_pattern_image
+from doedesign.design.objectives import (
+    BUILT_IN,
+    PsfSet,
+    far_spot,
+    handcrafted,
+    near_spread,
+    terms_from_spec,
+    window_loss,
+)
+from doedesign.design.patterns import target_image
 from doedesign.spec import load_spec
+from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.pictures import write_pixels
 from sim.camera import Camera, Colour
 from sim.metrics import participation
 from sim.psf_bank import psf_bank
@@ -72,11 +82,37 @@ def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:
     from doedesign.build import camera_from_spec
 
     camera = camera_from_spec(spec)
-    (term,) = terms_of(spec, camera, {})
-    target = target_pattern_image(camera, dict(spec.objectives[0].options), None, "objective")
+    (term,) = terms_from_spec(spec, camera, {})
+    target = target_image(camera, dict(spec.objectives[0].options), None, "objective")
     assert target.sum() == pytest.approx(1.0, abs=1e-5)
     images = PsfSet(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
     assert float(term.value(images)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_picture_is_a_target_with_its_top_at_the_highest_y(tmp_path: Path) -> None:
+    display = np.zeros((128, 128), np.uint8)
+    display[96:, :64] = 188  # top left; half of the linear light of 255 in sRGB
+    write_pixels(tmp_path / "grey.png", display)
+    write_pixels(tmp_path / "colour.tif", np.repeat(display[..., None].astype(np.uint16) * 257, 3, axis=2))
+    for name in ("grey.png", "colour.tif"):
+        target = target_image(CAMERA, {}, tmp_path / name, "objective")
+        assert target.sum() == pytest.approx(1.0, abs=1e-5)
+        # Anti-aliasing blurs by about a pixel of the target; energies are shares of the total, 16 x 32 pixels.
+        np.testing.assert_allclose(target[52:, :28], 1 / (16 * 32), rtol=0.01)
+        assert target[:44].max() < 1e-6
+    write_pixels(tmp_path / "black.png", np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match="some light"):
+        target_image(CAMERA, {}, tmp_path / "black.png", "objective")
+
+
+def test_the_objectives_are_those_of_the_spec() -> None:
+    """And each says by itself whether it looks at near depths, as the spec's table does."""
+    assert BUILT_IN.keys() == OBJECTIVES.keys()
+    given = {"target_pattern": {"target": even()}}
+    for name, traits in OBJECTIVES.items():
+        without = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), CAMERA)
+        value = float(BUILT_IN[name](without, **given.get(name, {})))
+        assert np.isnan(value) == traits.near, name
 
 
 def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,7 +121,7 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "users_objectives", module)
     overrides = ["objective.0.name=users_objectives:dark_centre", "objective.0.options.power=2.0"]
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
-    term = terms_of(spec, CAMERA, {})[0]
+    term = terms_from_spec(spec, CAMERA, {})[0]
     assert float(term.value(view(even(), point()))) == pytest.approx(1 / 64**4, rel=1e-5)
 
 
@@ -104,4 +140,4 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
     with pytest.raises(InputError, match=words):
-        terms_of(spec, CAMERA, {})
+        terms_from_spec(spec, CAMERA, {})

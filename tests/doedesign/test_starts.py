@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from doedesign.design.starts import flat, lens, random, ring, ring_period_m, start_heights
+from doedesign.design.starts import BUILT_IN, StartSetup, flat, grating, lens, random, ring_period_m, start_heights
+from doedesign.spec.values import STARTS
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.camera import Camera, Colour
@@ -14,18 +15,19 @@ from sim.psf_bank import psf_bank
 
 GREEN = 550e-9
 CAMERA = Camera(Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201)
+SETUP = StartSetup(CAMERA, False, GREEN, 3)
 
 
 @pytest.mark.parametrize("far_energy", [0.0, 0.25, 0.6, 1.0])
 def test_ring_keeps_the_asked_share_in_the_0th_order(far_energy: float) -> None:
-    height = ring(CAMERA, False, GREEN, far_energy, 16e-6)
+    height = grating(SETUP, far_energy, 16e-6)
     # Eight cells per period: the raster's area shares differ from one half by about 1 %.
     assert zeroth_order(CAMERA, height, GREEN) == pytest.approx(far_energy, abs=0.01)
 
 
 def test_ring_has_the_radius_of_its_grating_order() -> None:
     period = 16e-6
-    height = ring(CAMERA, False, GREEN, 0.0, period)
+    height = grating(SETUP, 0.0, period)
     psf = psf_bank(CAMERA, height, [np.inf]).energy[0, 0]
     radius = radius_map_m(psf.shape, CAMERA.pixel_m)
     profile = [psf[(radius >= r) & (radius < r + 4e-6)].sum() for r in np.arange(0, 240e-6, 4e-6)]
@@ -41,18 +43,18 @@ def test_ring_period_fits_every_colour_in_the_window() -> None:
 def test_lens_moves_the_focus() -> None:
     # A plate of power 1/z images a source at depth z onto the sensor: its near PSF is then the far PSF of a flat one.
     depth = 0.2
-    height = lens(CAMERA, False, GREEN, 1 / depth)
+    height = lens(SETUP, 1 / depth)
     passed = CAMERA.transmission(GREEN)
     spot = spot_radius_m(CAMERA, GREEN)
     sharp = energy_within(psf_bank(CAMERA, height, [depth]).energy[0, 0], CAMERA.pixel_m, spot)
-    ideal = energy_within(psf_bank(CAMERA, flat(CAMERA, False), [np.inf]).energy[0, 0], CAMERA.pixel_m, spot)
+    ideal = energy_within(psf_bank(CAMERA, flat(SETUP, {}), [np.inf]).energy[0, 0], CAMERA.pixel_m, spot)
     # The plate is continuous, so only the curvature beyond the paraxial sphere and the cells' sinc² cost light.
     assert sharp / passed > 0.97 * ideal / passed
 
 
 def test_random_is_seeded_and_uniform_over_one_wave() -> None:
-    height = random(CAMERA, False, GREEN, 3, 4e-6)
-    assert np.array_equal(height, random(CAMERA, False, GREEN, 3, 4e-6))
+    height = random(SETUP, {"feature": "4 um"})
+    assert np.array_equal(height, random(SETUP, {"feature": "4 um"}))
     assert np.array_equal(height[::2, ::2], height[1::2, 1::2])
     wave = full_wave_height_m("fused_silica", GREEN)
     # 40 000 independent squares: the mean of a uniform distribution is known to 0.3 / sqrt(40000) = 0.15 %.
@@ -62,20 +64,27 @@ def test_random_is_seeded_and_uniform_over_one_wave() -> None:
 def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
     depth = 0.2
 
-    def judge(height: np.ndarray) -> float:
+    def loss(height: np.ndarray) -> float:
         psf = psf_bank(CAMERA, height, [depth], sampling=1.0).energy[0, 0]
         return -energy_within(psf, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
 
-    options = {"evaluations": 45}
-    found = start_heights("fresnel", options, CAMERA, radial=False, wavelength_m=GREEN, seed=0, judge=judge)
-    ideal = lens(CAMERA, False, GREEN, 1 / depth)
+    found = start_heights("fresnel", {"evaluations": 45}, SETUP._replace(loss=loss))
+    ideal = lens(SETUP, 1 / depth)
     # Half of the best possible spot energy is inside the main lobe of the search landscape.
-    assert judge(found) < 0.9 * judge(ideal) < 0
+    assert loss(found) < 0.9 * loss(ideal) < 0
+
+
+def test_the_starts_are_those_of_the_spec() -> None:
+    assert BUILT_IN.keys() == STARTS.keys()
+    for name, options in STARTS.items():
+        for option in options:
+            with pytest.raises(InputError, match=f"start_options.{option}: must be"):
+                start_heights(name, {option: "much"}, SETUP)
 
 
 @pytest.mark.parametrize("name", ["flat", "random", "ring"])
 def test_radial_starts_are_profiles(name: str) -> None:
-    found = start_heights(name, {}, CAMERA, radial=True, wavelength_m=GREEN, seed=1, judge=lambda _: 0.0)
+    found = start_heights(name, {}, SETUP._replace(radial=True))
     assert found.shape == (ring_count(CAMERA),)
 
 
@@ -90,4 +99,4 @@ def test_radial_starts_are_profiles(name: str) -> None:
 )
 def test_wrong_options_are_named(name: str, options: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        start_heights(name, options, CAMERA, radial=False, wavelength_m=GREEN, seed=1, judge=lambda _: 0.0)
+        start_heights(name, options, SETUP)

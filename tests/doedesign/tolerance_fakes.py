@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +18,18 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Defects, Normal, Process, Variation, error_names
+from sim.camera import Camera, Colour
 
 LEVELS = Levels(4, 75e-9)
-
-
-@dataclass(frozen=True)
-class FakeGrid:
-    extent_m: tuple[float, float] = (1e-3, 1e-3)
-
-
-@dataclass(frozen=True)
-class FakeCamera:
-    grid: FakeGrid = FakeGrid()
+GRID = Grid((8, 8), 1e-3 / 8)
+CAMERA = Camera(GRID, 1e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 4e-3, 4e-6, 16)
 
 
 def design(name: object = "fake") -> Design:
     """A design whose name tells the evaluations below where to leave their marks."""
     level = np.arange(64, dtype=np.uint8).reshape(8, 8) % 4
-    level_map = LevelMap(level, LEVELS, Grid((8, 8), 1e-3 / 8), 1e-3, str(name))
-    return Design(level_map, FakeCamera(), (0.05,), (np.inf,))  # type: ignore[arg-type]
+    level_map = LevelMap(level, LEVELS, GRID, 1e-3, str(name))
+    return Design(level_map, CAMERA, (0.05,), (np.inf,))
 
 
 def process(**sigmas: float) -> Process:
