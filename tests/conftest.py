@@ -1,8 +1,17 @@
-"""What holds for every test: types are checked as the code runs, and randomness is seeded.
+"""What holds for every test: types are checked as the code runs, randomness is seeded, programs are compiled once.
 
 Single precision stays on, as in the product, so a test sees the rounding a user sees.
 """
 
+import atexit
+import ctypes
+import gc
+import os
+import resource
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -13,10 +22,22 @@ from jaxtyping import install_import_hook
 ROOT = Path(__file__).parent.parent
 WITH_ARRAYS = [path for path in (ROOT / "doedesign").rglob("*.py") if "jaxtyping" in path.read_text("utf-8")]
 
+# Programs are compiled once for all processes of a session: those of xdist, which find the name here, and those that
+# tests start. It must be said before anything imports jax.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    compiled = tempfile.mkdtemp(prefix="doedesign-compiled-")
+    atexit.register(shutil.rmtree, compiled, ignore_errors=True)
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": compiled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+
 # Before any test imports them: from here on the annotations of all modules with arrays are checked at every call,
 # shapes included. (The specs are left to pydantic.) As everywhere in Python, an int may stand for a float.
 install_import_hook(
-    ["sim", *(".".join(path.relative_to(ROOT).with_suffix("").parts) for path in WITH_ARRAYS)],
+    [
+        "sim",
+        "doedesign.recon",
+        "doedesign.training",
+        *(".".join(path.relative_to(ROOT).with_suffix("").parts) for path in WITH_ARRAYS),
+    ],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 
@@ -29,6 +50,25 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("repeatable")
+
+
+# Above this, a test process forgets the programs it compiled when a module of tests is done; jax itself never does.
+RESIDENT_BYTES = 1.6e9
+
+
+def resident_bytes() -> int:
+    """Memory of this process, or 0 where the system does not say."""
+    pages = Path("/proc/self/statm")
+    return int(pages.read_text().split()[1]) * resource.getpagesize() if pages.exists() else 0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def modest_memory() -> Iterator[None]:
+    yield
+    if "jax" in sys.modules and resident_bytes() > RESIDENT_BYTES:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
 
 
 @pytest.fixture
