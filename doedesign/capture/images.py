@@ -178,7 +178,7 @@ def crop(
     return np.ascontiguousarray(window[:, ::-1] if mirror else window)
 
 
-def display_values(picture: UInt8[np.ndarray, "y x 3"] | Float[np.ndarray, "y x 3"]) -> Picture:
+def display_values(picture: np.ndarray) -> Picture:
     """An array of display values, uint8 or floats from 0 to 1, as a picture.
 
     Raises:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key, UInt8
+from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel
 from doedesign.capture.from_spec import (
@@ -118,7 +118,7 @@ class SimulatedCapture:
 
 
 def simulate(
-    picture: str | Path | UInt8[np.ndarray, "y x 3"] | Float[np.ndarray, "y x 3"],
+    picture: str | Path | np.ndarray,
     design: Design,
     *,
     obstruction: str | ObstructionKind | None = None,

@@ -132,7 +132,7 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
             style: dict[str, Any] = {"color": LINE, "mec": LINE, "capsize": 3, "lw": 1.6, "ms": 5}
             fill = LINE if result.determined[name] else "white"
             errors.errorbar(centre[i], row, xerr=spread[i], fmt="o", mfc=fill, **style)
-            _beside(errors, row, value_text(name, posterior.values[i], posterior.sigma[i]))
+            _beside(errors, float(row), value_text(name, posterior.values[i], posterior.sigma[i]))
         errors.set_yticks(rows, [error_label(name) for name in unknowns.names])
         errors.set_ylim(-0.6, count - 0.4)
         reach = max(1.3, float(np.max(np.abs(centre) + spread)) * 1.1)
