@@ -14,9 +14,13 @@ from fab.draws import EXPECTED, variation_at
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process, Variation
+from fab.units import format_length
 from sim.camera import Camera
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
     from sim.surface import FabricatedDoe
 
 
@@ -115,3 +119,25 @@ class Design:
             side_m = max(self.camera.grid.extent_m)
             variation = variation_at(made_by, seed or 0, side_m, EXPECTED if seed is None else draw)
         return as_fabricated(self.level_map.level, self.camera, made_by, variation)
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the level map; on `ax`, or on a new figure. Returns what it drew on."""
+        return self.level_map.plot(ax)
+
+    def _repr_html_(self) -> str:
+        """Table and picture for notebooks."""
+        from fab.figure import html_of
+
+        colours = ", ".join(colour.name for colour in self.camera.colours)
+        near, far = (", ".join(format_length(z) for z in depths) or "none" for depths in (self.near_m, self.far_m))
+        rows: dict[str, object] = {
+            "level map": self.level_map,
+            "clear aperture": format_length(self.camera.aperture_m),
+            "lens": f"f = {format_length(self.camera.focal_length_m)}",
+            "colours": colours,
+            "near": near,
+            "far": far,
+        }
+        if self.history:
+            rows["loss"] = f"{self.history[-1]['loss']:.4g} after {len(self.history)} steps"
+        return html_of(self.name, rows, self.plot())
