@@ -25,7 +25,7 @@ from fab.level_map import LevelMap
 from fab.levels import Levels, height_of, quantise
 from fab.process import Process
 from fab.sampling import normal_draw
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
 TARGET_RATIO, TARGET_PEAK_GB, TARGET_SPEEDUP = 6.0, 4.0, 1.7
@@ -53,7 +53,7 @@ def time_draws(design: Design, process: Process, rounds: int) -> None:
         start = time.perf_counter()
         predict(design, process, normal_draw(process, 0, index, side))
         middle = time.perf_counter()
-        psf_bank(design.camera, height, design.depths_m)
+        psf(height, design.camera, design.depths_m)
         end = time.perf_counter()
         if index:  # the first round compiles
             draw_s.append(middle - start)

@@ -66,15 +66,16 @@ def ours(task: Task) -> Method:
     import jax.numpy as jnp
 
     from sim.propagation.farfield import plan_far_field
-    from sim.propagation.pupil import PhaseRows, phase_pupil
+    from sim.propagation.pupil import DoeRows, doe_field
+    from sim.source import MapColumns
 
     plan = plan_far_field(task.camera, YELLOW_M)
-    rate = jnp.float32(task.camera.waves_per_metre(YELLOW_M))
+    columns = MapColumns(jnp.float32(task.camera.waves_per_metre(YELLOW_M)))
     height, coverage, weights = (jnp.asarray(a) for a in (task.height_m, task.coverage, task.weights))
     source = jnp.zeros_like(height)
 
     def psf(height: jax.Array, source: jax.Array, coverage: jax.Array) -> jax.Array:
-        return plan.energy(phase_pupil, PhaseRows(height, source, coverage), rate)
+        return plan.energy(doe_field, DoeRows(coverage, height, None, source), columns)
 
     forward = jax.jit(psf)
     gradient = jax.jit(jax.value_and_grad(lambda *rows: jnp.sum(weights * psf(*rows))))

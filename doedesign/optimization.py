@@ -42,11 +42,11 @@ from fab.levels import Levels
 from fab.plots.height import plot_height
 from fab.units import NM
 from sim.aperture import circle_coverage
+from sim.optic import HeightOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
-from sim.propagation.hankel import ring_count
-from sim.psf_bank import PsfBank, psf_bank
+from sim.psf_bank import PsfBank, psf
 from sim.transfer import transfer_bank
 
 log = logging.getLogger("doedesign")
@@ -109,7 +109,7 @@ def _resume(
     run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
     optimiser = optimiser_of(run.spec)
-    shape = (ring_count(problem.camera),) if problem.radial else problem.camera.grid.shape
+    shape = problem.optic.shape
     # Depths that are learnt stand between the parameters and the moments.
     shapes = [shape, (run.spec.process.masks,)] if learns_depths(run.spec) else [shape]
     free = [np.zeros(each, np.float32) for each in shapes]
@@ -157,7 +157,7 @@ def _iterate(
 def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray) -> PsfBank:
     """The exact PSF bank of a height map at all depths of the spec."""
     depths = (*spec.scene.near_m, *spec.scene.far_m)
-    return psf_bank(problem.camera, height_m, depths, propagation=spec.optics.propagation)
+    return psf(height_m, problem.camera, depths, propagation=spec.optics.propagation)
 
 
 def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
@@ -190,7 +190,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, camera.aperture_m), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far), run.path("psf.png"))
-    transfers = [transfer_bank(camera, each, (*near, *far)) for each in (height, flat)]
+    transfers = [transfer_bank(HeightOptic.of(camera, each), (*near, *far)) for each in (height, flat)]
     save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))
     save(plot_encircled(bank, camera, near, far, lens), run.path("encircled.png"))
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]

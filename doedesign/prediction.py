@@ -14,7 +14,7 @@ from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.metrics import energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m
-from sim.psf_bank import PsfBank, surface_bank
+from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 
@@ -39,7 +39,7 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
         InputError: errors beyond what the model describes (`sim.surface.as_fabricated`).
     """
     surface = as_fabricated(design.level_map.level, design.camera, process, variation)
-    bank = surface_bank(design.camera, surface, design.depths_m)
+    bank = psf(surface, depths=design.depths_m)
     return Prediction(surface, bank, plate_rows(design, surface, bank))
 
 

@@ -37,7 +37,7 @@ from sim.imaging.formation import Optics, capture
 from sim.imaging.occlusion import Model, Outside
 from sim.imaging.scene import Obstruction, Scene
 from sim.imaging.shadow import shadowed_psf
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 from sim.store import read_height
 
 # Widths of the bar over the diameter of the aperture: 1, 2, 3, 4, 6, 8 and 10 mm for 4.44 mm.
@@ -83,7 +83,7 @@ def compare(
         and the error of every model.
     """
     half = camera.window // 2
-    optics = Optics.of(psf_bank(camera, height_m, [depth_m, background_m]), camera, [background_m, depth_m])
+    optics = Optics.of(psf(height_m, camera, [depth_m, background_m]), camera, [background_m, depth_m])
     pixels = middle_px + 2 * half + 1
     middle = slice(half, half + middle_px + 1)
     lines = range(pixels // 2 % line_px, pixels, line_px)
@@ -98,8 +98,8 @@ def compare(
             width_m = int(mask.sum()) * pixel_at(camera, depth_m)
             profiles = []
             for k, line in enumerate(lines):
-                psf = shadowed_psf(camera, height_m, mask, depth_m, background_m, (0, line))[0]
-                profiles.append(psf.sum(axis=0))
+                image = shadowed_psf(camera, height_m, mask, depth_m, background_m, (0, line))[0]
+                profiles.append(image.sum(axis=0))
                 progress.advance(n * len(lines) + k + 1)
             reference = _on_lines(profiles, lines, pixels)[middle]
             scene = Scene(light, background_m, (Obstruction(mask, np.zeros_like(light), depth_m),))

@@ -11,7 +11,6 @@ light comes in over the edges as it does in the world.
 import argparse
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +32,6 @@ from doedesign.training.scores import scores
 from fab.figure import SMALL, panels, save, scale_bar
 from fab.units import format_length
 from sim.camera import Camera
-from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.store import read_height
@@ -82,7 +80,7 @@ def photographed(model: Model, file: Path, seed: int, occlusion: str | None = No
     wanted = (side or load_spec(folder_of(model) / "spec.toml").train.size) + capture_model.margin_px
     view = CameraView((wanted, wanted), camera.pixel_m, camera.sensor_distance_m)
     sample = SceneData(Pictures((file,), most_px=2 * wanted), kind, view, far, seed, mirrored=False).item(0)
-    shot = photograph(sample, capture_model, partial(psf_at, model.bank), flat_psfs(camera), jax.random.key(seed))
+    shot = photograph(sample, capture_model, model.bank.at, flat_psfs(camera), jax.random.key(seed))
     psfs = [shot.psf_far, shot.psf_near]
     clean, plain, plate = (
         np.clip(srgb_from_linear(image), 0, 1) for image in (shot.clean, shot.conventional, shot.doe)

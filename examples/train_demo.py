@@ -23,7 +23,6 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +43,6 @@ from doedesign.training.scores import mean_and_interval, paired_difference, scor
 from doedesign.training.validation import SCENE_SEED
 from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
-from sim.imaging.formation import psf_at
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView
 
@@ -164,7 +162,7 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
     """
     models = {camera: Model.open(plan.out / f"{model}_{camera}_{seed}") for camera in CAMERAS}
     own, kind, far = see_through.capture_model_of(models["doe"])
-    psfs = [partial(psf_at, models[camera].bank) for camera in CAMERAS]
+    psfs = [models[camera].bank.at for camera in CAMERAS]
     side = load_spec(plan.out / f"{model}_doe_{seed}" / "spec.toml").train.size + own.margin_px
     view = CameraView((side, side), own.camera.pixel_m, own.camera.sensor_distance_m)
     files = picture_files(source_of(plan).test)
@@ -178,7 +176,7 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
                 shot = photograph(NamedScene(name, seen), by, *psfs, key)
                 for camera, light in zip(CAMERAS, (shot.doe, shot.conventional), strict=True):
                     bank, depths = models[camera].bank, (shot.depth_far_m, shot.depth_near_m)
-                    network = see_through.restored(models[camera], light, *(psf_at(bank, depth) for depth in depths))
+                    network = see_through.restored(models[camera], light, *(bank.at(depth) for depth in depths))
                     for what, image in (("capture", srgb_from_linear(light)), ("network", network)):
                         judged = scores(image[None], srgb_from_linear(shot.clean)[None], shot.mask[None])
                         found[border].setdefault(f"{camera}: {what}", []).append(float(judged.occluded.psnr[0]))

@@ -7,6 +7,7 @@ cancels the quadratic term of Fresnel propagation, so only the source's own path
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +23,20 @@ class Colour:
     name: str
     wavelengths_m: tuple[float, ...]
     weights: tuple[float, ...]
+
+
+class SpectralLine(NamedTuple):
+    """One wavelength of one colour channel.
+
+    Attributes:
+        colour: number of the channel.
+        wavelength_m: vacuum wavelength.
+        factor: weight in the channel times the power that passes the substrate's two faces.
+    """
+
+    colour: int
+    wavelength_m: float
+    factor: float
 
 
 @dataclass(frozen=True)
@@ -55,6 +70,15 @@ class Camera:
     def sensor_distance_m(self) -> float:
         """Distance from the lens to the sensor."""
         return self.focal_length_m + self.defocus_m
+
+    @property
+    def lines(self) -> tuple[SpectralLine, ...]:
+        """Every wavelength of every colour, colour by colour."""
+        return tuple(
+            SpectralLine(number, wavelength, weight * self.transmission(wavelength))
+            for number, colour in enumerate(self.colours)
+            for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
+        )
 
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""

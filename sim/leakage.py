@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.propagation.pupil import SurfaceRows, surface_pupil
-from sim.psf_bank import pixel_energy, plan_propagation, surface_energy
+from sim.camera import Colour
+from sim.psf_bank import psf
 from sim.surface import FabricatedDoe
 
 
@@ -73,31 +72,22 @@ class SplitPsf(NamedTuple):
         return float(np.max(np.abs(self.interference) - most) / np.max(self.total))
 
 
-def split_psf(camera: Camera, surface: FabricatedDoe, colour: Colour, depth_m: float) -> SplitPsf:
+def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
     """Split the PSF of one colour and depth into the light that leaked and the light that was diffracted.
 
     Args:
-        camera: lens, sensor and substrate.
-        surface: the plate, with the colour's wavelengths.
-        colour: colour channel.
+        doe: the DOE, with the colour's wavelengths.
         depth_m: source depth, metres.
+        colour: colour channel.
 
     Returns:
         energies per unit power incident on the clear aperture, Fresnel loss included. The three transforms are taken
         independently of each other: that they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
-    own = replace(camera, grid=surface.grid)
-    path = source_path_m(own, depth_m)
-    means = mean_transmission(surface)
-    parts = np.zeros((3, camera.window, camera.window), np.float32)
-    for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        plan = plan_propagation(own, wavelength, depth_m)
-        source = jnp.asarray(wrapped_waves(path, wavelength))
-        mean = jnp.complex64(means[surface.wavelengths_m.index(wavelength)])
-        whole = surface.at(wavelength)
-        factor = weight * camera.transmission(wavelength)
-        parts[0] += factor * surface_energy(plan, camera, surface, wavelength, source)
-        for i, field in ((1, jnp.full_like(whole, mean)), (2, whole - mean)):
-            rows = SurfaceRows(field, source, surface.coverage)
-            parts[i] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
-    return SplitPsf(*parts)
+    chosen = [doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m]
+    whole = doe.transmission[np.array(chosen)]
+    even = jnp.broadcast_to(jnp.asarray(mean_transmission(doe)[chosen], jnp.complex64)[:, None, None], whole.shape)
+    one = replace(doe, camera=replace(doe.camera, colours=(colour,)))
+    other = replace(one, wavelengths_m=colour.wavelengths_m, height_m=None)
+    parts = (replace(other, transmission=part) for part in (even, whole - even))
+    return SplitPsf(*(psf(part, depths=depth_m).energy[0, 0] for part in (one, *parts)))

@@ -10,8 +10,8 @@ from scipy.fft import fft2
 
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, Colour
-from sim.psf_bank import pupil_field
+from sim.camera import Camera, Colour, SpectralLine
+from sim.optic import HeightOptic
 
 
 def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y x"]:
@@ -88,7 +88,8 @@ def participation(psf: Array) -> Array:
 def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:
     """Fraction |<t>|^2 of the light that passes as if the plate were flat, t = exp(i phi) over the clear aperture."""
     # A star in focus is a plane wave; out of focus, a phase that is not the plate's would be added.
-    field = pupil_field(replace(camera, defocus_m=0.0), height_m, np.inf, wavelength_m)
+    optic = HeightOptic.of(replace(camera, defocus_m=0.0), height_m)
+    field = optic.field(SpectralLine(0, wavelength_m, 1.0))
     cells = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     return float(np.abs(np.asarray(field, np.complex128).sum() / cells) ** 2)
 
@@ -154,8 +155,9 @@ def energy_budget(
     curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
+    optic = HeightOptic.of(camera, height_m)
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-        field = np.asarray(pupil_field(camera, height_m, depth_m, wavelength))
+        field = np.asarray(optic.field(SpectralLine(0, wavelength, 1.0), depth_m))
         share = weight * camera.transmission(wavelength)
         passed += share
         band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength) / scale

@@ -1,209 +1,199 @@
-"""PSF banks: the image of a point source for every colour and depth of one DOE height map."""
+"""PSFs: the image of a point source for every colour of an optic and every depth."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Literal
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jax.core import Tracer
+from jaxtyping import Array, Float
 
-from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.propagation.farfield import FarField, plan_far_field
-from sim.propagation.fresnel import DirectPath, plan_direct
-from sim.propagation.hankel import plan_hankel, ring_source_waves
-from sim.propagation.pupil import PhaseRows, PupilRows, SurfaceRows, phase_pupil, surface_pupil
-from sim.surface import FabricatedDoe
+from fab.errors import InputError
+from fab.units import parse_length
+from sim.camera import Camera, SpectralLine
+from sim.optic import ON_AXIS, CellOptic, HasOptic, HeightOptic, Optic, Propagation
 
-Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
+Length = float | str
 
 
 class PsfBank(eqx.Module):
     """PSFs of one optical system, on one field angle.
 
     Attributes:
-        energy: `[wavelength, depth, y, x]` energy per pixel per unit power incident on the clear aperture.
+        energy: `[wavelength, depth, y, x]` energy per pixel per unit power incident on the clear aperture; numpy, or
+            jax where it is traced.
         colours: name of each entry of the first axis.
         depths_m: source depth of each entry of the second axis, metres.
         pixel_m: pixel pitch, metres. The chief ray is at the centre of the window.
         field_rad: field angles (y, x).
+        camera: the camera they were computed for, if it is known.
     """
 
-    energy: Float[np.ndarray, "w d y x"]
+    energy: Float[np.ndarray, "w d y x"] | Float[Array, "w d y x"]
     colours: tuple[str, ...] = eqx.field(static=True)
     depths_m: tuple[float, ...] = eqx.field(static=True)
     pixel_m: float = eqx.field(static=True)
     field_rad: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
+    camera: Camera | None = eqx.field(static=True, default=None)
+
+    def as_optic(self) -> "BankOptic":
+        """An optic that mixes these PSFs linearly in 1/z."""
+        order = np.argsort([1 / depth for depth in self.depths_m])
+        inverse = np.array([1 / self.depths_m[k] for k in order], np.float32)
+        energy = jnp.asarray(self.energy[:, order].swapaxes(0, 1))
+        return BankOptic(energy, jnp.asarray(inverse), self.colours, self.pixel_m, self.camera)
+
+    def at(self, depth_m: float) -> Float[np.ndarray, "c y x"]:
+        """PSFs of every colour at a depth, mixed linearly in 1/z from the two nearest.
+
+        Raises:
+            InputError: a depth beyond the bank's.
+        """
+        order = np.argsort([1 / depth for depth in self.depths_m])
+        curvatures = np.array([1 / self.depths_m[d] for d in order])
+        # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.
+        wanted, slack = 1 / depth_m, 1e-6 * curvatures[-1]
+        if not curvatures[0] - slack <= wanted <= curvatures[-1] + slack:
+            depths = sorted(self.depths_m)
+            rule = f"must lie within the depths of the PSF bank, {depths[0]:g} to {depths[-1]:g} m"
+            raise InputError("depth", rule, f"{depth_m:g} m", "Compute the bank for this depth too.")
+        place = float(np.interp(wanted, curvatures, np.arange(len(order))))
+        low = min(int(place), len(order) - 1)
+        share = np.float32(place - low)
+        lower = self.energy[:, order[low]]
+        return lower if share == 0 else (1 - share) * lower + share * self.energy[:, order[low + 1]]
 
 
-def plan_propagation(
-    camera: Camera,
-    wavelength_m: float,
-    depth_m: float,
-    propagation: Propagation = "far_field",
-    sampling: float | None = None,
-) -> FarField | DirectPath:
-    """Operators of one wavelength and depth for the propagation a spec names (a direct path serves every depth).
+class BankOptic(Optic):
+    """PSFs that are known at some depths, computed or measured, mixed linearly in 1/z between them.
+
+    Beyond the outermost depths they stay as they are there.
+
+    Attributes:
+        energies: `[depth, c, y, x]` PSFs, the farthest first.
+        inverse_depths: `[depth]` rising, 1/m.
+        colours: names of the channels.
+        pixel_m: pixel pitch, metres.
+        camera: the camera, if it is known.
+    """
+
+    energies: Float[Array, "d c y x"]
+    inverse_depths: Float[Array, " d"]
+    colours: tuple[str, ...] = eqx.field(static=True)
+    pixel_m: float = eqx.field(static=True)
+    camera: Camera | None = eqx.field(static=True, default=None)
+
+    @property
+    def lines(self) -> tuple[SpectralLine, ...]:
+        """One line per colour, without a wavelength of its own."""
+        return tuple(SpectralLine(number, 0.0, 1.0) for number in range(len(self.colours)))
+
+    def plan(
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+    ) -> None:
+        """Nothing is propagated."""
+
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> np.ndarray:
+        """The source's curvature, 1/m; its field angle makes no difference."""
+        return np.asarray(1 / depth_m, np.float32)
+
+    def energy(self, line: SpectralLine, plan: None, source: Float[Array, ""] | np.ndarray) -> Float[Array, "y x"]:
+        """Energy in every pixel."""
+        place = jnp.interp(source, self.inverse_depths, jnp.arange(len(self.inverse_depths), dtype=jnp.float32))
+        low = jnp.clip(place.astype(jnp.int32), 0, max(len(self.inverse_depths) - 2, 0))
+        share = place - low
+        known = self.energies[:, line.colour]
+        return (1 - share) * known[low] + share * known[low + 1]
+
+
+def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
+    """The optic of something that carries one, or of a bare height map `[y, x]` (metres) and a camera.
 
     Raises:
-        InputError: the direct path is asked for where eq. 6 does not hold.
+        ValueError: a map without a camera or of another shape than its grid, or a camera with another aperture or
+            substrate than the optic's.
+        TypeError: a camera for an optic that is not made of cells.
     """
-    if propagation == "far_field":
-        return plan_far_field(camera, wavelength_m, depth_m=depth_m, sampling=sampling)
-    return plan_direct(camera, wavelength_m, propagation)
+    if isinstance(optic, HasOptic):
+        found = optic.as_optic()
+        if camera is None:
+            return found
+        if not isinstance(found, CellOptic):
+            raise TypeError(f"`camera` must be left out for a {type(found).__name__}, which has its own")
+        return found.with_camera(camera)
+    if camera is None:
+        raise ValueError(f"a height map needs a `camera`, but got {type(optic).__name__} alone")
+    return HeightOptic.of(camera, optic)
 
 
-def pixel_energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
-    """`plan.energy`, compiled once per shape."""
-    # The error that a plan predicts changes with depth; kept, it would have every depth compiled anew.
-    timeless = replace(plan, expected_error=0.0) if isinstance(plan, FarField) else plan
-    return _compiled_energy(timeless, pupil, rows, shared)
+def depth_m(value: Length) -> float:
+    """A source depth in metres from a number or text with a unit, such as "5 mm" or "inf"."""
+    if isinstance(value, str):
+        return np.inf if value.strip() in ("inf", "infinity") else parse_length(value)
+    return float(value)
 
 
-@eqx.filter_jit
-def _compiled_energy(plan: FarField | DirectPath, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Array:
-    return plan.energy(pupil, rows, shared)
-
-
-def psf_bank(
-    camera: Camera,
-    height_m: Float[np.ndarray, "y x"],
-    depths_m: Sequence[float],
+def psf(
+    optic: Any,
+    camera: Camera | None = None,
+    depths: Length | Sequence[Length] = np.inf,
     *,
-    field_rad: tuple[float, float] = (0.0, 0.0),
+    field_rad: tuple[float, float] = ON_AXIS,
     propagation: Propagation = "far_field",
     sampling: float | None = None,
     on_psf: Callable[[], None] = lambda: None,
 ) -> PsfBank:
-    """PSFs of a height map for every colour of the camera and every depth.
+    """PSFs for every colour and depth.
+
+    The PSFs are differentiable in the arrays of the optic: `jax.grad`, `jit` and `vmap` go through.
 
     Args:
-        camera: lens, sensor, substrate and DOE grid.
-        height_m: `[y, x]` DOE height on `camera.grid`, metres.
-        depths_m: source depths, metres (`inf` allowed).
-        field_rad: field angles (y, x); the window follows the chief ray.
+        optic: an `Optic`, anything that carries one (a design, a DOE as fabricated, a bank), or a height map `[y, x]`
+            in metres on `camera.grid`.
+        camera: lens, sensor, substrate and DOE grid of a bare height map; another lens or sensor for an optic of cells.
+        depths: one source depth or several, in metres or with a unit; "inf" for a star.
+        field_rad: field angles (y, x), positive where light travels toward +y or +x; the window follows the chief ray.
         propagation: far field, or one of the direct kernels.
-        sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
+        sampling: intensity samples per lambda d / D (far field only); see `sim.propagation.farfield.plan_far_field`.
         on_psf: called after every single PSF, for progress.
 
     Returns:
         the bank, Fresnel loss of the substrate included.
 
     Raises:
-        ValueError: `height_m` does not match `camera.grid`.
+        ValueError: a height map that does not match its camera, or what the optic cannot do.
         InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
     """
-    if height_m.shape != camera.grid.shape:
-        raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height_m.shape}")
-    height = jnp.asarray(height_m, jnp.float32)
-    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    lines = [
-        (c, weight * camera.transmission(wavelength), wavelength)
-        for c, colour in enumerate(camera.colours)
-        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
-    ]
-    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
-    for d, depth in enumerate(depths_m):
-        path = source_path_m(camera, depth, field_rad)
-        for c, factor, wavelength in lines:
-            plan = plan_propagation(camera, wavelength, depth, propagation, sampling)
-            rate = jnp.float32(camera.waves_per_metre(wavelength, field_rad))
-            rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
-            energy[c, d] += factor * np.asarray(pixel_energy(plan, phase_pupil, rows, rate))
+    chosen = optic_of(optic, camera)
+    given = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
+    depths_m = tuple(depth_m(depth) for depth in given)
+    rows = []
+    for depth in depths_m:
+        images: list[Any] = [0.0] * len(chosen.colours)
+        for line in chosen.lines:
+            plan = chosen.plan(line, depth, propagation, sampling)
+            image = _compiled(chosen, line, plan, chosen.source(line, depth, field_rad))
+            images[line.colour] = images[line.colour] + line.factor * _on_host(image)
             on_psf()
-    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
+        rows.append(_stack(images, 0))
+    return PsfBank(_stack(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
 
 
-def surface_bank(
-    camera: Camera,
-    surface: FabricatedDoe,
-    depths_m: Sequence[float],
-    *,
-    field_rad: tuple[float, float] = (0.0, 0.0),
-    on_psf: Callable[[], None] = lambda: None,
-) -> PsfBank:
-    """PSFs of a plate as fabricated, for every colour of the camera and every depth, in the far field.
-
-    Args:
-        camera: lens, sensor and substrate.
-        surface: the plate, with every wavelength of the camera.
-        depths_m: source depths, metres (`inf` allowed).
-        field_rad: field angles (y, x); the plate's transmission is taken as that on the axis.
-        on_psf: called after every single PSF, for progress.
-
-    Returns:
-        the bank, per unit power incident on the *nominal* clear aperture, Fresnel loss of the substrate included.
-    """
-    own = replace(camera, grid=surface.grid)
-    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
-    for d, depth in enumerate(depths_m):
-        path = source_path_m(own, depth, field_rad)
-        for c, colour in enumerate(camera.colours):
-            for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-                plan = plan_propagation(own, wavelength, depth)
-                source = jnp.asarray(wrapped_waves(path, wavelength))
-                factor = weight * camera.transmission(wavelength)
-                energy[c, d] += factor * surface_energy(plan, camera, surface, wavelength, source)
-                on_psf()
-    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m, field_rad)
+# Compiled once per wavelength and shape, whatever the depth.
+@eqx.filter_jit
+def _compiled(optic: Optic, line: SpectralLine, plan: Any, source: Any) -> Array:
+    return optic.energy(line, plan, source)
 
 
-def surface_energy(
-    plan: FarField | DirectPath, camera: Camera, surface: FabricatedDoe, wavelength_m: float, source_waves: Array
-) -> Float[np.ndarray, "v u"]:
-    """Pixel energies of a plate for one wavelength and source, without Fresnel loss.
-
-    A plate exactly as drawn takes the way of `psf_bank`, so that both agree to the last bit.
-    """
-    if surface.height_m is not None:
-        rows = PhaseRows(surface.height_m, source_waves, surface.coverage)
-        rate = jnp.float32(camera.waves_per_metre(wavelength_m))
-        return np.asarray(pixel_energy(plan, phase_pupil, rows, rate))
-    field = SurfaceRows(surface.at(wavelength_m), source_waves, surface.coverage)
-    return np.asarray(pixel_energy(plan, surface_pupil, field, None))
+def _on_host(image: Array) -> Any:
+    """Numbers as numpy, which adds them up without the library's overhead; what is traced stays."""
+    return image if isinstance(image, Tracer) else np.asarray(image)
 
 
-def pupil_field(
-    camera: Camera, height_m: Float[np.ndarray, "y x"], depth_m: float, wavelength_m: float
-) -> Complex[Array, "y x"]:
-    """The whole field behind the DOE for a source on the axis, `[y, x]`, unit amplitude where open."""
-    source = jnp.asarray(wrapped_waves(source_path_m(camera, depth_m), wavelength_m))
-    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    rows = PhaseRows(jnp.asarray(height_m, jnp.float32), source, coverage)
-    return jax.jit(phase_pupil)(rows, jnp.float32(camera.waves_per_metre(wavelength_m)))
-
-
-def radial_psf_bank(
-    camera: Camera,
-    profile_m: Float[np.ndarray, " ring"],
-    depths_m: Sequence[float],
-    *,
-    on_psf: Callable[[], None] = lambda: None,
-) -> PsfBank:
-    """PSFs on the axis of rings drawn as rings, by the Hankel path.
-
-    Args:
-        camera: optics.
-        profile_m: height of every ring of one cell's width, metres (`sim.propagation.hankel.ring_count` of them).
-        depths_m: source depths, metres.
-        on_psf: called after every single PSF, for progress.
-
-    Returns:
-        the bank, Fresnel loss of the substrate included.
-    """
-    energy = np.zeros((len(camera.colours), len(depths_m), camera.window, camera.window), np.float32)
-    profile = jnp.asarray(profile_m, jnp.float32)
-    for c, colour in enumerate(camera.colours):
-        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-            plan = plan_hankel(camera, wavelength)
-            rate = jnp.float32(camera.waves_per_metre(wavelength))
-            for d, depth in enumerate(depths_m):
-                source = jnp.asarray(ring_source_waves(camera, depth, wavelength))
-                energy[c, d] += (
-                    weight * camera.transmission(wavelength) * np.asarray(plan.energy(profile, source, rate))
-                )
-                on_psf()
-    return PsfBank(energy, tuple(c.name for c in camera.colours), tuple(depths_m), camera.pixel_m)
+def _stack(images: list[Any], axis: int) -> Any:
+    return (jnp if any(isinstance(image, Tracer) for image in images) else np).stack(images, axis)

@@ -1,119 +1,122 @@
-"""A point source at any depth and field angle, described by a few numbers and two rows of phase.
+"""Point sources: the optical path from a source to the cells of a DOE, for one wavelength, depth and field angle.
 
-The path from a source to the cells of a plate (`sim.camera.path_at_m`) is a hundred waves from side to side, so it is
-wrapped in double precision. All of that but a few waves is a parabola, and a parabola is a sum over y and x: it is
-wrapped per axis, in double precision, on the host. What remains, for a chief ray of curvature k = 1 / c and direction
-sines s, is
+`SourceMap` holds the path to every cell, wrapped in double precision on the host (`sim.camera.source_path_m`).
+
+`SeparableSource` describes it by a few numbers and two rows of phase, so that one compiled step serves every depth. The
+path from side to side of the aperture is a hundred waves. All but a few of them are a parabola, and a parabola is a sum
+over y and x: it is wrapped per axis, in double precision, on the host. What remains, for a chief ray of curvature
+k = 1 / c and direction sines s, is
 
     -k q² / (2 (1 + sqrt(1 + k q))²),    q = k r² + 2 s·r,
 
-free of cancellation and small enough for single precision. So a source may be traced: one compiled step serves every
-depth.
+free of cancellation and small enough for single precision.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
-from sim.camera import Camera, direction_sines, wrapped_waves
-from sim.propagation.pupil import cis
+from fab.grid import Grid
+from sim.camera import Camera, direction_sines, source_path_m, wrapped_waves
+
+Real = Array | np.ndarray | np.float32
 
 
-class Source(NamedTuple):
-    """A point source, for every line (wavelength) of a camera.
+class MapColumns(NamedTuple):
+    """Waves per metre of DOE height; the rows are the waves of the source."""
+
+    waves_per_metre: Real
+
+    def waves(self, rows: Array, height_m: Array | None) -> Float[Array, "y x"]:
+        """Optical path in waves."""
+        return rows if height_m is None else height_m * self.waves_per_metre + rows
+
+
+class SourceMap(eqx.Module):
+    """A point source by its path to every cell.
+
+    Attributes:
+        source_waves: `[y, x]` wrapped optical path to every cell (or `[subring]` of a DOE of rings), waves.
+        waves_per_metre: waves of delay per metre of DOE height for this chief ray.
+    """
+
+    source_waves: Float[Array, "*cell"]
+    waves_per_metre: Float[Array, ""]
+
+    @classmethod
+    def at(
+        cls, camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+    ) -> "SourceMap":
+        """A source at a depth (metres, `inf` allowed) and field angles (y, x), as every cell of the camera sees it."""
+        waves = wrapped_waves(source_path_m(camera, depth_m, field_rad), wavelength_m)
+        return cls(jnp.asarray(waves), jnp.float32(camera.waves_per_metre(wavelength_m, field_rad)))
+
+    def over(self, grid: Grid) -> tuple[Array, MapColumns]:
+        """What `sim.propagation.pupil.doe_field` has to know: by row, and for all rows alike."""
+        return self.source_waves, MapColumns(self.waves_per_metre)
+
+
+class SeparableColumns(NamedTuple):
+    """A `SeparableSource` on columns at `x_m`; the rows are their positions and `waves_y`."""
+
+    x_m: Array
+    waves_x: Array
+    curvature: Array
+    sines: Array
+    waves_per_metre: Array
+    inverse_wavelength: Array
+
+    def waves(self, rows: tuple[Array, Array], height_m: Array | None) -> Float[Array, "y x"]:
+        """Optical path in waves."""
+        y_m, waves_y = rows
+        waves = waves_y[:, None] if height_m is None else height_m * self.waves_per_metre + waves_y[:, None]
+        return waves + self.waves_x[None, :] + self.remainder_m(y_m) * self.inverse_wavelength
+
+    def remainder_m(self, y_m: Array) -> Float[Array, "y x"]:
+        """The path less its parabola and its tilt, metres."""
+        y, x = y_m[:, None], self.x_m[None, :]
+        k = self.curvature
+        q = k * (y * y + x * x) + 2 * (self.sines[0] * y + self.sines[1] * x)
+        return -k * q * q / (2 * (1 + jnp.sqrt(1 + k * q)) ** 2)
+
+
+class SeparableSource(NamedTuple):
+    """A point source by a few numbers; all of them may be traced.
 
     Attributes:
         curvature: inverse of the chief ray's length, 1/m; 0 for a star.
         sines: direction sines (y, x) of the chief ray.
-        waves_y: `[line, y]` wrapped parabola along y, waves.
-        waves_x: `[line, x]` the same along x.
-        rates: `[line]` waves per metre of DOE height for this chief ray.
-        inverse_wavelengths: `[line]` waves per metre of path.
-    """
-
-    curvature: Float[Array, ""] | np.float32
-    sines: Float[Array, "2"] | Float[np.ndarray, "2"]
-    waves_y: Float[Array, "line y"] | Float[np.ndarray, "line y"]
-    waves_x: Float[Array, "line x"] | Float[np.ndarray, "line x"]
-    rates: Float[Array, " line"] | Float[np.ndarray, " line"]
-    inverse_wavelengths: Float[Array, " line"] | Float[np.ndarray, " line"]
-
-
-def source_at(
-    camera: Camera, wavelengths_m: tuple[float, ...], depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
-) -> Source:
-    """Describe a source.
-
-    Args:
-        camera: lens and grid.
-        wavelengths_m: vacuum wavelength of every line.
-        depth_m: axial distance of the source from the DOE; `inf` for a star.
-        field_rad: field angles (y, x) of the chief ray (`sim.camera.direction_sines`).
-    """
-    tangents = np.tan(np.asarray(field_rad, np.float64))
-    curvature = 0.0 if np.isinf(depth_m) else 1 / (depth_m * np.sqrt(1 + np.sum(tangents**2)))
-    bend = curvature + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
-    rows = [
-        np.stack([wrapped_waves(bend / 2 * camera.grid.axis_m(axis) ** 2, line) for line in wavelengths_m])
-        for axis in ("y", "x")
-    ]
-    rates = np.array([camera.waves_per_metre(line, field_rad) for line in wavelengths_m], np.float32)
-    sines = direction_sines(field_rad).astype(np.float32)
-    inverse = np.array([1 / line for line in wavelengths_m], np.float32)
-    return Source(np.float32(curvature), sines, rows[0], rows[1], rates, inverse)
-
-
-class SourceRows(NamedTuple):
-    """Row-wise description of a phase-only pupil and where it lies.
-
-    Attributes:
-        height_m: `[y, x]` DOE height, metres.
-        coverage: `[y, x]` open share of each cell.
-        y_m: `[y]` position of the rows.
-        waves_y: `[y]` see `Source`, of one line.
-        errors: `[y, x]` factor of the transmission beside what the height does, if there is one.
-    """
-
-    height_m: Float[Array, "y x"]
-    coverage: Float[Array, "y x"]
-    y_m: Float[Array, " y"]
-    waves_y: Float[Array, " y"]
-    errors: Complex[Array, "y x"] | None = None
-
-
-class SourceColumns(NamedTuple):
-    """What all rows share.
-
-    Attributes:
-        x_m: `[x]` position of the columns.
-        waves_x: `[x]` see `Source`, of one line.
-        curvature: see `Source`.
-        sines: see `Source`.
-        rate: waves per metre of height.
+        waves_y: `[y]` wrapped parabola along y, waves.
+        waves_x: `[x]` the same along x.
+        waves_per_metre: waves of delay per metre of DOE height for this chief ray.
         inverse_wavelength: waves per metre of path.
     """
 
-    x_m: Float[Array, " x"]
-    waves_x: Float[Array, " x"]
-    curvature: Float[Array, ""]
-    sines: Float[Array, "2"]
-    rate: Float[Array, ""]
-    inverse_wavelength: Float[Array, ""]
+    curvature: Real
+    sines: Real
+    waves_y: Real
+    waves_x: Real
+    waves_per_metre: Real
+    inverse_wavelength: Real
 
+    @classmethod
+    def at(
+        cls, camera: Camera, wavelength_m: float, depth_m: float, field_rad: tuple[float, float] = (0.0, 0.0)
+    ) -> "SeparableSource":
+        """A source at a depth (metres, `inf` allowed) and field angles (y, x) of the chief ray."""
+        tangents = np.tan(np.asarray(field_rad, np.float64))
+        curvature = 0.0 if np.isinf(depth_m) else 1 / (depth_m * np.sqrt(1 + np.sum(tangents**2)))
+        bend = curvature + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+        waves_y, waves_x = (wrapped_waves(bend / 2 * camera.grid.axis_m(axis) ** 2, wavelength_m) for axis in "yx")
+        sines = direction_sines(field_rad).astype(np.float32)
+        per_metre = np.float32(camera.waves_per_metre(wavelength_m, field_rad))
+        return cls(np.float32(curvature), sines, waves_y, waves_x, per_metre, np.float32(1 / wavelength_m))
 
-def remainder_m(rows_y_m: Array, columns: SourceColumns) -> Float[Array, "y x"]:
-    """The path less its parabola and its tilt, metres."""
-    y, x = rows_y_m[:, None], columns.x_m[None, :]
-    k = columns.curvature
-    q = k * (y * y + x * x) + 2 * (columns.sines[0] * y + columns.sines[1] * x)
-    return -k * q * q / (2 * (1 + jnp.sqrt(1 + k * q)) ** 2)
-
-
-def source_pupil(rows: SourceRows, columns: SourceColumns) -> Complex[Array, "y x"]:
-    """Field coverage * exp(2 pi i (height * rate + source)) of rows (`sim.propagation.pupil.phase_pupil`)."""
-    waves = rows.height_m * columns.rate + rows.waves_y[:, None] + columns.waves_x[None, :]
-    waves = waves + remainder_m(rows.y_m, columns) * columns.inverse_wavelength
-    field = rows.coverage * cis(waves)
-    return field if rows.errors is None else field * rows.errors
+    def over(self, grid: Grid) -> tuple[tuple[Array, Array], SeparableColumns]:
+        """What `sim.propagation.pupil.doe_field` has to know: by row, and for all rows alike."""
+        y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in "yx")
+        curvature, sines, waves_y, waves_x, *scales = (jnp.asarray(part) for part in self)
+        return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.propagation.pupil import PhaseRows, block_size, in_blocks, phase_pupil
+from sim.optic import CellOptic
+from sim.propagation.pupil import DoeRows, SourceColumns, block_size, doe_field, in_blocks
 
 
 class TransferBank(NamedTuple):
@@ -36,42 +35,36 @@ class TransferBank(NamedTuple):
 
 
 @jax.jit
-def _row_spectra(rows: PhaseRows, waves_per_metre: Array) -> Array:
+def _row_spectra(rows: DoeRows, columns: SourceColumns) -> Array:
     """Sum over y of |FFT along x|² of the rows padded to twice their length, `[2 cells]`."""
 
-    def add(total: Array, block: PhaseRows) -> tuple[Array, None]:
-        spectrum = jnp.fft.fft(phase_pupil(block, waves_per_metre), len(total))
+    def add(total: Array, block: DoeRows) -> tuple[Array, None]:
+        spectrum = jnp.fft.fft(doe_field(block, columns), len(total))
         return total + jnp.sum(spectrum.real**2 + spectrum.imag**2, axis=0), None
 
-    count, cells = rows.height_m.shape
+    count, cells = rows.coverage.shape
     return jax.lax.scan(add, jnp.zeros(2 * cells), in_blocks(rows, block_size(count)))[0]
 
 
-def transfer_bank(
-    camera: Camera, height_m: Float[np.ndarray, "y x"], depths_m: Sequence[float], count: int = 160
-) -> TransferBank:
-    """MTF of a height map along x, from zero to the sensor's Nyquist frequency.
+def transfer_bank(optic: CellOptic, depths_m: Sequence[float], count: int = 160) -> TransferBank:
+    """MTF of a DOE along x, from zero to the sensor's Nyquist frequency.
 
     Args:
-        camera: optics.
-        height_m: `[y, x]` the map, metres.
+        optic: the DOE.
         depths_m: source depths on the axis, metres.
         count: number of frequencies.
     """
+    camera = optic.camera
     frequencies = np.linspace(0.0, 0.5 / camera.pixel_m, count)
-    height = jnp.asarray(height_m, jnp.float32)
-    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     otf = np.zeros((len(camera.colours), len(depths_m), count), np.complex128)
     lags = np.arange(camera.grid.shape[1])
+    weights = [weight for colour in camera.colours for weight in colour.weights]
     for d, depth in enumerate(depths_m):
-        path = source_path_m(camera, depth)
-        for c, colour in enumerate(camera.colours):
-            for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-                rows = PhaseRows(height, jnp.asarray(wrapped_waves(path, wavelength)), coverage)
-                power = np.asarray(_row_spectra(rows, jnp.float32(camera.waves_per_metre(wavelength))), np.float64)
-                correlation = np.fft.ifft(power)[: len(lags)] / power.mean()
-                lag = wavelength * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
-                otf[c, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
-                otf[c, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
+        for line, weight in zip(camera.lines, weights, strict=True):
+            power = np.asarray(_row_spectra(*optic.rows(line, optic.source(line, depth))), np.float64)
+            correlation = np.fft.ifft(power)[: len(lags)] / power.mean()
+            lag = line.wavelength_m * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
+            otf[line.colour, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
+            otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
     pixel = np.sinc(camera.pixel_m * camera.fill * frequencies)
     return TransferBank(np.abs(otf * pixel), frequencies, tuple(depths_m))

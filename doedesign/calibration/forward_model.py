@@ -24,7 +24,7 @@ from fab.grid import Grid
 from fab.process import Process
 from sim.camera import Camera, Colour, source_path_m, wrapped_waves
 from sim.propagation.farfield import FarField, plan_far_field
-from sim.propagation.pupil import cis
+from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
 
 MOTIONS = ("shift_y", "shift_x", "defocus")  # pixels, pixels, 1/m
@@ -42,11 +42,21 @@ class VariedDoe(NamedTuple):
     coverage: Float[Array, "y x"]
 
 
-class _Rows(eqx.Module):
-    transmission: Complex[Array, "y x"]
-    coverage: Float[Array, "y x"]
-    source_waves: Float[Array, "y x"]
-    y: Float[Array, " y"]
+class _MovedColumns(NamedTuple):
+    """A source that is moved: the rows are its waves and the rows' places, in cells from the middle.
+
+    Attributes:
+        axis: columns' places.
+        motion: tilt along y and x, waves per cell, and curvature, waves per cell².
+    """
+
+    axis: Float[Array, " x"]
+    motion: Float[Array, "3"]
+
+    def waves(self, rows: tuple[Array, Array], height_m: None) -> Float[Array, "row x"]:
+        source_waves, y = rows[0], rows[1][:, None]
+        tilted = source_waves + self.motion[0] * y + self.motion[1] * self.axis
+        return tilted + self.motion[2] * (y * y + self.axis * self.axis)
 
 
 class _Optic(eqx.Module):
@@ -67,21 +77,10 @@ class _Optic(eqx.Module):
     factor: float = eqx.field(static=True)
 
 
-def _pupil(rows: _Rows, shared: tuple[Array, Array]) -> Complex[Array, "row x"]:
-    """The field behind the plate, tilted and bent."""
-    axis, motion = shared
-    y = rows.y[:, None]
-    waves = rows.source_waves + motion[0] * y + motion[1] * axis + motion[2] * (y * y + axis * axis)
-    return rows.coverage * rows.transmission * cis(waves)
-
-
-def _rows(optic: _Optic, plate: VariedDoe) -> _Rows:
-    return _Rows(plate.transmission, plate.coverage, optic.source_waves, optic.axis)
-
-
 @eqx.filter_jit
 def _energy(optic: _Optic, plate: VariedDoe, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
-    return optic.factor * optic.plan.energy(_pupil, _rows(optic, plate), (optic.axis, optic.rates * motion))
+    rows = DoeRows(plate.coverage, None, plate.transmission, (optic.source_waves, optic.axis))
+    return optic.factor * optic.plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion))
 
 
 def probe_camera(camera: Camera, wavelength_m: float, pixel_m: float, window: int, fill: float) -> Camera:

@@ -30,7 +30,7 @@ from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.image_files import Stored, read_image, write_image
 from doedesign.capture.images import Pictures, picture_files
 from doedesign.capture.scenes import SceneData
-from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, doe_psfs, flat_psfs, photograph
+from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, flat_psfs, photograph, psfs_by_depth
 from doedesign.design.design import Design
 from doedesign.report.sheet import ContactRow, plot_contact
 from doedesign.runs.folder import alone_in
@@ -143,7 +143,7 @@ def simulate_files(
 
     process, errors = (Process(design.levels), Variation()) if plate is None else plate[:2]
     make = partial(as_fabricated, design.level_map.level, model.camera, process, errors)
-    psfs = doe_psfs(make, model.camera), flat_psfs(model.camera)
+    psfs = psfs_by_depth(make, model.camera), flat_psfs(model.camera)
     names = _write_captures(folder, data, count, model, psfs, settings, png)
     if skips := pictures.skips():
         _log.info("%s", skips)

@@ -34,7 +34,8 @@ from sim.imaging.occlusion import Model
 from sim.imaging.scene import Scene
 from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
-from sim.psf_bank import psf_bank, surface_bank
+from sim.optic import HeightOptic
+from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def simulate(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 0)))
     sample = NamedScene(name, draw_scene(shown, stage.kind, stage.view, stage.far_m, rng))
     camera, ideal = stage.model.camera, (Process(design.levels), Variation())
-    made = doe_psfs(lambda: fabricated or as_fabricated(design.level_map.level, camera, *ideal), camera)
+    made = psfs_by_depth(lambda: fabricated or as_fabricated(design.level_map.level, camera, *ideal), camera)
     return photograph(sample, stage.model, made, flat_psfs(camera), jax.random.fold_in(jax.random.key(seed), 0))
 
 
@@ -242,13 +243,12 @@ def _middle(image: Any, margin_px: int) -> tuple[slice, slice]:
     return y, x
 
 
-def doe_psfs(make: Callable[[], FabricatedDoe], camera: Camera) -> Psfs:
-    """PSFs of a DOE by depth, exactly at the depth asked for, and kept; it is made at the first call."""
-    made = cache(make)
-    return lru_cache(maxsize=8)(lambda depth_m: surface_bank(camera, made(), (depth_m,)).energy[:, 0])
+def psfs_by_depth(make_optic: Callable[[], Any], camera: Camera) -> Psfs:
+    """PSFs of an optic by depth, exactly at the depth asked for, and kept; it is made at the first call."""
+    made = cache(make_optic)
+    return lru_cache(maxsize=8)(lambda depth_m: psf(made(), camera, depth_m).energy[:, 0])
 
 
 def flat_psfs(camera: Camera) -> Psfs:
     """PSFs of flat glass of the same kind, which stands for the conventional camera."""
-    flat = np.zeros(camera.grid.shape, np.float32)
-    return lru_cache(maxsize=8)(lambda depth_m: psf_bank(camera, flat, (depth_m,)).energy[:, 0])
+    return psfs_by_depth(lambda: HeightOptic.of(camera), camera)

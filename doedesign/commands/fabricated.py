@@ -20,7 +20,7 @@ from fab.process import Process, Variation
 from sim.leakage import SplitPsf, split_psf
 from sim.plots.leakage import plot_split
 from sim.plots.psfs import plot_psfs
-from sim.psf_bank import PsfBank, surface_bank
+from sim.psf_bank import PsfBank, psf
 from sim.store import write_bank
 from sim.surface import as_fabricated
 
@@ -105,13 +105,13 @@ def _write(folder: Path, design: Design, process: Process, plate: Variation, sou
     with meter("PSFs", total) as progress:
         for d, depth in enumerate(design.depths_m):
             for c, colour in enumerate(camera.colours):
-                splits[c, d] = split_psf(camera, surface, colour, depth)
+                splits[c, d] = split_psf(surface, depth, colour)
                 progress.advance(len(splits))
     excess = max(split.excess() for split in splits.values())
     if excess > _MOST_EXCESS:
         raise CheckFailed([f"leaked and diffracted light miss the plate's by {excess:.1e} of its brightest pixel"])
     meant = as_fabricated(design.level_map.level, camera, process, Variation())
-    nominal = surface_bank(camera, meant, design.depths_m)
+    nominal = psf(meant, depths=design.depths_m)
     bank = _bank(design, splits)
     say("writing bank and pictures")
     rows = {"nominal": plate_rows(design, meant, nominal), "fabricated": plate_rows(design, surface, bank)}

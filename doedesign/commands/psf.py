@@ -6,6 +6,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from doedesign.build import camera_from_spec
@@ -20,10 +21,12 @@ from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, s
 from fab.height import HeightMap
 from fab.plots.height import plot_height
 from sim.camera import Camera
+from sim.optic import HeightOptic, RingOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import radial_profile, ring_count
-from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
+from sim.psf_bank import PsfBank
+from sim.psf_bank import psf as psf_of
 from sim.store import write_bank
 from sim.transfer import transfer_bank
 
@@ -134,9 +137,10 @@ def _bank(
 ) -> PsfBank:
     profile = radial_profile(height_m, camera.grid) if _takes_hankel(run, name, field_rad) else None
     if profile is not None:
-        return radial_psf_bank(camera, profile[: ring_count(camera)], depths_m, on_psf=on_psf)
+        rings = RingOptic(camera, jnp.asarray(profile[: ring_count(camera)]))
+        return psf_of(rings, depths=depths_m, on_psf=on_psf)
     propagation = run.spec.optics.propagation
-    return psf_bank(camera, height_m, depths_m, field_rad=field_rad, propagation=propagation, on_psf=on_psf)
+    return psf_of(height_m, camera, depths_m, field_rad=field_rad, propagation=propagation, on_psf=on_psf)
 
 
 def _write(
@@ -148,15 +152,15 @@ def _write(
     near: tuple[float, ...],
     far: tuple[float, ...],
 ) -> None:
-    flat, depths, field = np.zeros(camera.grid.shape), (*near, *far), banks["quantised"].field_rad
-    lens = psf_bank(camera, flat, depths, field_rad=field)
-    lens_transfer = transfer_bank(camera, flat, depths)
+    flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
+    lens = psf_of(flat, depths=depths, field_rad=field)
+    lens_transfer = transfer_bank(flat, depths)
     metrics: dict[str, Any] = {}
     for name in ("continuous", "quantised"):
         bank, height = banks[name], designs[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
         save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
-        transfer = transfer_bank(camera, height, depths)
+        transfer = transfer_bank(HeightOptic.of(camera, height), depths)
         save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
         save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
         metrics[name] = design_metrics(camera, height, bank, near, lens)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, optimal_levels, recipe_depths_m
-from doedesign.design.parametrize import softness_at
+from doedesign.design.parametrize import Free, softness_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
@@ -32,12 +32,8 @@ from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from sim.aperture import circle_coverage
-from sim.propagation.hankel import radial_profile, revolve, ring_count
 
 Start = Callable[[Path], Float[np.ndarray, "y x"]]
-
-
-Free = Array | tuple[Array, Array]
 
 
 class OptimizationState(NamedTuple):
@@ -108,16 +104,14 @@ def initial_state(
             raise InputError(
                 str(path), f"a start must have the grid's shape {camera.grid.shape}", heights.shape, "Resample it."
             )
-        if problem.radial:
-            profile = radial_profile(heights, camera.grid)
-            if profile is None:
-                raise InputError(
-                    str(path),
-                    "the start of a radial design must be a raster of rings one cell wide",
-                    "a map with other structure",
-                    'Use parametrization = "freeform", or another start.',
-                )
-            heights = profile[: ring_count(camera)]
+        heights = problem.optic.heights_of(heights)
+        if heights is None:
+            raise InputError(
+                str(path),
+                "the start of a radial design must be a raster of rings one cell wide",
+                "a map with other structure",
+                'Use parametrization = "freeform", or another start.',
+            )
     radians = jnp.asarray(problem.parametrization.radians_of(heights))
     log_depth_ratio = jnp.zeros(spec.process.masks, jnp.float32) if learns_depths(spec) else None
     free = radians if log_depth_ratio is None else (radians, log_depth_ratio)
@@ -130,13 +124,7 @@ def learns_depths(spec: Spec) -> bool:
 
 
 def _loss(free: Free, problem: Problem, look: StepSources, softness: Array) -> tuple[Array, Array]:
-    parametrization = problem.parametrization
-    if isinstance(free, tuple):
-        radians, log_depth_ratio = free
-        height = parametrization.height_m(radians, softness, parametrization.depths_m(log_depth_ratio))
-    else:
-        height = parametrization.height_m(free, softness)
-    return losses(problem, view_of(problem, height, look))
+    return losses(problem, view_of(problem, problem.parametrization.height_of(free, softness), look))
 
 
 Constants = tuple[Problem, StepSources, Array]
@@ -195,9 +183,7 @@ def finished_design(
 ) -> Design:
     """Return the design of the parameters: every cell at its nearest level, and the heights before rounding."""
     parametrization, camera = problem.parametrization, problem.camera
-    continuous = np.asarray(parametrization.continuous_m(state.radians))
-    if problem.radial:
-        continuous = revolve(continuous, camera.grid)
+    continuous = problem.optic.raster(np.asarray(parametrization.continuous_m(state.radians)))
     levels = _chosen_levels(spec, problem, state, continuous) if spec.process.chooses_depths else parametrization.levels
     level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
     level_map = LevelMap(level, levels, camera.grid, spec.doe.aperture_m, spec.name)

@@ -24,6 +24,8 @@ from fab.levels import Levels
 from sim.material import full_wave_height_m
 
 Quantisation = Literal["straight_through", "annealed", "none"]
+# The parameters, and where the depths of the etches are learnt their logarithms (`LevelParametrization.depths_m`).
+Free = Array | tuple[Array, Array]
 
 # A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
 DEPTH_SCALE = 0.1
@@ -80,6 +82,13 @@ class LevelParametrization(eqx.Module):
         stepped = sum(jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths))
         blended = softness * height + (1.0 - softness) * stepped
         return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
+
+    def height_of(self, free: Free, softness: Float[Array, ""]) -> Float[Array, "*s"]:
+        """`height_m` of all that an optimisation moves."""
+        if isinstance(free, tuple):
+            radians, stretch = free
+            return self.height_m(radians, softness, self.depths_m(stretch))
+        return self.height_m(free, softness)
 
     def _nearest(self, height_m: Float[Array, "*s"], depths_m: Float[Array, " k"]) -> Int[Array, "*s"]:
         """Nearest level of a wrapped height if the etches have these depths (`fab.levels.wrapped_cells`)."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,30 +14,13 @@ from doedesign.design.objectives import PsfSet, Term, terms_from_spec
 from doedesign.design.parametrize import LevelParametrization
 from doedesign.spec import Spec
 from fab.levels import Levels
-from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
+from sim.camera import Camera
 from sim.metrics import participation
-from sim.propagation.farfield import FarField, displaced, plan_far_field
-from sim.propagation.fresnel import DirectPath, plan_direct
-from sim.propagation.hankel import Hankel, plan_hankel, ring_source_waves
-from sim.propagation.pupil import PhaseRows, phase_pupil
-from sim.psf_bank import psf_bank
-
-
-class WavelengthPlan(eqx.Module):
-    """One wavelength of one colour.
-
-    Attributes:
-        plan: propagation operators.
-        rate: waves per metre of height.
-        factor: weight in its colour times the substrate's transmission.
-        colour: index of the colour.
-    """
-
-    plan: FarField | DirectPath | Hankel
-    rate: Float[Array, ""]
-    factor: float = eqx.field(static=True)
-    colour: int = eqx.field(static=True)
+from sim.optic import HeightOptic, RingOptic, colour_energies
+from sim.propagation.farfield import displaced
+from sim.propagation.hankel import ring_count
+from sim.psf_bank import psf
+from sim.source import SourceMap
 
 
 class StepSources(NamedTuple):
@@ -60,23 +43,28 @@ class Problem(eqx.Module):
     """What stays the same from step to step.
 
     Attributes:
-        camera: optics and sensor.
         parametrization: parameters to heights.
         terms: weighted objectives.
-        lines: one entry per wavelength.
-        coverage: open share of every cell; None for a radial problem, whose rings end at the aperture.
+        plans: propagation of every line (wavelength) of the camera.
+        waves_per_metre: of DOE height, for every line.
+        optic: the DOE, its heights (of cells or rings) still those of the bare lens.
     """
 
-    camera: Camera = eqx.field(static=True)
     parametrization: LevelParametrization = eqx.field(static=True)
     terms: tuple[Term, ...] = eqx.field(static=True)
-    lines: tuple[WavelengthPlan, ...]
-    coverage: Float[Array, "y x"] | None
+    plans: tuple[Any, ...]
+    waves_per_metre: tuple[Float[Array, ""], ...]
+    optic: HeightOptic | RingOptic
+
+    @property
+    def camera(self) -> Camera:
+        """Optics and sensor."""
+        return self.optic.camera
 
     @property
     def radial(self) -> bool:
         """Whether the parameters are a profile over rings."""
-        return self.coverage is None
+        return len(self.optic.shape) == 1
 
 
 class SourceSet(NamedTuple):
@@ -131,11 +119,10 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSe
         InputError: objectives that cannot be read, or a direct path that eq. 6 forbids.
     """
     problem = plans_of(spec, files)
-    camera, radial = problem.camera, problem.radial
-    wavelengths = [wavelength for colour in camera.colours for wavelength in colour.wavelengths_m]
+    camera, optic = problem.camera, problem.optic
     near, far = (
-        tuple(_sources(camera, depths, wavelength, radial) for wavelength in wavelengths)
-        for depths in (spec.scene.near_m, spec.scene.far_m)
+        tuple(tuple(optic.source(line, depth).source_waves for depth in depths_m) for line in optic.lines)
+        for depths_m in (spec.scene.near_m, spec.scene.far_m)
     )
     lens = lens_participation(camera, spec.scene.near_m)
     return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
@@ -153,66 +140,39 @@ def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
     camera, process = camera_from_spec(spec), spec.process
     # Depths that are to be chosen begin at 2^k steps.
     levels = levels_from_spec(process, Levels(process.levels, process.level_step_m))
-    radial = spec.optimize.parametrization == "radial"
-    direct = spec.optics.propagation == "fresnel"
-    sparse = _is_sparse(spec)
     terms = terms_from_spec(spec, camera, files)
-    lines = []
-    for index, colour in enumerate(camera.colours):
-        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-            if radial:
-                plan = plan_hankel(camera, wavelength)
-            elif direct:
-                plan = plan_direct(camera, wavelength, "fresnel")
-            else:
-                plan = plan_far_field(camera, wavelength, sampling=1.0 if sparse else None)
-            rate = jnp.float32(camera.waves_per_metre(wavelength))
-            lines.append(WavelengthPlan(plan, rate, weight * camera.transmission(wavelength), index))
+    radial = spec.optimize.parametrization == "radial"
+    optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else HeightOptic.of(camera)
+    propagation = "far_field" if radial else spec.optics.propagation
+    sampling = 1.0 if _is_sparse(spec) else None
     return Problem(
-        camera=camera,
         parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=terms,
-        lines=tuple(lines),
-        coverage=None if radial else jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)),
+        plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),
+        waves_per_metre=tuple(jnp.float32(camera.waves_per_metre(line.wavelength_m)) for line in optic.lines),
+        optic=optic,
     )
 
 
-def _sources(camera: Camera, depths_m: tuple[float, ...], wavelength_m: float, radial: bool) -> tuple[Array, ...]:
-    if radial:
-        return tuple(jnp.asarray(ring_source_waves(camera, z, wavelength_m)) for z in depths_m)
-    return tuple(jnp.asarray(wrapped_waves(source_path_m(camera, z), wavelength_m)) for z in depths_m)
-
-
 def lens_participation(camera: Camera, near_m: tuple[float, ...]) -> Float[np.ndarray, "w n"]:
-    """Sum of squared pixel energies of the lens behind a flat plate, per colour and near depth."""
-    bank = psf_bank(camera, np.zeros(camera.grid.shape), near_m)
-    return np.asarray(participation(jnp.asarray(bank.energy)))
-
-
-def _line_energy(
-    problem: Problem, line: WavelengthPlan, height_m: Array, source: Array, offset_m: Array | None
-) -> Array:
-    plan = line.plan
-    if isinstance(plan, Hankel):
-        return line.factor * plan.energy(height_m, source, line.rate)
-    if offset_m is not None and isinstance(plan, FarField):
-        plan = displaced(plan, offset_m)
-    assert problem.coverage is not None  # only rings go without
-    return line.factor * plan.energy(phase_pupil, PhaseRows(height_m, source, problem.coverage), line.rate)
+    """Sum of squared pixel energies of the lens behind a flat DOE, per colour and near depth."""
+    if not near_m:
+        return np.zeros((len(camera.colours), 0), np.float32)
+    return np.asarray(participation(jnp.asarray(psf(HeightOptic.of(camera), depths=near_m).energy)))
 
 
 def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
-    """PSFs of a height map (or profile) for the sources of a look, as objectives see them."""
-    size = problem.camera.window
+    """PSFs of a height map (or profile) for the sources of a step, as objectives see them."""
+    optic, camera = problem.optic.with_heights(height_m), problem.camera
+    # Only far-field plans are displaced: see `_is_sparse`.
+    plans = problem.plans if look.offset_m is None else [displaced(plan, look.offset_m) for plan in problem.plans]
 
-    def bank(sources: tuple[tuple[Array, ...], ...]) -> Array:
-        colours: list[list[Array]] = [[] for _ in problem.camera.colours]
-        for line, waves in zip(problem.lines, sources, strict=True):
-            images = [_line_energy(problem, line, height_m, source, look.offset_m) for source in waves]
-            colours[line.colour].append(jnp.stack(images) if images else jnp.zeros((0, size, size)))
-        return jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in colours])
+    def bank(waves: tuple[tuple[Array, ...], ...]) -> Array:
+        sources = [map(SourceMap, one, problem.waves_per_metre) for one in zip(*waves, strict=True)]
+        images = [colour_energies(optic, plans, list(one)) for one in sources]
+        return jnp.stack(images, 1) if images else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
 
-    return PsfSet(bank(look.near), bank(look.far), look.lens, problem.camera)
+    return PsfSet(bank(look.near), bank(look.far), look.lens, camera)
 
 
 def losses(problem: Problem, view: PsfSet) -> tuple[Array, Array]:

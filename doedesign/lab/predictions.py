@@ -34,7 +34,7 @@ from sim.camera import Camera
 from sim.leakage import strehl, zeroth_order
 from sim.material import full_wave_wavelength_m, refractive_index
 from sim.plots.psfs import plot_psfs
-from sim.psf_bank import surface_bank
+from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 __all__ = ["SheetPrediction", "grating_orders", "matters_of", "predict_sheet", "seen_of"]
@@ -164,7 +164,7 @@ def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float)
     parts = plate.grid.shape[0] // nominal.grid.shape[0]
     field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
     coverage = jnp.asarray(circle_coverage(plate.grid, aperture_m))
-    return FabricatedDoe(field, field, coverage, plate.grid, nominal.wavelengths_m)
+    return FabricatedDoe(plate.camera, coverage, field, field, nominal.wavelengths_m)
 
 
 def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
@@ -175,7 +175,7 @@ def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, A
         return expected.rows, expected
     nominal = as_fabricated(design.level_map.level, design.camera, process, Variation())
     alike = _on_grid_of(expected.surface, nominal, design.camera.aperture_m)
-    return plate_rows(design, alike, surface_bank(design.camera, alike, design.depths_m)), expected
+    return plate_rows(design, alike, psf(alike, depths=design.depths_m)), expected
 
 
 def predict_sheet(

@@ -28,7 +28,6 @@ from doedesign.recon.tiles import OVERLAP, TILE, reconstruct_tiled
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, read_network
 from fab.errors import InputError
 from fab.files import sha256_file
-from sim.imaging.formation import psf_at
 from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import read_bank
@@ -295,7 +294,7 @@ def _at(bank: PsfBank, depth_m: float, name: str) -> Float[np.ndarray, "c y x"]:
     if not depth_m > 0:
         raise InputError(name, "must be a positive distance", f"{depth_m:g} m", "Give metres, or inf.")
     try:
-        return psf_at(bank, depth_m)
+        return bank.at(depth_m)
     except InputError as error:
         raise InputError(name, error.rule, error.got, error.cure) from error
 

@@ -26,8 +26,7 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import sensor_from_spec
 from doedesign.capture.scenes import Batch
-from doedesign.design.optimize import Free
-from doedesign.design.parametrize import softness_at
+from doedesign.design.parametrize import Free, softness_at
 from doedesign.design.problem import plans_of
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
@@ -37,10 +36,7 @@ from doedesign.training.hosts import on_all, own_copy, parts_of
 from doedesign.training.loss import TERMS, Weights, losses
 from doedesign.training.optics import (
     Capture,
-    LivePlate,
-    Plate,
-    RingPlate,
-    StoredPlate,
+    TrainingDoe,
     TrainingScene,
     shots,
 )
@@ -52,7 +48,8 @@ from sim.camera import Camera
 from sim.imaging.occlusion import Model
 from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
+from sim.source import SeparableSource
 from sim.surface import as_fabricated
 
 AXIS = "data"
@@ -106,7 +103,7 @@ class Trainer(eqx.Module):
     """What stays the same from step to step. `Trainer.of` makes one.
 
     Attributes:
-        plate: the plate that training looks through.
+        doe: the DOE that training looks through.
         bench: the rest of the camera.
         weights: of the loss.
         perceptual: perceptual distance, or None.
@@ -115,7 +112,7 @@ class Trainer(eqx.Module):
         mesh: devices, or None for one.
     """
 
-    plate: Plate
+    doe: TrainingDoe
     perceptual: Any
     bench: CaptureModel = eqx.field(static=True)
     weights: Weights = eqx.field(static=True)
@@ -164,12 +161,12 @@ class Trainer(eqx.Module):
         if train.camera == "conventional":
             height_m = np.zeros(camera.grid.shape, np.float32)
         alive = train.moves_optics or train.fabricated or train.field == "random"
-        plate = _live_plate(spec, files, source, camera) if alive else resting_plate(spec, camera, kind, height_m)
+        doe = _learnt_doe(spec, files, source) if alive else resting_doe(spec, camera, kind, height_m)
         bench = CaptureModel.make(camera, kind, model, sensor)
         weights = Weights(train.l1, train.perceptual, train.masked)
         process = process_from_spec(spec.process) if train.fabricated else None
-        plate = plate if mesh is None else on_all(plate, mesh)
-        return cls(plate, perceptual, bench, weights, process, spec, mesh)
+        doe = doe if mesh is None else on_all(doe, mesh)
+        return cls(doe, perceptual, bench, weights, process, spec, mesh)
 
     def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> JointState:
         """The state before the first step.
@@ -184,8 +181,8 @@ class Trainer(eqx.Module):
         adam = optax.scale_by_adam()
         moments = adam.init(eqx.filter(network, eqx.is_inexact_array))
         free, optics_moments = None, None
-        if not isinstance(self.plate, StoredPlate):
-            free = jnp.asarray(self.plate.parametrization.radians_of(height_m))
+        if self.doe.parametrization is not None:
+            free = jnp.asarray(self.doe.parametrization.radians_of(height_m))
             optics_moments = adam.init(free) if self.spec.train.moves_optics else None
         state = JointState(0, network, free, moments, optics_moments)
         # Where the step will leave it: otherwise the second step would be compiled anew.
@@ -245,34 +242,31 @@ class Trainer(eqx.Module):
             # In single precision, as the compiled step has them.
             scene = jax.tree.map(np.float32, self.bench.scene(batch.items[k].scene))
             depths = scene.background_depth_m, scene.obstructions[0].depth_m
-            items.append(TrainingScene(scene, *(self.plate.source(float(depth), angles) for depth in depths)))
+            items.append(TrainingScene(scene, *(self.doe.sources(float(depth), angles) for depth in depths)))
         seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
         root = jax.random.key(seed + (_SALT_NOISE << 32))
         return seen, jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.arange(first, first + count))
 
     def _with_errors(self, state: JointState, step: int) -> "Trainer":
         """The same with a plate that has this step's errors, where the process makes any."""
-        if self.process is None or not isinstance(self.plate, LivePlate):
+        if self.process is None or self.doe.parametrization is None:
             return self
-        plate, camera = self.plate, self.bench.camera
+        parametrization, camera = self.doe.parametrization, self.bench.camera
         assert isinstance(state.free, Array)  # learnt depths are refused with errors
-        level = np.asarray(plate.parametrization.level(plate.parametrization.continuous_m(state.free))).astype(np.uint8)
+        level = np.asarray(parametrization.level(parametrization.continuous_m(state.free))).astype(np.uint8)
         plate_m = max(camera.grid.extent_m)
         errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
-        surface = as_fabricated(level, camera, self.process, errors, plate.wavelengths_m)
-        height = jnp.asarray(height_of(level, plate.parametrization.levels).astype(np.float32))
-        rates = [camera.waves_per_metre(line) for line in plate.wavelengths_m]
-        ratio = [
-            _error_of(jnp.asarray(surface.at(line)), height, rate)
-            for line, rate in zip(plate.wavelengths_m, rates, strict=True)
-        ]
-        return eqx.tree_at(lambda t: t.plate.errors, self, jnp.stack(ratio), is_leaf=lambda leaf: leaf is None)
+        doe = as_fabricated(level, camera, self.process, errors)
+        height = jnp.asarray(height_of(level, parametrization.levels).astype(np.float32))
+        wavelengths = [line.wavelength_m for line in camera.lines]
+        ratio = [_deviation(doe.at(w), height, camera.waves_per_metre(w)) for w in wavelengths]
+        return eqx.tree_at(lambda t: t.doe.optic.deviation, self, jnp.stack(ratio), is_leaf=lambda leaf: leaf is None)
 
 
 @eqx.filter_jit
-def _error_of(transmission: Array, height_m: Array, rate: Array | float) -> Array:
-    """What a plate does to light beside its nominal heights."""
-    return transmission * jnp.exp(-2j * np.pi * height_m * rate)
+def _deviation(transmission: Array, height_m: Array, waves_per_metre: Array | float) -> Array:
+    """What a DOE as fabricated does to light beside its nominal heights."""
+    return transmission * jnp.exp(-2j * np.pi * height_m * waves_per_metre)
 
 
 def layout_of(spec: Spec, colours: int) -> NetworkShape:
@@ -319,28 +313,28 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
     return None if wanted == 1 else Mesh(np.array(devices[:wanted]), (AXIS,))
 
 
-def _live_plate(spec: Spec, files: Mapping[str, Path], source: str, camera: Camera) -> LivePlate | RingPlate:
-    """A plate that is learnt, or looked at off the axis, or with errors."""
+def _learnt_doe(spec: Spec, files: Mapping[str, Path], source: str) -> TrainingDoe:
+    """A DOE that is learnt, or looked at off the axis, or with errors."""
     problem = plans_of(spec.model_copy(update={"sensor": _odd_window(spec)}), files)
-    wavelengths = tuple(w for colour in camera.colours for w in colour.wavelengths_m)
     if not problem.radial:
-        assert problem.coverage is not None  # only rings go without
-        return LivePlate(problem.lines, problem.coverage, None, problem.parametrization, camera, wavelengths)
+        # One compiled step serves all depths and fields.
+        optic = replace(problem.optic, source_kind=SeparableSource)
+        return TrainingDoe(optic, problem.plans, problem.parametrization)
     if spec.train.field == "random" or spec.train.fabricated:
         key = "field" if spec.train.field == "random" else "fabricated"
         cure = 'Use parametrization = "freeform" with this design as its start.'
         raise InputError(f"{source}: train.{key}", "must be left out for a design of rings", "it", cure)
-    return RingPlate(problem.lines, problem.parametrization, camera, wavelengths)
+    return TrainingDoe(problem.optic, problem.plans, problem.parametrization)
 
 
 def _odd_window(spec: Spec) -> Any:
     return spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
 
 
-def resting_plate(spec: Spec, camera: Camera, kind: ObstructionKind, height_m: Float[np.ndarray, "y x"]) -> StoredPlate:
-    """A plate that stays as it is, by exact PSFs over all depths that scenes may have."""
-    bank = psf_bank(camera, height_m, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
-    return StoredPlate.of(bank)
+def resting_doe(spec: Spec, camera: Camera, kind: ObstructionKind, height_m: Float[np.ndarray, "y x"]) -> TrainingDoe:
+    """A DOE that stays as it is, by exact PSFs over all depths that scenes may have."""
+    bank = psf(height_m, camera, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
+    return TrainingDoe.at_rest(bank.as_optic())
 
 
 def resting_depths_m(spec: Spec, kind: ObstructionKind) -> tuple[float, ...]:
@@ -369,7 +363,7 @@ def _loss(
 ) -> tuple[Array, Array]:
     network, free = eqx.combine(moving, still)
     train = trainer.spec.train
-    found = shots(seen, trainer.plate, free, softness, trainer.bench, keys)
+    found = shots(seen, trainer.doe, free, softness, trainer.bench, keys)
     picture = network(
         found.capture,
         found.far,
@@ -446,5 +440,5 @@ def _update() -> Callable[[Constants, tuple[Learnt, tuple[Any, Any]]], Any]:
 
 @eqx.filter_jit
 def _look(network: Network, free: Any, trainer: Trainer, seen: TrainingScene, keys: Array) -> tuple[Capture, Array]:
-    found = shots(seen, trainer.plate, free, jnp.float32(0.0), trainer.bench, keys)
+    found = shots(seen, trainer.doe, free, jnp.float32(0.0), trainer.bench, keys)
     return found, network(found.capture, found.far, found.near)

@@ -20,8 +20,7 @@ from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write
 from doedesign.runs.folder import CONTINUOUS, Run
 from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.training.evaluation import EvaluationResult, judge
-from doedesign.training.joint import JointState, Trainer, resting_plate
-from doedesign.training.optics import RingPlate, StoredPlate
+from doedesign.training.joint import JointState, Trainer, resting_doe
 from doedesign.training.perceptual import Lpips
 from doedesign.training.validation import looks
 from fab.files import canonical_json, write_atomic
@@ -29,8 +28,7 @@ from fab.level_map import LevelMap
 from sim.camera import Camera
 from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
-from sim.propagation.hankel import radial_profile, revolve, ring_count
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 from sim.store import write_bank
 
 
@@ -72,10 +70,10 @@ def _at_rest(trainer: Trainer, state: JointState, kind: ObstructionKind) -> tupl
     Within a step PSFs are estimates: samples may be sparse, and a near source lights the cells obliquely, which plans
     for all depths leave out (`sim.propagation.farfield`): at 5 cm that is up to a fifth of the light in the window.
     """
-    if isinstance(trainer.plate, StoredPlate):
+    if trainer.doe.parametrization is None:
         return trainer, state
-    plate = resting_plate(trainer.spec, trainer.bench.camera, kind, _design_of(trainer, state).nominal_height_m)
-    return eqx.tree_at(lambda t: t.plate, trainer, plate), state._replace(free=None)
+    doe = resting_doe(trainer.spec, trainer.bench.camera, kind, _design_of(trainer, state).nominal_height_m)
+    return eqx.tree_at(lambda t: t.doe, trainer, doe), state._replace(free=None)
 
 
 def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
@@ -105,37 +103,33 @@ def height_at_rest_m(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
 
 def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
     """The heights that training begins with: those of the run before rounding; of rings, their profile."""
-    camera = trainer.bench.camera
     if run.spec.train.camera == "conventional":
-        flat = np.zeros(camera.grid.shape, np.float32)
-        return flat[0, : ring_count(camera)] if isinstance(trainer.plate, RingPlate) else flat
+        learns = trainer.doe.parametrization is not None
+        return np.zeros(trainer.doe.learnt.shape if learns else trainer.bench.camera.grid.shape, np.float32)
     heights = read_any_height(run.path(CONTINUOUS)).height_m
-    if not isinstance(trainer.plate, RingPlate):
+    if trainer.doe.parametrization is None:
         return heights
-    profile = radial_profile(heights, camera.grid)
-    assert profile is not None  # that is what `optimize` writes for a radial design
-    return profile[: ring_count(camera)]
+    found = trainer.doe.learnt.heights_of(heights)
+    assert found is not None  # `optimize` writes a raster of rings for a radial design
+    return found
 
 
 def design_after(run: Run, trainer: Trainer, state: JointState) -> Design:
     """The design of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
-    if not run.spec.train.moves_optics or isinstance(trainer.plate, StoredPlate):
+    if not run.spec.train.moves_optics or trainer.doe.parametrization is None:
         return replace(open_design(run, levels=run.spec.process.levels), continuous_m=None)
     return _design_of(trainer, state)
 
 
 def _design_of(trainer: Trainer, state: JointState) -> Design:
     """The design that parameters make."""
-    plate = trainer.plate
-    assert not isinstance(plate, StoredPlate)  # which has none
+    parametrization = trainer.doe.learning
     # A finished run has chosen its depths, so only the map is free.
     assert isinstance(state.free, jax.Array)
-    continuous = np.asarray(plate.parametrization.continuous_m(state.free))
-    if isinstance(plate, RingPlate):
-        continuous = revolve(continuous, trainer.bench.camera.grid)
-    level = np.asarray(plate.parametrization.level(jnp.asarray(continuous))).astype(np.uint8)
+    continuous = trainer.doe.learnt.raster(np.asarray(parametrization.continuous_m(state.free)))
+    level = np.asarray(parametrization.level(jnp.asarray(continuous))).astype(np.uint8)
     spec, camera = trainer.spec, trainer.bench.camera
-    level_map = LevelMap(level, plate.parametrization.levels, camera.grid, spec.doe.aperture_m, spec.name)
+    level_map = LevelMap(level, parametrization.levels, camera.grid, spec.doe.aperture_m, spec.name)
     return Design(level_map, camera, spec.scene.near_m, spec.scene.far_m, continuous_m=continuous, spec=spec)
 
 
@@ -171,7 +165,7 @@ def write_results(
         height = design.nominal_height_m
         names += write_design(folder, design)
     depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
-    bank = psf_bank(camera, height, depths, propagation=spec.optics.propagation)
+    bank = psf(height, camera, depths, propagation=spec.optics.propagation)
     write_bank(folder / BANK_NAME, bank, {"design": spec.name})
     found = validate(trainer, state, held_out, baselines=True)
     write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))

@@ -32,7 +32,7 @@ from sim.imaging.convolve import (
     tile_length,
     tiles,
 )
-from sim.imaging.formation import Optics, check_layers, psf_at, shadow_discs, shadow_px
+from sim.imaging.formation import Optics, check_layers, shadow_discs, shadow_px
 from sim.imaging.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light, with_spot
 from sim.imaging.scene import Scene
 from sim.psf_bank import PsfBank
@@ -58,7 +58,7 @@ class FieldOptics(NamedTuple):
         """From banks at field angles, one row of banks per angle along y, in increasing order.
 
         Args:
-            banks: `banks[j][i]` has the field angles (y_j, x_i); see `sim.psf_bank.psf_bank`.
+            banks: `banks[j][i]` has the field angles (y_j, x_i); see `sim.psf_bank.psf`.
             camera: the camera they were made for.
             depths_m: depth of every layer, background first, metres.
 
@@ -71,7 +71,7 @@ class FieldOptics(NamedTuple):
         grid = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
         if not np.array_equal(grid, angles) or (np.diff(y) <= 0).any() or (np.diff(x) <= 0).any():
             raise ValueError(f"`banks` must be an increasing grid of field angles, but got {angles.tolist()}")
-        psf = np.stack([[np.stack([psf_at(bank, depth) for depth in depths_m]) for bank in row] for row in banks])
+        psf = np.stack([[np.stack([bank.at(depth) for depth in depths_m]) for bank in row] for row in banks])
         middle = psf[np.abs(y).argmin(), np.abs(x).argmin()]
         distance, pixel = camera.sensor_distance_m, banks[0][0].pixel_m
         return cls(psf, distance * np.tan(y), distance * np.tan(x), Optics(middle, camera.aperture_m, distance, pixel))

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fab.errors import InputError
 from sim.camera import Camera
 from sim.imaging.convolve import Border, Otf, Window, convolve, plan_otf, superpose
 from sim.imaging.disc import disc_window, shadow_disc
@@ -59,7 +58,7 @@ class Optics(eqx.Module):
         Raises:
             InputError: a depth beyond the bank's.
         """
-        psf = np.stack([psf_at(bank, depth) for depth in depths_m])
+        psf = np.stack([bank.at(depth) for depth in depths_m])
         return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m, shadow_px)
 
     @property
@@ -109,27 +108,6 @@ class Prepared(eqx.Module):
 
     optics: Optics
     otf: Otf
-
-
-def psf_at(bank: PsfBank, depth_m: float) -> Float[np.ndarray, "c y x"]:
-    """PSFs of every colour at a depth, mixed linearly in 1/z from the two nearest of a bank.
-
-    Raises:
-        InputError: a depth beyond the bank's.
-    """
-    order = np.argsort([1 / depth for depth in bank.depths_m])
-    curvatures = np.array([1 / bank.depths_m[d] for d in order])
-    # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.
-    wanted, slack = 1 / depth_m, 1e-6 * curvatures[-1]
-    if not curvatures[0] - slack <= wanted <= curvatures[-1] + slack:
-        depths = sorted(bank.depths_m)
-        rule = f"must lie within the depths of the PSF bank, {depths[0]:g} to {depths[-1]:g} m"
-        raise InputError("depth", rule, f"{depth_m:g} m", "Compute the bank for this depth too.")
-    place = float(np.interp(wanted, curvatures, np.arange(len(order))))
-    low = min(int(place), len(order) - 1)
-    share = np.float32(place - low)
-    lower = bank.energy[:, order[low]]
-    return lower if share == 0 else (1 - share) * lower + share * bank.energy[:, order[low + 1]]
 
 
 def capture(

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from sim.aperture import circle_coverage
-from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.propagation.pupil import SurfaceRows, cis, surface_pupil
-from sim.psf_bank import pixel_energy, plan_propagation
+from sim.camera import Camera
+from sim.optic import HeightOptic
+from sim.propagation.pupil import cis
+from sim.psf_bank import psf
 
 Border = Literal["edge", "zero"]
 Point = tuple[float, float]
@@ -118,20 +118,14 @@ def shadowed_psf(
         `[colour, y, x]` energy per pixel per unit power that would reach the clear aperture without the obstruction,
         the chief ray in the middle of the window. The DOE is taken as it is on the axis.
     """
-    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    path = source_path_m(camera, background_depth_m)
     height = jnp.asarray(height_m, jnp.float32)
-    energy = np.zeros((len(camera.colours), camera.window, camera.window), np.float32)
-    for c, colour in enumerate(camera.colours):
-        for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
-            plan = plan_propagation(camera, wavelength, background_depth_m)
-            passed = shadow(camera, mask, depth_m, background_depth_m, wavelength, point, border)
-            plate = cis(height * jnp.float32(camera.waves_per_metre(wavelength)))
-            source = jnp.asarray(wrapped_waves(path, wavelength))
-            rows = SurfaceRows(jnp.asarray(passed, jnp.complex64) * plate, source, coverage)
-            factor = weight * camera.transmission(wavelength)
-            energy[c] += factor * np.asarray(pixel_energy(plan, surface_pupil, rows, None))
-    return energy
+    fields = []
+    for line in camera.lines:
+        passed = shadow(camera, mask, depth_m, background_depth_m, line.wavelength_m, point, border)
+        doe = cis(height * jnp.float32(camera.waves_per_metre(line.wavelength_m)))
+        fields.append(jnp.asarray(passed, jnp.complex64) * doe)
+    optic = HeightOptic(camera, HeightOptic.of(camera).coverage, None, jnp.stack(fields))
+    return np.asarray(psf(optic, depths=background_depth_m).energy[:, 0])
 
 
 def pupil_shadow(
@@ -169,6 +163,6 @@ def pupil_shadow(
     height, width = mask.shape
     wide = np.zeros((len(camera.colours), height + 2 * half, width + 2 * half))
     for (row, column), light in zip(points, radiance, strict=True):
-        psf = shadowed_psf(camera, height_m, mask, depth_m, background_depth_m, (row, column), border)
-        wide[:, row : row + camera.window, column : column + camera.window] += light[:, None, None] * psf
+        image = shadowed_psf(camera, height_m, mask, depth_m, background_depth_m, (row, column), border)
+        wide[:, row : row + camera.window, column : column + camera.window] += light[:, None, None] * image
     return wide[:, half : half + height, half : half + width].astype(np.float32)

@@ -80,7 +80,8 @@ class FarField(eqx.Module):
     kept: int = eqx.field(static=True)
     blocks: tuple[int, int] = eqx.field(static=True)
     spacing_m: float = eqx.field(static=True)
-    expected_error: float = eqx.field(static=True)
+    # No static field: it changes with depth, and every depth would be compiled anew.
+    expected_error: float
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy in every pixel of the window, per unit power incident on the clear aperture.
@@ -167,7 +168,7 @@ def plan_far_field(
         kept=kept,
         blocks=(block_size(nx), block_size(kept)),
         spacing_m=spacing,
-        expected_error=float(np.hypot(np.sqrt(2) * weights.expected_error, 2 * np.sqrt(2) * missed)),
+        expected_error=np.hypot(np.sqrt(2) * weights.expected_error, 2 * np.sqrt(2) * missed),
     )
 
 

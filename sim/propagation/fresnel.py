@@ -41,7 +41,7 @@ class DirectPath(eqx.Module):
     lens: Complex[Array, "y x"]
     kernel: Complex[Array, "ky kx"]
     first: int = eqx.field(static=True)
-    expected_error: float = eqx.field(static=True)
+    expected_error: float
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
@@ -111,7 +111,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
         lens=cis(jnp.asarray(lens)),
         kernel=_kernel(padded, pitch, wavelength_m, distance, kernel),
         first=first,
-        expected_error=float(np.sqrt(2) * weights.expected_error),
+        expected_error=np.sqrt(2) * weights.expected_error,
     )
 
 

@@ -11,7 +11,10 @@ band-limited interpolation of the complex field to eight times finer radii; inte
 hold each pixel's area as a function of radius. Only one octant of the window is distinct.
 """
 
+from functools import lru_cache
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -117,8 +120,9 @@ def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray,
     return first, areas.reshape(len(keys), width) * area, distinct.reshape(n, n)
 
 
+@lru_cache(maxsize=8)
 def plan_hankel(camera: Camera, wavelength_m: float) -> Hankel:
-    """Prepare the Hankel transform of one wavelength; matrices are built in float64."""
+    """Prepare the Hankel transform of one wavelength; matrices are built in float64. Kept, for all depths."""
     scale = wavelength_m * camera.sensor_distance_m
     coarse_m = scale / camera.aperture_m / _OVERSAMPLING
     edges = _subring_edges_m(camera)
@@ -130,14 +134,15 @@ def plan_hankel(camera: Camera, wavelength_m: float) -> Hankel:
     primitive = edges[:, None] * j1(edges[:, None] * rate[None, :]) / rate[None, :]
     area = np.pi * camera.aperture_m**2 / 4
     matrix = np.diff(primitive, axis=0) * (2 * np.pi / scale / np.sqrt(area))
-    return Hankel(
-        rings_to_field=jnp.asarray(matrix, jnp.float32),
-        refine=Banded.from_dense(_interpolation(coarse, _HALF_TAPS), 512),
-        first=jnp.asarray(first, jnp.int32),
-        areas=jnp.asarray(areas, jnp.float32),
-        distinct=jnp.asarray(distinct, jnp.int32),
-        subrings=_SUBRINGS,
-    )
+    with jax.ensure_compile_time_eval():  # also where something is traced
+        return Hankel(
+            rings_to_field=jnp.asarray(matrix, jnp.float32),
+            refine=Banded.from_dense(_interpolation(coarse, _HALF_TAPS), 512),
+            first=jnp.asarray(first, jnp.int32),
+            areas=jnp.asarray(areas, jnp.float32),
+            distinct=jnp.asarray(distinct, jnp.int32),
+            subrings=_SUBRINGS,
+        )
 
 
 def revolve(profile_m: Float[np.ndarray, " ring"], grid: Grid) -> Float[np.ndarray, "y x"]:

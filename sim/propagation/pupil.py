@@ -1,9 +1,8 @@
 """The field behind the DOE, written for a block of rows so that it never has to exist as a whole."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,42 +34,35 @@ def _cis_tangent(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
     return wave, jax.lax.complex(-wave.imag * rate, wave.real * rate)
 
 
-class PhaseRows(eqx.Module):
-    """Row-wise description of a phase-only pupil: height of the DOE, source wave, clear aperture.
+class DoeRows(NamedTuple):
+    """Rows of a DOE and of the wave that lights it; every array's first axis is the grid's y.
 
     Attributes:
-        height_m: `[y, x]` DOE height, metres.
-        source_waves: `[y, x]` wrapped optical path of the source, waves.
-        coverage: `[y, x]` open share of each cell.
+        coverage: `[y, x]` open share of every cell.
+        height_m: `[y, x]` DOE height, metres; None for a DOE without relief.
+        transmission: `[y, x]` complex transmission besides that of the height; None for 1.
+        source: what the source says of these rows (`sim.source`).
     """
 
-    height_m: Float[Array, "y x"]
-    source_waves: Float[Array, "y x"]
     coverage: Float[Array, "y x"]
+    height_m: Float[Array, "y x"] | None
+    transmission: Complex[Array, "y x"] | None
+    source: Any
 
 
-def phase_pupil(rows: PhaseRows, waves_per_metre: Float[Array, ""]) -> Complex[Array, "y x"]:
-    """Field coverage * exp(2 pi i (height * waves_per_metre + source)): eqs. 1, 2 and 4 without the lens."""
-    return rows.coverage * cis(rows.height_m * waves_per_metre + rows.source_waves)
+@runtime_checkable
+class SourceColumns(Protocol):
+    """What a source says of all rows alike."""
+
+    def waves(self, rows: Any, height_m: Float[Array, "y x"] | None) -> Float[Array, "y x"]:
+        """Optical path through a DOE height (None: no relief) from the source, waves."""
+        ...
 
 
-class SurfaceRows(eqx.Module):
-    """Row-wise description of a plate whose transmission is known (`sim.surface`).
-
-    Attributes:
-        transmission: `[y, x]` complex transmission of every cell.
-        source_waves: `[y, x]` wrapped optical path of the source, waves.
-        coverage: `[y, x]` open share of each cell.
-    """
-
-    transmission: Complex[Array, "y x"]
-    source_waves: Float[Array, "y x"]
-    coverage: Float[Array, "y x"]
-
-
-def surface_pupil(rows: SurfaceRows, shared: None) -> Complex[Array, "y x"]:
-    """Field coverage * transmission * exp(2 pi i source) behind a plate."""
-    return rows.coverage * rows.transmission * cis(rows.source_waves)
+def doe_field(rows: DoeRows, columns: SourceColumns) -> Complex[Array, "y x"]:
+    """Field coverage * transmission * exp(2 pi i waves) behind the DOE: eqs. 1, 2 and 4 without the lens."""
+    wave = cis(columns.waves(rows.source, rows.height_m))
+    return (rows.coverage if rows.transmission is None else rows.coverage * rows.transmission) * wave
 
 
 # One block of rows (64-256 of a few thousand samples) fits a processor's second-level cache.

@@ -1,5 +1,7 @@
 """From a level map and the errors of a process to a plate: `as_fabricated`."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,37 +15,50 @@ from fab.levels import height_of
 from fab.masks import planes
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
-from sim.camera import Camera
+from sim.camera import Camera, SpectralLine
+from sim.optic import CellOptic
 from sim.propagation.pupil import cis
+from sim.source import SourceMap
 from sim.surface.relief import plan_of, relief_of, require_possible
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 
 
-class FabricatedDoe(eqx.Module):
-    """A plate with its chrome.
+class FabricatedDoe(CellOptic):
+    """A DOE as fabricated, with its chrome.
 
     Attributes:
-        transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
-            that of the plate within `sim.surface.cell`'s accuracy, and its mean is the plate's.
-        means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other plates.
+        camera: lens, sensor and substrate. Its grid is that of the cells here: those of the DOE, or a whole number of
+            parts of them where the sensor sees waves too oblique for moments.
         coverage: `[y, x]` open share of every cell.
-        grid: the cells: those of the DOE, or a whole number of parts of them where the sensor sees waves too
-            oblique for moments.
+        transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
+            that of the DOE within `sim.surface.cell`'s accuracy, and its mean is the DOE's.
+        means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other DOEs.
         wavelengths_m: vacuum wavelengths.
-        height_m: `[y, x]` height of every cell where that says all about the plate: exactly as drawn.
+        height_m: `[y, x]` height of every cell where that says all about the DOE: exactly as drawn. Its PSFs are then
+            those of the height map, to the last bit.
     """
 
+    camera: Camera = eqx.field(static=True)
+    coverage: Float[Array, "y x"]
     transmission: Complex[Array, "w y x"]
     means: Complex[Array, "w y x"]
-    coverage: Float[Array, "y x"]
-    grid: Grid = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
     height_m: Float[Array, "y x"] | None = None
+    source_kind: type[SourceMap] = eqx.field(static=True, default=SourceMap)
+
+    @property
+    def grid(self) -> Grid:
+        """The cells."""
+        return self.camera.grid
 
     def at(self, wavelength_m: float) -> Complex[Array, "y x"]:
         """Transmission at one of the wavelengths."""
         return self.transmission[self.wavelengths_m.index(wavelength_m)]
+
+    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
+        """Heights as drawn, or transmission."""
+        return (None, self.at(line.wavelength_m)) if self.height_m is None else (self.height_m, None)
 
 
 def as_fabricated(
@@ -77,7 +92,7 @@ def as_fabricated(
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return FabricatedDoe(flat, flat, coverage, camera.grid, lines, height)
+        return FabricatedDoe(camera, coverage, flat, flat, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan = plan_of(camera, process, variation, min(lines), traced)
@@ -94,7 +109,8 @@ def as_fabricated(
     if loss is not None:
         transmission, means = transmission * loss[:, None, None], means * loss[:, None, None]
     grid = _refined(camera.grid, plan.parts)
-    return FabricatedDoe(transmission, means, _coverage(grid, camera, variation, traced), grid, lines)
+    coverage = _coverage(grid, camera, variation, traced)
+    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, means, lines)
 
 
 def _flat(height_m: Array, rate: Array) -> Array:

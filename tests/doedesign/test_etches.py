@@ -229,7 +229,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
     state = run(spec)
     assert state.log_depth_ratio is None
     design = finished_design(spec, problem, state)
-    area = np.asarray(problem.coverage)
+    area = np.asarray(problem.optic.coverage)
     assert design.continuous_m is not None
     seen = height_histogram(design.continuous_m, area, design.levels.period_m, problem.camera)
     assert light_cost(seen, design.levels) < light_cost(seen, Levels(4, 300e-9))

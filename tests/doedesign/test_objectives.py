@@ -25,7 +25,7 @@ from fab.grid import Grid
 from fab.pictures import write_pixels
 from sim.camera import Camera, Colour
 from sim.metrics import participation
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CAMERA = Camera(Grid((64, 64), 10e-6), 0.64e-3, "fused_silica", (Colour("green", (550e-9,), (1.0,)),), 5e-3, 4e-6, 64)
@@ -51,7 +51,7 @@ def test_far_spot_is_the_light_that_misses() -> None:
 
 
 def test_near_spread_is_one_for_the_plain_lens() -> None:
-    bank = psf_bank(CAMERA, np.zeros((64, 64)), [0.05])
+    bank = psf(np.zeros((64, 64)), CAMERA, [0.05])
     lens = float(participation(jnp.asarray(bank.energy[0, 0])))
     assert float(near_spread(view(bank.energy[0, 0], point(), lens))) == pytest.approx(1.0, rel=1e-6)
     assert float(near_spread(view(even(), point(), lens))) == pytest.approx(1 / 64**2 / lens, rel=1e-5)
@@ -59,7 +59,7 @@ def test_near_spread_is_one_for_the_plain_lens() -> None:
 
 def test_coherent_light_obeys_its_bound() -> None:
     # A fraction s of the field passes undiffracted; the near PSF keeps s times the lens's disc, hence s² of its square.
-    bank = psf_bank(CAMERA, np.zeros((64, 64)), [0.05]).energy[0, 0]
+    bank = psf(np.zeros((64, 64)), CAMERA, [0.05]).energy[0, 0]
     lens = float(participation(jnp.asarray(bank)))
     s = 0.4
     assert float(near_spread(view(s * bank, point(), lens))) == pytest.approx(s**2, rel=1e-5)

@@ -14,7 +14,7 @@ from fab.levels import Levels, height_of
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.metrics import energy_budget, energy_within, mean_wavelength_m, ring_to_disc, spot_radius_m, zeroth_order
-from sim.psf_bank import psf_bank, surface_bank
+from sim.psf_bank import psf
 from sim.surface import as_fabricated
 
 PITCH_M = 1.85e-6
@@ -52,7 +52,7 @@ def test_there_is_a_row_for_every_depth_and_colour_near_depths_first(nominal: Pr
 
 
 def test_the_bank_of_a_plate_without_errors_is_that_of_its_height_map(design: Design, nominal: Prediction):
-    bank = psf_bank(CAMERA, height_of(design.level_map.level, LEVELS), design.depths_m)
+    bank = psf(height_of(design.level_map.level, LEVELS), CAMERA, design.depths_m)
     np.testing.assert_allclose(nominal.bank.energy, bank.energy, rtol=0, atol=1e-6 * bank.energy.max())
     assert (nominal.bank.depths_m, nominal.bank.colours) == (bank.depths_m, bank.colours)
     surface = as_fabricated(design.level_map.level, CAMERA, PROCESS, Variation())
@@ -116,7 +116,7 @@ def test_chrome_out_of_place_is_booked_as_such(design: Design, nominal: Predicti
 def test_strehl_does_not_fall_with_a_plate_that_only_leaks_less_light_through_its_chrome(design: Design):
     """The overlap is one over the open cells, so a displaced opening before a perfect plate leaves it at 1."""
     moved = as_fabricated(design.level_map.level, CAMERA, PROCESS, Variation(chrome_x_m=2e-6))
-    bank = surface_bank(CAMERA, moved, (np.inf,))
+    bank = psf(moved, depths=(np.inf,))
     rows = plate_rows(design, moved, bank)
     assert [row["strehl"] for row in rows] == pytest.approx([1.0, 1.0], abs=2e-5)
 

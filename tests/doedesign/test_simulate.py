@@ -26,7 +26,7 @@ from fab.process import Process
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Obstruction, Scene
 from sim.obstruction import Dirt
-from sim.psf_bank import surface_bank
+from sim.psf_bank import psf
 from sim.sensor import Sensor
 from tests.doedesign.small_runs import finished_run
 from tests.doedesign.test_simulate_command import SPEC
@@ -100,7 +100,7 @@ def test_what_a_capture_knows_of_itself(design: Design, picture: Path):
     assert shot.depth_far_m == 0.6
     # Its PSFs are those of the design at the depths of the scene, in an odd window.
     camera = replace(design.camera, window=33)
-    wanted = surface_bank(camera, design.fabricated(Process(design.levels)), (0.6,)).energy[:, 0]
+    wanted = psf(design.fabricated(Process(design.levels)), camera, (0.6,)).energy[:, 0]
     np.testing.assert_array_equal(shot.psf_far, wanted)
     other = simulate(picture, design, **ASKED, fabricated=design.fabricated(seed=3))
     assert not np.array_equal(other.doe, shot.doe)

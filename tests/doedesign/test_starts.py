@@ -11,7 +11,7 @@ from sim.camera import Camera, Colour
 from sim.material import full_wave_height_m
 from sim.metrics import energy_within, radius_map_m, spot_radius_m, zeroth_order
 from sim.propagation.hankel import ring_count
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 GREEN = 550e-9
 CAMERA = Camera(Grid((400, 400), 2e-6), 0.8e-3, "fused_silica", (Colour("green", (GREEN,), (1.0,)),), 4e-3, 4e-6, 201)
@@ -28,9 +28,9 @@ def test_ring_keeps_the_asked_share_in_the_0th_order(far_energy: float) -> None:
 def test_ring_has_the_radius_of_its_grating_order() -> None:
     period = 16e-6
     height = grating(SETUP, 0.0, period)
-    psf = psf_bank(CAMERA, height, [np.inf]).energy[0, 0]
-    radius = radius_map_m(psf.shape, CAMERA.pixel_m)
-    profile = [psf[(radius >= r) & (radius < r + 4e-6)].sum() for r in np.arange(0, 240e-6, 4e-6)]
+    image = psf(height, CAMERA, [np.inf]).energy[0, 0]
+    radius = radius_map_m(image.shape, CAMERA.pixel_m)
+    profile = [image[(radius >= r) & (radius < r + 4e-6)].sum() for r in np.arange(0, 240e-6, 4e-6)]
     # lambda f / period = 137.5 um; bins of one pixel.
     assert np.arange(0, 240e-6, 4e-6)[int(np.argmax(profile))] == pytest.approx(GREEN * 4e-3 / period, abs=6e-6)
 
@@ -46,8 +46,8 @@ def test_lens_moves_the_focus() -> None:
     height = lens(SETUP, 1 / depth)
     passed = CAMERA.transmission(GREEN)
     spot = spot_radius_m(CAMERA, GREEN)
-    sharp = energy_within(psf_bank(CAMERA, height, [depth]).energy[0, 0], CAMERA.pixel_m, spot)
-    ideal = energy_within(psf_bank(CAMERA, flat(SETUP, {}), [np.inf]).energy[0, 0], CAMERA.pixel_m, spot)
+    sharp = energy_within(psf(height, CAMERA, [depth]).energy[0, 0], CAMERA.pixel_m, spot)
+    ideal = energy_within(psf(flat(SETUP, {}), CAMERA, [np.inf]).energy[0, 0], CAMERA.pixel_m, spot)
     # The plate is continuous, so only the curvature beyond the paraxial sphere and the cells' sinc² cost light.
     assert sharp / passed > 0.97 * ideal / passed
 
@@ -65,8 +65,8 @@ def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
     depth = 0.2
 
     def loss(height: np.ndarray) -> float:
-        psf = psf_bank(CAMERA, height, [depth], sampling=1.0).energy[0, 0]
-        return -energy_within(psf, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
+        image = psf(height, CAMERA, [depth], sampling=1.0).energy[0, 0]
+        return -energy_within(image, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
 
     found = start_heights("fresnel", {"evaluations": 45}, SETUP._replace(loss=loss))
     ideal = lens(SETUP, 1 / depth)

@@ -7,11 +7,11 @@ from scipy.special import j0, j1
 from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.camera import Camera
 from sim.metrics import encircled_energy
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 
 def flat_psf(camera: Camera) -> np.ndarray:
-    bank = psf_bank(camera, np.zeros(camera.grid.shape), [np.inf])
+    bank = psf(np.zeros(camera.grid.shape), camera, [np.inf])
     return bank.energy[0, 0] / camera.transmission(YELLOW_M)
 
 

@@ -5,12 +5,12 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera
 from sim.metrics import encircled_energy
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 
-def half_energy_radius(psf: np.ndarray, pixel_m: float, total: float) -> float:
-    radii = np.linspace(0.1, 0.5, 33) * psf.shape[0] * pixel_m
-    return float(np.interp(0.5 * total, encircled_energy(psf, pixel_m, radii), radii))
+def half_energy_radius(image: np.ndarray, pixel_m: float, total: float) -> float:
+    radii = np.linspace(0.1, 0.5, 33) * image.shape[0] * pixel_m
+    return float(np.interp(0.5 * total, encircled_energy(image, pixel_m, radii), radii))
 
 
 @pytest.mark.parametrize(
@@ -19,12 +19,12 @@ def half_energy_radius(psf: np.ndarray, pixel_m: float, total: float) -> float:
 def test_the_disc_is_as_wide_as_geometry_says(depth_m: float, defocus_m: float):
     """Uniformly lit, so half the light lies within 1/sqrt(2) of the radius."""
     camera = make_camera(768, 3e-3, 8e-3, 3e-6, 100, defocus_m=defocus_m)
-    psf = psf_bank(camera, np.zeros((768, 768)), [depth_m]).energy[0, 0]
+    image = psf(np.zeros((768, 768)), camera, [depth_m]).energy[0, 0]
     passed = camera.transmission(YELLOW_M)
     radius = camera.defocus_radius_m(depth_m)
-    assert half_energy_radius(psf, camera.pixel_m, passed) == pytest.approx(radius / np.sqrt(2), rel=0.02)
+    assert half_energy_radius(image, camera.pixel_m, passed) == pytest.approx(radius / np.sqrt(2), rel=0.02)
     # The edge of the shadow is blurred over sqrt(lambda d²/ z) or so, which a Fresnel number above ten keeps thin.
-    inner, outer = encircled_energy(psf, camera.pixel_m, np.array([0.5, 1.15]) * radius)
+    inner, outer = encircled_energy(image, camera.pixel_m, np.array([0.5, 1.15]) * radius)
     assert inner == pytest.approx(0.25 * passed, rel=0.06)
     assert outer > 0.97 * passed
 
@@ -39,7 +39,7 @@ def test_refocusing_makes_the_near_source_sharp():
     depth = 0.5
     sensor = 8e-3 * depth / (depth - 8e-3)
     camera = make_camera(512, 2e-3, 8e-3, 3e-6, 31, defocus_m=sensor - 8e-3)
-    sharp = psf_bank(camera, np.zeros((512, 512)), [depth]).energy[0, 0]
-    star = psf_bank(make_camera(512, 2e-3, sensor, 3e-6, 31), np.zeros((512, 512)), [np.inf]).energy[0, 0]
+    sharp = psf(np.zeros((512, 512)), camera, [depth]).energy[0, 0]
+    star = psf(np.zeros((512, 512)), make_camera(512, 2e-3, sensor, 3e-6, 31), [np.inf]).energy[0, 0]
     # The sphere and the parabola differ by D^4 / (128 z^3) = 1 nm here.
     np.testing.assert_allclose(sharp, star, atol=2e-4 * star.max())

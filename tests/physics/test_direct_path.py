@@ -11,8 +11,9 @@ from bench.reference import YELLOW_M, make_camera, relative_error
 from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.propagation.fresnel import Kernel, plan_direct
-from sim.propagation.pupil import PhaseRows, phase_pupil
-from sim.psf_bank import psf_bank
+from sim.propagation.pupil import DoeRows, doe_field
+from sim.psf_bank import psf
+from sim.source import MapColumns
 
 NO_LENS_M = 1e5  # focal length whose curvature over half a millimetre is 1e-6 of a wave
 
@@ -24,9 +25,9 @@ def without_lens(cells: int, aperture_m: float, distance_m: float, pixel_m: floa
 def shadow(camera: Camera, coverage: np.ndarray, kernel: Kernel) -> np.ndarray:
     """Energy per pixel behind an opening, per unit power on the whole aperture."""
     source = wrapped_waves(source_path_m(camera, np.inf), YELLOW_M)
-    rows = PhaseRows(jnp.zeros(camera.grid.shape), jnp.asarray(source), jnp.asarray(coverage, jnp.float32))
+    rows = DoeRows(jnp.asarray(coverage, jnp.float32), None, None, jnp.asarray(source))
     plan = plan_direct(camera, YELLOW_M, kernel)
-    return np.asarray(jax.jit(lambda r: plan.energy(phase_pupil, r, jnp.float32(0.0)))(rows))
+    return np.asarray(jax.jit(lambda r: plan.energy(doe_field, r, MapColumns(jnp.float32(0.0))))(rows))
 
 
 def slit_intensity(x_m: np.ndarray, width_m: float, distance_m: float) -> np.ndarray:
@@ -76,10 +77,10 @@ def smooth_plate(cells: int) -> np.ndarray:
 def test_far_field_agrees_with_the_direct_path(depth_m: float, defocus_m: float):
     camera = make_camera(800, 0.4e-3, 8e-3, 3.7e-6, 64, defocus_m=defocus_m)
     height = smooth_plate(800)
-    far = psf_bank(camera, height, [depth_m]).energy[0, 0].astype(np.float64)
-    paraxial = psf_bank(camera, height, [depth_m], propagation="fresnel").energy[0, 0]
+    far = psf(height, camera, [depth_m]).energy[0, 0].astype(np.float64)
+    paraxial = psf(height, camera, [depth_m], propagation="fresnel").energy[0, 0]
     # Same paraxial physics, other route; half-micrometre cells hardly differ from points.
     assert relative_error(paraxial, far) < 1e-3
-    exact = psf_bank(camera, height, [depth_m], propagation="angular_spectrum").energy[0, 0]
+    exact = psf(height, camera, [depth_m], propagation="angular_spectrum").energy[0, 0]
     # At f/20 the paraxial phase is off by D^4 / (128 f^3) = 0.4 nm in the pupil, and by more for diffracted light.
     assert relative_error(exact, far) < 1e-2

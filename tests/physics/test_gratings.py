@@ -6,7 +6,7 @@ import pytest
 from bench.reference import YELLOW_M, make_camera
 from sim.camera import Camera
 from sim.metrics import zeroth_order
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 CELLS = 512
 PITCH = 1.85e-6
@@ -26,7 +26,7 @@ def efficiency(camera: Camera, height: np.ndarray, order: int) -> float:
 
     def box(plate: np.ndarray, column: int) -> float:
         left = column - PER_ORDER // 2
-        return float(psf_bank(camera, plate, [np.inf]).energy[0, 0][rows, left : left + PER_ORDER].sum())
+        return float(psf(plate, camera, [np.inf]).energy[0, 0][rows, left : left + PER_ORDER].sum())
 
     return box(height, middle + order * PER_ORDER) / box(np.zeros_like(height), middle)
 

@@ -12,7 +12,7 @@ from bench.psf import Task, adjoint_error, prysm, prysm_wavefronts
 from bench.reference import YELLOW_M, make_camera, relative_error, wrapped_map
 from sim.aperture import circle_coverage
 from sim.camera import Camera
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 CAMERA = make_camera(256, 0.512e-3, 2e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(256, smooth_cells=4.0)
@@ -28,7 +28,7 @@ def peer(name: str) -> ModuleType:
 
 
 def ours() -> np.ndarray:
-    return psf_bank(CAMERA, HEIGHT, [np.inf]).energy[0, 0] / CAMERA.transmission(YELLOW_M)
+    return psf(HEIGHT, CAMERA, [np.inf]).energy[0, 0] / CAMERA.transmission(YELLOW_M)
 
 
 def binned(intensity: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from fab.masks import planes
 from fab.process import Process, Variation, variation_of
 from sim.camera import Camera, Colour
 from sim.leakage import mean_transmission, strehl, zeroth_order
-from sim.psf_bank import PsfBank, surface_bank
+from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 1.85e-6
@@ -85,7 +85,7 @@ def test_orders_of_a_blazed_grating_on_the_sensor():
     optics = dataclasses.replace(camera(cells, 5 * per_order, spacing / per_order), focal_length_m=8e-3)
 
     def bank(level: np.ndarray, depth: float) -> PsfBank:
-        return surface_bank(optics, made(level, STAIRS, Variation(common_depth_scale=depth - 1), optics), [np.inf])
+        return psf(made(level, STAIRS, Variation(common_depth_scale=depth - 1), optics), depths=[np.inf])
 
     def box(found: PsfBank, order: int) -> float:
         rows = np.arange(per_order) + 2 * per_order
@@ -260,7 +260,7 @@ def test_chrome_out_of_place_moves_and_changes_the_light_that_passes():
     flat = np.full((128, 128), 15, np.uint8)
     wide = 0.01 * optics.aperture_m
     drawn, grown, moved = (
-        surface_bank(optics, made(flat, STAIRS, error, optics), [depth_m]).energy[0, 0].astype(float)
+        psf(made(flat, STAIRS, error, optics), depths=[depth_m]).energy[0, 0].astype(float)
         for error in (
             Variation(common_depth_scale=1e-6),
             Variation(chrome_diameter_m=wide),

@@ -13,9 +13,8 @@ from bench.reference import YELLOW_M
 from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Process, Variation, error_names, variation_of
-from sim.camera import Camera, Colour, source_path_m, wrapped_waves
-from sim.propagation.pupil import SurfaceRows, surface_pupil
-from sim.psf_bank import plan_propagation
+from sim.camera import Camera, Colour
+from sim.optic import HeightOptic
 from sim.surface import as_fabricated
 
 pytestmark = pytest.mark.slow
@@ -156,8 +155,9 @@ def test_every_error_is_tried():
 
 def test_a_psf_has_the_derivative_of_its_plate():
     """What remains of the chain: from the plate's transmission and chrome to the energy on the pixels."""
-    plan = plan_propagation(CAMERA, YELLOW_M, 5e-3)
-    source = jnp.asarray(wrapped_waves(source_path_m(CAMERA, 5e-3), YELLOW_M))
+    (line,) = CAMERA.lines
+    lens = HeightOptic.of(CAMERA)
+    plan, source = lens.plan(line, 5e-3), lens.source(line, 5e-3)
     rng = np.random.default_rng(2)
     weights = jnp.asarray(rng.normal(size=(64, 64)), jnp.float32)
     values, shift = rng.normal(size=(2, 2, CELLS, CELLS))
@@ -167,8 +167,8 @@ def test_a_psf_has_the_derivative_of_its_plate():
     @jax.jit
     @jax.value_and_grad
     def energy(step: jax.Array) -> jax.Array:
-        rows = SurfaceRows(at + step[0] * toward, source, open_ - step[1] * closing)
-        return jnp.sum(weights * plan.energy(surface_pupil, rows, None))
+        optic = HeightOptic(CAMERA, open_ - step[1] * closing, None, (at + step[0] * toward)[None])
+        return jnp.sum(weights * optic.energy(line, plan, source))
 
     slopes = np.asarray(energy(jnp.zeros(2))[1])
     for i in range(2):

@@ -10,7 +10,7 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m
 from sim.propagation.farfield import plan_far_field
 from sim.propagation.hankel import plan_hankel, revolve, ring_count, ring_source_waves
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 
 def field64(camera: Camera, height: np.ndarray, depth_m: float, wavelength_m: float) -> np.ndarray:
@@ -23,7 +23,7 @@ def field64(camera: Camera, height: np.ndarray, depth_m: float, wavelength_m: fl
 def test_wrapped_sixteen_level_plate(wavelength_m: float, pixel_m: float, fill: float):
     camera = make_camera(512, 1e-3, 2e-3, pixel_m, 64, wavelength_m=wavelength_m, fill=fill)
     height = wrapped_map(512)
-    got = psf_bank(camera, height, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
+    got = psf(height, camera, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
     wanted = oversampled_psf(camera, wavelength_m, field64(camera, height, np.inf, wavelength_m))
     assert relative_error(got, wanted) < 3e-3  # the project's target
     # The reference's own sum is off by up to 1e-4; the rule weights the mean most (`_MEAN_WEIGHT`).
@@ -36,7 +36,7 @@ def test_a_plan_knows_its_error(wavelength_m: float, pixel_m: float, fill: float
     """A plate of noise makes the fully developed speckle that the prediction is for."""
     camera = make_camera(256, 0.5e-3, 1e-3, pixel_m, 48, wavelength_m=wavelength_m, fill=fill)
     height = rng.uniform(0, 1, (256, 256)) / camera.waves_per_metre(wavelength_m)
-    got = psf_bank(camera, height, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
+    got = psf(height, camera, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
     # Forty samples per pixel, for a reference that is itself better than 3e-4.
     wanted = oversampled_psf(camera, wavelength_m, field64(camera, height, np.inf, wavelength_m), 40)
     predicted = plan_far_field(camera, wavelength_m).expected_error
@@ -53,7 +53,7 @@ def test_near_sources_light_cells_obliquely(plate: str, depth_m: float, defocus_
     fine = make_camera(256 * 4, 0.5e-3, 1e-3, 1.85e-6, 64, defocus_m=defocus_m)
     height = np.zeros((256, 256)) if plate == "flat" else wrapped_map(256, seed=1)
     inside = np.repeat(np.repeat(circle_coverage(camera.grid, camera.aperture_m), 4, 0), 4, 1)
-    got = psf_bank(camera, height, [depth_m]).energy[0, 0] / camera.transmission(589e-9)
+    got = psf(height, camera, [depth_m]).energy[0, 0] / camera.transmission(589e-9)
     waves = np.repeat(np.repeat(height, 4, 0), 4, 1) * camera.waves_per_metre(589e-9)
     waves += source_path_m(fine, depth_m) / 589e-9
     wanted = oversampled_psf(fine, 589e-9, inside * np.exp(2j * np.pi * waves))
@@ -71,6 +71,6 @@ def test_rings_against_a_raster_eight_times_finer(depth_m: float):
     rate = jnp.float32(camera.waves_per_metre(589e-9))
     got = np.asarray(plan.energy(jnp.asarray(profile, jnp.float32), source, rate))
     fine = make_camera(192 * 8, 0.375e-3, 1.5e-3, 1.85e-6, 64)
-    raster = psf_bank(fine, revolve(np.repeat(profile, 8), fine.grid), [depth_m]).energy[0, 0]
+    raster = psf(revolve(np.repeat(profile, 8), fine.grid), fine, [depth_m]).energy[0, 0]
     # The raster's rule is good to 2e-3, its staircase to 2e-3, the rings' interpolation to 1e-3.
     assert relative_error(got, raster.astype(np.float64) / camera.transmission(589e-9)) < 4e-3

@@ -7,7 +7,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera
 from sim.imaging.shadow import pupil_shadow, shadow, shadowed_psf
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 NEAR_M = 0.05
 # Fresnel number D^2 / (lambda z) of 76, a tenth of the automotive camera's: fringes are wider, tests faster.
@@ -89,7 +89,7 @@ def test_light_that_passes_is_what_geometry_leaves_open(pixels: int):
     flat = np.zeros(SMALL.grid.shape)
     camera = dataclasses.replace(SMALL, window=401)
     passed = shadowed_psf(camera, flat, strip(pixels), NEAR_M, np.inf, (50, 50)).sum()
-    whole = psf_bank(camera, flat, [np.inf]).energy.sum()
+    whole = psf(flat, camera, [np.inf]).energy.sum()
     # Fringes carry light across the edge of the shadow: lambda z / (pi D w) or so of it, 1 % at this Fresnel number.
     assert passed / whole == pytest.approx(disc_overlap(width_m(pixels) / SMALL.aperture_m), abs=0.012)
 
@@ -101,8 +101,8 @@ def test_a_picture_is_the_sum_of_its_points():
     alone = [shadowed_psf(SMALL, flat, mask, NEAR_M, np.inf, point)[0] for point in points]
     # Pixel (row, column) of the picture is the middle of the PSF shifted to the point.
     wanted = np.zeros((41, 61))
-    for (row, column), weight, psf in zip(points, light[:, 0], alone, strict=True):
-        wanted += weight * psf[63 - row : 104 - row, 63 - column : 124 - column]
+    for (row, column), weight, image in zip(points, light[:, 0], alone, strict=True):
+        wanted += weight * image[63 - row : 104 - row, 63 - column : 124 - column]
     np.testing.assert_allclose(picture[0], wanted, atol=1e-7)
 
 
@@ -128,9 +128,9 @@ def test_an_even_light_behind_a_bar_is_what_the_bar_would_have_sent():
     # Everything is alike on both sides of the middle, so one side tells what lands there.
     found = 0.0
     for point in range(half, 255):
-        psf = shadowed_psf(camera, height, bar, NEAR_M, np.inf, (0, point))[0]
-        found += (2 - (point == half)) * float(psf[:, 2 * half - point].sum())
-    bank = psf_bank(camera, height, [NEAR_M, np.inf]).energy[0].sum(axis=1)
+        image = shadowed_psf(camera, height, bar, NEAR_M, np.inf, (0, point))[0]
+        found += (2 - (point == half)) * float(image[:, 2 * half - point].sum())
+    bank = psf(height, camera, [NEAR_M, np.inf]).energy[0].sum(axis=1)
     wanted = bank[1].sum() - bank[0, half - 15 : half + 16].sum()
     # What leaves the window differs for near and far light, and fringes carry a little over the bar's edge.
     assert found == pytest.approx(wanted, abs=0.01)

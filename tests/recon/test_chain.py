@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from doedesign.training.joint import Trainer
-from doedesign.training.optics import LivePlate, RingPlate, StoredPlate, shots
+from doedesign.training.optics import TrainingDoe, shots
+from sim.optic import HeightOptic, RingOptic
 from sim.propagation.hankel import revolve, ring_count
-from sim.psf_bank import PsfBank, psf_bank, radial_psf_bank
+from sim.psf_bank import BankOptic, PsfBank, psf
 from tests.recon.small_training import batch, heights, trainer
 
 AXIS, ASIDE = (0.0, 0.0), (0.2, -0.1)
@@ -25,15 +26,15 @@ def psf_of(plate: Any, free: Any, softness: Any, source: Any) -> jax.Array:
     return plate.psf(free, softness, source)
 
 
-def live(*changes: str) -> tuple[Trainer, LivePlate]:
+def live(*changes: str) -> tuple[Trainer, TrainingDoe]:
     """A plate whose heights are not rounded."""
     made = trainer("optimize.quantisation=none", *changes)
-    assert isinstance(made.plate, LivePlate)
-    return made, made.plate
+    assert isinstance(made.doe.optic, HeightOptic)
+    return made, made.doe
 
 
-def radians_of(plate: LivePlate | RingPlate, height_m: np.ndarray) -> jax.Array:
-    return jnp.asarray(plate.parametrization.radians_of(height_m))
+def radians_of(plate: TrainingDoe, height_m: np.ndarray) -> jax.Array:
+    return jnp.asarray(plate.learning.radians_of(height_m))
 
 
 def difference(found: jax.Array, wanted: np.ndarray) -> float:
@@ -46,8 +47,8 @@ def difference(found: jax.Array, wanted: np.ndarray) -> float:
 @pytest.mark.parametrize(("depth_m", "field_rad"), PLACES)
 def test_a_live_plate_has_the_psf_of_the_bank(depth_m: float, field_rad: tuple[float, float]) -> None:
     made, plate = live("optimize.sampling=exact")
-    found = psf_of(plate, radians_of(plate, heights()), jnp.float32(1), plate.source(depth_m, field_rad))
-    wanted = psf_bank(made.bench.camera, heights(), (depth_m,), field_rad=field_rad).energy[:, 0]
+    found = psf_of(plate, radians_of(plate, heights()), jnp.float32(1), plate.sources(depth_m, field_rad))
+    wanted = psf(heights(), made.bench.camera, (depth_m,), field_rad=field_rad).energy[:, 0]
     # The bank's cells send light about the direction in which it leaves them, those of a step about the axis (see
     # `sim.propagation.farfield`): so near 1 % of the PSF. Far away single precision is left, for waves up to a hundred.
     assert difference(found, wanted) < (0.012 if depth_m == NEAR_M else 2e-4)
@@ -57,8 +58,8 @@ def test_a_live_plate_has_the_psf_of_the_bank(depth_m: float, field_rad: tuple[f
 def test_sparse_sampling_keeps_the_energy(depth_m: float, field_rad: tuple[float, float]) -> None:
     """One sample per lambda d / D: single pixels are off, which is what it costs, sums over the window are not."""
     made, plate = live("optimize.sampling=sparse")
-    found = psf_of(plate, radians_of(plate, heights()), jnp.float32(1), plate.source(depth_m, field_rad))
-    wanted = psf_bank(made.bench.camera, heights(), (depth_m,), field_rad=field_rad).energy[:, 0]
+    found = psf_of(plate, radians_of(plate, heights()), jnp.float32(1), plate.sources(depth_m, field_rad))
+    wanted = psf(heights(), made.bench.camera, (depth_m,), field_rad=field_rad).energy[:, 0]
     # The window's edge may pass between two samples: a row or column of 33 more or less, of a thirtieth of the energy.
     np.testing.assert_allclose(np.asarray(found).sum(), wanted.sum(), rtol=0.03)
     assert difference(found, wanted) < 0.5
@@ -67,19 +68,19 @@ def test_sparse_sampling_keeps_the_energy(depth_m: float, field_rad: tuple[float
 def test_a_live_plate_is_quantised_as_it_will_be_drawn() -> None:
     made, plate = live("optimize.sampling=exact")
     free = radians_of(plate, heights())
-    drawn = plate.parametrization.level(plate.parametrization.continuous_m(free)) * plate.parametrization.levels.step_m
-    wanted = psf_bank(made.bench.camera, np.asarray(drawn), (FAR_M,)).energy[:, 0]
-    found = psf_of(plate, free, jnp.float32(0), plate.source(FAR_M))
+    drawn = plate.learning.level(plate.learning.continuous_m(free)) * plate.learning.levels.step_m
+    wanted = psf(np.asarray(drawn), made.bench.camera, (FAR_M,)).energy[:, 0]
+    found = psf_of(plate, free, jnp.float32(0), plate.sources(FAR_M))
     assert difference(found, wanted) < 2e-4  # as above
-    smooth = psf_of(plate, free, jnp.float32(1), plate.source(FAR_M))
+    smooth = psf_of(plate, free, jnp.float32(1), plate.sources(FAR_M))
     assert difference(smooth, wanted) > 0.1
 
 
 def test_errors_of_nothing_change_nothing() -> None:
     _, plate = live()
-    free, softness, source = radians_of(plate, heights()), jnp.float32(0), plate.source(NEAR_M)
+    free, softness, source = radians_of(plate, heights()), jnp.float32(0), plate.sources(NEAR_M)
     none = eqx.tree_at(
-        lambda p: p.errors, plate, jnp.ones((1, *plate.coverage.shape), jnp.complex64), is_leaf=lambda x: x is None
+        lambda p: p.optic.deviation, plate, jnp.ones((1, 96, 96), jnp.complex64), is_leaf=lambda x: x is None
     )
     # A product with one is exact; the compiler may round the two programs' sums apart.
     assert difference(psf_of(none, free, softness, source), np.asarray(psf_of(plate, free, softness, source))) < 1e-5
@@ -90,18 +91,18 @@ def test_errors_of_nothing_change_nothing() -> None:
 
 def test_rings_have_the_psf_of_their_bank() -> None:
     made = trainer("optimize.parametrization=radial", "optimize.quantisation=none")
-    plate, camera = made.plate, made.bench.camera
-    assert isinstance(plate, RingPlate)
+    plate, camera = made.doe, made.bench.camera
+    assert isinstance(plate.optic, RingOptic)
     profile = heights()[0].repeat(2)[: ring_count(camera)]
-    source = plate.source(FAR_M)
+    source = plate.sources(FAR_M)
     found = psf_of(plate, radians_of(plate, profile), jnp.float32(1), source)
-    wanted = radial_psf_bank(camera, profile, (FAR_M,)).energy[:, 0]
+    wanted = psf(RingOptic(camera, jnp.asarray(profile)), depths=(FAR_M,)).energy[:, 0]
     assert difference(found, wanted) < 1e-4  # the same transform, compiled in another program
     # Drawn as squares, the same rings make nearly the same picture: this is the plate that was meant.
-    drawn = psf_bank(camera, revolve(profile, camera.grid), (FAR_M,)).energy[:, 0]
+    drawn = psf(revolve(profile, camera.grid), camera, (FAR_M,)).energy[:, 0]
     assert np.corrcoef(np.asarray(found).ravel(), drawn.ravel())[0, 1] > 0.9
     with pytest.raises(ValueError, match="must be \\(0, 0\\) for rings"):
-        plate.source(FAR_M, ASIDE)
+        plate.sources(FAR_M, ASIDE)
 
 
 # --- a plate at rest -------------------------------------------------------------------------------------------------
@@ -111,25 +112,25 @@ def test_a_stored_plate_gives_its_bank_back_and_mixes_between() -> None:
     rng = np.random.default_rng(0)
     depths = (0.1, 0.6, np.inf, 0.2)
     bank = PsfBank(rng.random((1, 4, 3, 3), np.float32), ("green",), depths, 1e-6)
-    plate = StoredPlate.of(bank)
+    plate = TrainingDoe.at_rest(bank.as_optic())
     for k, depth in enumerate(depths):
-        found = psf_of(plate, None, jnp.float32(0), plate.source(depth))
+        found = psf_of(plate, None, jnp.float32(0), plate.sources(depth))
         # The place between two depths is found in single precision.
         np.testing.assert_allclose(found, bank.energy[:, k], atol=2e-6)
     # Half way in 1/z between 0.1 m and 0.2 m.
-    found = psf_of(plate, None, jnp.float32(0), plate.source(1 / 7.5))
+    found = psf_of(plate, None, jnp.float32(0), plate.sources(1 / 7.5))
     np.testing.assert_allclose(found, (bank.energy[:, 0] + bank.energy[:, 3]) / 2, atol=2e-6)
-    beyond = psf_of(plate, None, jnp.float32(0), plate.source(0.01))
+    beyond = psf_of(plate, None, jnp.float32(0), plate.sources(0.01))
     np.testing.assert_array_equal(beyond, bank.energy[:, 0])
 
 
 def test_a_plate_at_rest_has_the_psf_of_the_bank() -> None:
     """Between the depths of its bank the blur disc grows by less than a pixel here."""
     made = trainer("train.freeze=optics")
-    assert isinstance(made.plate, StoredPlate)
+    assert isinstance(made.doe.optic, BankOptic)
     for depth in (NEAR_M, 7.3e-3, 9e-3, FAR_M):
-        found = psf_of(made.plate, None, jnp.float32(0), made.plate.source(depth))
-        wanted = psf_bank(made.bench.camera, heights(), (depth,)).energy[:, 0]
+        found = psf_of(made.doe, None, jnp.float32(0), made.doe.sources(depth))
+        wanted = psf(heights(), made.bench.camera, (depth,)).energy[:, 0]
         # Defocus turns by a fifth of a wave from one depth to the next: a parabola of a hundredth at most between.
         assert difference(found, wanted) < 0.02
 
@@ -152,7 +153,7 @@ def test_a_capture_has_the_gradient_of_its_plate() -> None:
 
     slope = jax.jit(jax.grad(value))(free)
     # Cells that a step would wrap have a jump in between.
-    room = (free > 0.1) & (free < plate.parametrization.levels.period_m / plate.parametrization.metres_per_radian - 0.1)
+    room = (free > 0.1) & (free < plate.learning.levels.period_m / plate.learning.metres_per_radian - 0.1)
     along = jnp.where(room, jnp.sign(slope), 0.0)
     step = 1e-2
     found = (value(free + step * along) - value(free - step * along)) / (2 * step)

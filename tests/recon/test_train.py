@@ -14,7 +14,6 @@ import pytest
 from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
-from doedesign.training.optics import LivePlate
 from fab.errors import InputError
 from sim.obstruction import Dirt
 from tests.recon.small_training import PLAIN, batch, heights, small_spec, trainer
@@ -80,19 +79,19 @@ def test_in_turns_one_moves_and_the_other_stays_to_the_bit() -> None:
 @pytest.mark.slow
 def test_a_plate_at_rest_is_not_in_the_state() -> None:
     made = trainer(*PLAIN, *LEARNING, 'train.freeze="optics"')
-    plate = numbers(made.plate)
+    plate = numbers(made.doe)
     state, losses = walk(made, 20)
     assert losses[-1] < 0.98 * losses[0]
     assert state.free is None
-    assert alike(numbers(made.plate), plate)
+    assert alike(numbers(made.doe), plate)
 
 
 def test_a_conventional_camera_has_a_flat_plate() -> None:
     one, other = (
         trainer(*PLAIN, 'train.camera="conventional"', height_m=height) for height in (heights(), 0 * heights())
     )
-    assert alike(numbers(one.plate), numbers(other.plate))
-    assert not alike(numbers(one.plate), numbers(trainer(*PLAIN, 'train.freeze="optics"').plate))
+    assert alike(numbers(one.doe), numbers(other.doe))
+    assert not alike(numbers(one.doe), numbers(trainer(*PLAIN, 'train.freeze="optics"').doe))
 
 
 # --- what a step depends on ------------------------------------------------------------------------------------------
@@ -110,17 +109,17 @@ def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
     seen = [made._seen(batch(), made.spec.train.seed, True) for made in (joint, trainer(*PLAIN, "train.seed=3"))]
     (here, keys), (there, other_keys) = seen
     assert not np.array_equal(jax.random.key_data(keys), jax.random.key_data(other_keys))
-    assert not np.array_equal(here.far.sines, there.far.sines)
+    assert not np.array_equal(here.far[0].sines, there.far[0].sines)
 
 
 def test_field_angles_stay_on_the_sensor(joint: Trainer) -> None:
-    sines = [joint._seen(batch(step=k), 0, True)[0].far.sines[0] for k in range(200)]
+    sines = [joint._seen(batch(step=k), 0, True)[0].far[0].sines[0] for k in range(200)]
     # 640 x 480 pixels of 1.85 um at 1 mm: angles (y, x) whose tangents are below half of that.
     most = np.array([240, 320]) * 1.85e-3
     tangents = np.abs(sines) / np.sqrt(1 - np.sum(np.square(sines), axis=1, keepdims=True))
     assert np.all(tangents < 1.05 * most)  # a sine is taken for its plane's, so a little more in the corner
     assert np.all(tangents.max(axis=0) > 0.9 * most)
-    straight = joint._seen(batch(), 0, False)[0].far.sines
+    straight = joint._seen(batch(), 0, False)[0].far[0].sines
     np.testing.assert_array_equal(straight, 0)
 
 
@@ -154,7 +153,7 @@ def test_errors_of_a_process_and_the_perceptual_term() -> None:
     made = trainer(*PLAIN, *changes, perceptual=Distance(jnp.float32(3)))
     state = made.initial(heights())
     with_errors = [made._with_errors(state, step) for step in (0, 0, 1)]
-    errors = [np.asarray(each.plate.errors) for each in with_errors if isinstance(each.plate, LivePlate)]
+    errors = [np.asarray(each.doe.learnt.deviation) for each in with_errors]
     # Every step has errors of its own, which follow from its number.
     np.testing.assert_array_equal(errors[0], errors[1])
     assert np.mean(errors[0] != errors[2]) > 0.01

@@ -40,7 +40,7 @@ from fab.figure import save
 from fab.files import read_json
 from fab.level_map import read_level_map
 from fab.pictures import read_display
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
 from tests.pictures import leave_out_pictures
@@ -529,7 +529,7 @@ def test_what_stays_at_rest(
     fresh = jax.tree.leaves(command.Trainer.initial(_still(run), np.zeros((2, 2), np.float32)).network)
     assert any(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(moved), fresh, strict=True)) == network
     camera = camera_from_spec(load_spec(run / "spec.toml"))
-    flat = psf_bank(replace(camera, window=33), np.zeros((64, 64), np.float32), (np.inf,)).energy
+    flat = psf(np.zeros((64, 64), np.float32), replace(camera, window=33), (np.inf,)).energy
     assert np.array_equal(read_bank(out / "psf.exr").energy[:, -1:], flat) == (height is None)
 
 
@@ -541,7 +541,7 @@ def _still(run: Path) -> Any:
         spec=spec,
         bench=bench,
         mesh=None,
-        plate=doedesign.training.results.StoredPlate(jax.numpy.zeros((2, 1, 1, 1)), jax.numpy.zeros(2)),
+        doe=SimpleNamespace(parametrization=None),
     )
 
 

@@ -11,7 +11,8 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.propagation.farfield import TOLERANCE, FarField, displaced, plan_far_field
 from sim.propagation.pixel import Banded
-from sim.propagation.pupil import PhaseRows, phase_pupil
+from sim.propagation.pupil import DoeRows, doe_field
+from sim.source import MapColumns
 
 # The airy disc is as wide against the pixel as in the paper's camera (f/1.8, 1.85 um).
 PLANS = {
@@ -28,19 +29,19 @@ PLANS = {
 }
 
 
-def make_rows(camera: Camera, depth_m: float = 0.02) -> PhaseRows:
+def make_rows(camera: Camera, depth_m: float = 0.02) -> DoeRows:
     source = wrapped_waves(source_path_m(camera, depth_m), YELLOW_M)
     coverage = circle_coverage(camera.grid, camera.aperture_m)
     height = wrapped_map(camera.grid.shape[0]).astype(np.float32)
-    return PhaseRows(jnp.asarray(height), jnp.asarray(source), jnp.asarray(coverage))
+    return DoeRows(jnp.asarray(coverage), jnp.asarray(height), None, jnp.asarray(source))
 
 
 def dense(banded: Banded, inputs: int) -> np.ndarray:
     return np.asarray(banded(jnp.eye(inputs, dtype=jnp.float32)), np.float64)
 
 
-def inputs64(rows: PhaseRows, rate: np.ndarray | np.floating | float) -> list[np.ndarray]:
-    return [np.asarray(a, np.float64) for a in (rows.height_m, rows.source_waves, rows.coverage, rate)]
+def inputs64(rows: DoeRows, rate: np.ndarray | np.floating | float) -> list[np.ndarray]:
+    return [np.asarray(a, np.float64) for a in (rows.height_m, rows.source, rows.coverage, rate)]
 
 
 def field64(height: np.ndarray, source: np.ndarray, coverage: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -74,8 +75,8 @@ def test_value_and_gradient(name: str, moved: bool, rng: np.random.Generator):
     rows, rate = make_rows(camera), np.float32(camera.waves_per_metre(YELLOW_M))
     weights = rng.uniform(size=(camera.window, camera.window))
 
-    def objective(rows: PhaseRows, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
-        energy = plan.energy(phase_pupil, rows, rate)
+    def objective(rows: DoeRows, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
+        energy = plan.energy(doe_field, rows, MapColumns(rate))
         return jnp.sum(jnp.asarray(weights, jnp.float32) * energy), energy
 
     run = jax.jit(jax.value_and_grad(objective, argnums=(0, 1), has_aux=True))
@@ -102,9 +103,9 @@ def test_displaced_moves_the_image():
     """By whole pixels, so that the moved image is the same numbers one pixel further; +y is the next row."""
     camera, plan = planned("default", moved=False)
     rows, rate = make_rows(camera), jnp.float32(camera.waves_per_metre(YELLOW_M))
-    still = np.asarray(plan.energy(phase_pupil, rows, rate))
+    still = np.asarray(plan.energy(doe_field, rows, MapColumns(rate)))
     offset = jnp.array([2 * camera.pixel_m, -3 * camera.pixel_m])
-    moved = np.asarray(displaced(plan, offset).energy(phase_pupil, rows, rate))
+    moved = np.asarray(displaced(plan, offset).energy(doe_field, rows, MapColumns(rate)))
     # What differs is the rule's error at other sample positions, and the cell's sinc², which stays where it was.
     assert relative_error(moved[2:, :-3], still[:-2, 3:]) < 2e-2
 
@@ -113,7 +114,7 @@ def test_point_cells_lack_only_the_envelope():
     camera = make_camera(256, 0.8e-3, 1.44e-3, 1.85e-6, 65)
     rows, rate = make_rows(camera), jnp.float32(camera.waves_per_metre(YELLOW_M))
     square, points = (
-        np.asarray(plan_far_field(camera, YELLOW_M, cell=cell).energy(phase_pupil, rows, rate))
+        np.asarray(plan_far_field(camera, YELLOW_M, cell=cell).energy(doe_field, rows, MapColumns(rate)))
         for cell in (True, False)
     )
     envelope = np.sinc(camera.axis_m() * camera.grid.pitch_m / (YELLOW_M * camera.focal_length_m)) ** 2

@@ -6,7 +6,7 @@ from sim.imaging.field import FieldOptics, capture_frame, node_weights
 from sim.imaging.formation import Optics, capture
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Obstruction, Scene
-from sim.psf_bank import PsfBank, psf_bank
+from sim.psf_bank import PsfBank, psf
 
 MODELS: tuple[Model, ...] = ("paper", "paper_release", "radiometric", "reciprocal")
 SHAPE, PIXEL_M, DEPTH_M = (70, 90), 2e-5, 0.1
@@ -78,7 +78,7 @@ def test_from_banks_at_field_angles():
     camera = make_camera(64, 0.15e-3, 0.5e-3, 4e-6, 15)
     height = np.random.default_rng(3).uniform(0, 3e-7, (64, 64))
     angles = (-0.1, 0.0, 0.1)
-    banks = [[psf_bank(camera, height, [np.inf, 0.05], field_rad=(y, x)) for x in angles] for y in angles[1:]]
+    banks = [[psf(height, camera, [np.inf, 0.05], field_rad=(y, x)) for x in angles] for y in angles[1:]]
     optics = FieldOptics.of(banks, camera, (np.inf, 0.05))
     assert optics.psf.shape == (2, 3, 2, 1, 15, 15)
     np.testing.assert_allclose(optics.x_m, 0.5e-3 * np.tan(angles), rtol=1e-12)

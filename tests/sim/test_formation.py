@@ -8,7 +8,7 @@ import pytest
 
 from bench.reference import make_camera
 from fab.errors import InputError
-from sim.imaging.formation import Optics, capture, psf_at, shadow_px
+from sim.imaging.formation import Optics, capture, shadow_px
 from sim.imaging.occlusion import Model, follows_light
 from sim.imaging.scene import Obstruction, Scene
 from sim.psf_bank import PsfBank
@@ -175,14 +175,14 @@ def bank_of(rng, depths: tuple[float, ...]) -> PsfBank:
 
 def test_psfs_between_depths_are_mixed_in_dioptres(rng):
     bank = bank_of(rng, (0.05, np.inf, 0.1))
-    np.testing.assert_array_equal(psf_at(bank, 0.1), bank.energy[:, 2])
-    np.testing.assert_array_equal(psf_at(bank, np.inf), bank.energy[:, 1])
+    np.testing.assert_array_equal(bank.at(0.1), bank.energy[:, 2])
+    np.testing.assert_array_equal(bank.at(np.inf), bank.energy[:, 1])
     # 1 / 0.0625 = 16 dioptres lies at 0.6 between 10 and 20.
-    np.testing.assert_allclose(psf_at(bank, 0.0625), 0.4 * bank.energy[:, 2] + 0.6 * bank.energy[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(bank.at(0.0625), 0.4 * bank.energy[:, 2] + 0.6 * bank.energy[:, 0], rtol=1e-5)
     with pytest.raises(InputError, match=r"0\.04 m\. Compute the bank"):
-        psf_at(bank, 0.04)
+        bank.at(0.04)
     with pytest.raises(InputError, match="within the depths"):
-        psf_at(bank_of(rng, (0.05, 5.0)), np.inf)
+        bank_of(rng, (0.05, 5.0)).at(np.inf)
 
 
 def test_optics_of_a_bank(rng):

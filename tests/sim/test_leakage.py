@@ -13,7 +13,7 @@ from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.leakage import SplitPsf, mean_transmission, split_psf, strehl, zeroth_order
 from sim.metrics import zeroth_order as zeroth_order_of_heights
-from sim.psf_bank import psf_bank, surface_bank
+from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 2e-6
@@ -44,7 +44,7 @@ def plate(level: np.ndarray) -> FabricatedDoe:
 
 @pytest.fixture(scope="module")
 def split(plate: FabricatedDoe) -> SplitPsf:
-    return split_psf(CAMERA, plate, GREEN, DEPTH_M)
+    return split_psf(plate, DEPTH_M, GREEN)
 
 
 def test_the_mean_is_weighted_by_the_open_share_of_every_cell(plate: FabricatedDoe):
@@ -66,7 +66,7 @@ def test_a_flat_plate_leaks_everything(nominal: FabricatedDoe):
     even = jnp.full_like(nominal.transmission, jnp.exp(0.7j))
     flat = dataclasses.replace(nominal, transmission=even, means=even, height_m=None)
     np.testing.assert_allclose(zeroth_order(flat), 1.0, atol=1e-6)  # float32
-    parts = split_psf(CAMERA, flat, GREEN, DEPTH_M)
+    parts = split_psf(flat, DEPTH_M, GREEN)
     assert parts.diffracted.sum() < 1e-9
     assert relative_error(parts.leaked, parts.total.astype(np.float64)) < 1e-6
 
@@ -91,13 +91,13 @@ def test_strehl_of_a_plate_in_half_cells(nominal: FabricatedDoe, plate: Fabricat
         transmission=halved(plate.transmission),
         means=halved(plate.means),
         coverage=halved(plate.coverage),
-        grid=Grid((2 * CELLS, 2 * CELLS), PITCH_M / 2),
+        camera=dataclasses.replace(CAMERA, grid=Grid((2 * CELLS, 2 * CELLS), PITCH_M / 2)),
     )
     np.testing.assert_allclose(strehl(halves, nominal), strehl(plate, nominal), rtol=1e-6)
 
 
 def test_the_parts_belong_to_the_psf_of_the_bank(plate: FabricatedDoe, split: SplitPsf):
-    bank = surface_bank(CAMERA, plate, [DEPTH_M]).energy[0, 0]
+    bank = psf(plate, depths=[DEPTH_M]).energy[0, 0]
     np.testing.assert_array_equal(split.total, bank)
     assert relative_error(split.leaked + split.diffracted + split.interference, bank.astype(np.float64)) < 1e-6
 
@@ -107,7 +107,7 @@ def test_what_leaks_is_the_zeroth_order_of_the_bare_lens(plate: FabricatedDoe, s
     bare = np.zeros_like(split.leaked, float)
     for i, line in enumerate(GREEN.wavelengths_m):
         own = dataclasses.replace(CAMERA, colours=(Colour("one", (line,), (1.0,)),))
-        flat = psf_bank(own, np.zeros((CELLS, CELLS)), [DEPTH_M]).energy[0, 0]
+        flat = psf(np.zeros((CELLS, CELLS)), own, [DEPTH_M]).energy[0, 0]
         bare += GREEN.weights[i] * orders[i] * flat
     assert relative_error(split.leaked, bare) < 1e-5  # float32 and `cis`
 

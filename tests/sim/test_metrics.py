@@ -19,7 +19,7 @@ from sim.metrics import (
     spot_radius_m,
     zeroth_order,
 )
-from sim.psf_bank import psf_bank
+from sim.psf_bank import psf
 
 CAMERA = make_camera(256, 0.6e-3, 1.08e-3, 1.85e-6, 64)
 
@@ -40,12 +40,12 @@ def test_radii_are_measured_from_the_middle_of_the_window():
 
 
 def test_encircled_energy_grows_to_the_windows_total(rng: np.random.Generator):
-    psf = rng.uniform(size=(20, 20)).astype(np.float32)
-    energies = encircled_energy(psf, 1e-6, np.linspace(0, 15e-6, 16))
+    image = rng.uniform(size=(20, 20)).astype(np.float32)
+    energies = encircled_energy(image, 1e-6, np.linspace(0, 15e-6, 16))
     assert energies[0] == 0
     assert all(np.diff(energies) >= 0)
-    assert energies[-1] == pytest.approx(psf.sum(dtype=np.float64), rel=1e-6)  # 15 um reach the corners
-    assert energies[7] == energy_within(psf, 1e-6, 7e-6)
+    assert energies[-1] == pytest.approx(image.sum(dtype=np.float64), rel=1e-6)  # 15 um reach the corners
+    assert energies[7] == energy_within(image, 1e-6, 7e-6)
 
 
 def test_radii_of_the_far_spot():
@@ -94,8 +94,8 @@ def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np
     height = {"flat": np.zeros((256, 256)), "wrapped": wrapped_map(256), "rough": rng.uniform(0, 1.2e-6, (256, 256))}[
         plate
     ]
-    psf = psf_bank(camera, height, [depth_m]).energy[0, 0]
-    budget = energy_budget(camera, height, psf, depth_m, camera.colours[0])
+    image = psf(height, camera, [depth_m]).energy[0, 0]
+    budget = energy_budget(camera, height, image, depth_m, camera.colours[0])
     assert sum(budget) == pytest.approx(1, abs=1e-9)
     assert budget.reflected == pytest.approx(0.0684, abs=1e-3)
     assert budget.spot > 0
@@ -112,9 +112,9 @@ def test_the_budget_of_a_colour_is_that_of_its_wavelengths():
     waves, weights = (5e-7, 6e-7), (0.25, 0.75)
     camera = dataclasses.replace(CAMERA, colours=(Colour("mixed", waves, weights),))
     height = wrapped_map(256)
-    psf = psf_bank(camera, height, [0.02]).energy[0, 0]
-    mixed = energy_budget(camera, height, psf, 0.02, camera.colours[0])
-    parts = [energy_budget(camera, height, psf, 0.02, Colour("one", (w,), (1.0,))) for w in waves]
+    image = psf(height, camera, [0.02]).energy[0, 0]
+    mixed = energy_budget(camera, height, image, 0.02, camera.colours[0])
+    parts = [energy_budget(camera, height, image, 0.02, Colour("one", (w,), (1.0,))) for w in waves]
     assert mixed.higher_orders == pytest.approx(np.dot(weights, [p.higher_orders for p in parts]), abs=1e-9)
     assert mixed.reflected == pytest.approx(np.dot(weights, [p.reflected for p in parts]), abs=1e-12)
 

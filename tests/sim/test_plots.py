@@ -21,7 +21,7 @@ from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.leakage import plot_split
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
-from sim.psf_bank import PsfBank, psf_bank
+from sim.psf_bank import PsfBank, psf
 from sim.transfer import TransferBank
 from tests.pictures import panel, panel_dots, require_place_of_axes, require_whole
 
@@ -86,7 +86,7 @@ def test_a_picture_takes_the_place_of_given_axes(name: str):
 def test_light_of_a_wedge_that_thickens_upward_is_drawn_on_top():
     wave = full_wave_height_m("fused_silica", 589e-9)
     rise = np.linspace(0, 3 * wave, 64, dtype=np.float32)
-    bank = psf_bank(CAMERA, np.tile(rise[:, None], 64), (np.inf,))
+    bank = psf(np.tile(rise[:, None], 64), CAMERA, (np.inf,))
     dots = panel_dots(panel(plot_psfs(bank, CAMERA, (), (np.inf,)), "far")).sum(axis=2)
     # A strip left of the inset and above the words.
     strip = dots[: int(0.8 * len(dots)), int(0.35 * dots.shape[1]) : int(0.6 * dots.shape[1])]

@@ -5,9 +5,10 @@ import pytest
 
 from bench.reference import make_camera, relative_error, wrapped_map
 from sim.camera import Colour
+from sim.optic import HeightOptic
 from sim.propagation.farfield import FarField
 from sim.propagation.fresnel import DirectPath
-from sim.psf_bank import plan_propagation, psf_bank, pupil_field
+from sim.psf_bank import psf
 
 ONE = make_camera(128, 0.3e-3, 0.54e-3, 1.85e-6, 32)
 HEIGHT = wrapped_map(128)
@@ -16,7 +17,7 @@ HEIGHT = wrapped_map(128)
 def test_axes_are_wavelength_depth_y_x():
     camera = dataclasses.replace(ONE, colours=(Colour("a", (5e-7,), (1.0,)), Colour("b", (6e-7,), (1.0,))))
     calls = []
-    bank = psf_bank(camera, HEIGHT, [0.02, 0.5, np.inf], on_psf=lambda: calls.append(1))
+    bank = psf(HEIGHT, camera, [0.02, 0.5, np.inf], on_psf=lambda: calls.append(1))
     assert bank.energy.shape == (2, 3, 32, 32)
     assert bank.energy.dtype == np.float32
     assert (bank.colours, bank.depths_m, bank.pixel_m) == (("a", "b"), (0.02, 0.5, np.inf), 1.85e-6)
@@ -24,26 +25,26 @@ def test_axes_are_wavelength_depth_y_x():
     for c, wavelength in enumerate((5e-7, 6e-7)):
         for d, depth in enumerate(bank.depths_m):
             single = dataclasses.replace(ONE, colours=(Colour("s", (wavelength,), (1.0,)),))
-            np.testing.assert_array_equal(bank.energy[c, d], psf_bank(single, HEIGHT, [depth]).energy[0, 0])
+            np.testing.assert_array_equal(bank.energy[c, d], psf(HEIGHT, single, [depth]).energy[0, 0])
 
 
 def test_a_colour_is_the_weighted_sum_of_its_wavelengths():
     waves, weights = (5e-7, 5.5e-7, 6e-7), (0.2, 0.5, 0.3)
     mixed = dataclasses.replace(ONE, colours=(Colour("green", waves, weights),))
     pure = dataclasses.replace(ONE, colours=tuple(Colour(f"{w}", (w,), (1.0,)) for w in waves))
-    parts = psf_bank(pure, HEIGHT, [0.1]).energy[:, 0]
-    whole = psf_bank(mixed, HEIGHT, [0.1]).energy[0, 0]
+    parts = psf(HEIGHT, pure, [0.1]).energy[:, 0]
+    whole = psf(HEIGHT, mixed, [0.1]).energy[0, 0]
     assert relative_error(whole, np.tensordot(weights, parts.astype(np.float64), 1)) < 1e-6  # float32 sums
 
 
 def test_reflection_is_in_the_energy():
-    flat = psf_bank(ONE, np.zeros((128, 128)), [np.inf]).energy[0, 0]
+    flat = psf(np.zeros((128, 128)), ONE, [np.inf]).energy[0, 0]
     air = 2 * 0.0338 + 0.0012  # two faces of fused silica send back 6.8-7.0 %
     assert 0.85 < flat.sum() < 1 - air + 0.003
 
 
 def test_the_field_behind_the_plate():
-    field = np.asarray(pupil_field(ONE, HEIGHT, 0.05, 589e-9))
+    field = np.asarray(HeightOptic.of(ONE, HEIGHT).field(ONE.lines[0], 0.05))
     y, x = (ONE.grid.axis_m(a) for a in ("y", "x"))
     path = np.sqrt(y[:, None] ** 2 + x[None, :] ** 2 + 0.05**2) - 0.05
     wanted = np.exp(2j * np.pi * (HEIGHT * ONE.waves_per_metre(589e-9) + path / 589e-9))
@@ -54,21 +55,20 @@ def test_the_field_behind_the_plate():
 
 
 def test_propagations_by_name():
-    assert isinstance(plan_propagation(ONE, 589e-9, np.inf), FarField)
-    assert isinstance(
-        plan_propagation(make_camera(300, 0.15e-3, 1e-3, 1e-6, 16), 589e-9, np.inf, "fresnel"), DirectPath
-    )
+    assert isinstance(HeightOptic.of(ONE).plan(ONE.lines[0], np.inf), FarField)
+    fine = HeightOptic.of(make_camera(300, 0.15e-3, 1e-3, 1e-6, 16))
+    assert isinstance(fine.plan(fine.lines[0], np.inf, "fresnel"), DirectPath)
 
 
 def test_a_map_of_another_shape_is_refused():
     with pytest.raises(ValueError, match="must have the grid's shape"):
-        psf_bank(ONE, np.zeros((127, 128)), [np.inf])
+        psf(np.zeros((127, 128)), ONE, [np.inf])
 
 
 def test_an_oblique_field_is_the_same_lens_seen_under_an_angle():
     """On a star, obliquity only lengthens the way through the glass; a flat plate does not notice."""
     flat = np.zeros((128, 128))
-    on, off = (psf_bank(ONE, flat, [np.inf], field_rad=f).energy for f in ((0.0, 0.0), (0.2, 0.1)))
+    on, off = (psf(flat, ONE, [np.inf], field_rad=f).energy for f in ((0.0, 0.0), (0.2, 0.1)))
     np.testing.assert_array_equal(on, off)
-    ruled = psf_bank(ONE, HEIGHT, [np.inf], field_rad=(0.2, 0.0)).energy
-    assert relative_error(ruled, psf_bank(ONE, HEIGHT, [np.inf]).energy.astype(np.float64)) > 0.01
+    ruled = psf(HEIGHT, ONE, [np.inf], field_rad=(0.2, 0.0)).energy
+    assert relative_error(ruled, psf(HEIGHT, ONE, [np.inf]).energy.astype(np.float64)) > 0.01

@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim.propagation.pupil import PhaseRows, cis, phase_pupil
+from sim.propagation.pupil import DoeRows, cis, doe_field
+from sim.source import MapColumns
 
 
 @pytest.mark.parametrize("reach", [0.5, 3.0, 50.0])
@@ -32,11 +33,11 @@ def test_the_derivative_of_cis_is_a_quarter_turn():
 
 
 def test_a_closed_row_gives_no_field():
-    rows = PhaseRows(jnp.full((2, 3), 1e-6), jnp.full((2, 3), 0.3), jnp.zeros((2, 3)))
-    assert np.all(np.asarray(phase_pupil(rows, jnp.float32(8e5))) == 0)
+    rows = DoeRows(jnp.zeros((2, 3)), jnp.full((2, 3), 1e-6), None, jnp.full((2, 3), 0.3))
+    assert np.all(np.asarray(doe_field(rows, MapColumns(jnp.float32(8e5)))) == 0)
 
 
 def test_glass_and_path_add_as_phase():
-    rows = PhaseRows(jnp.full((1, 1), 0.5e-6), jnp.full((1, 1), 0.125), jnp.full((1, 1), 0.5))
-    got = complex(np.asarray(phase_pupil(rows, jnp.float32(5e5)))[0, 0])
+    rows = DoeRows(jnp.full((1, 1), 0.5), jnp.full((1, 1), 0.5e-6), None, jnp.full((1, 1), 0.125))
+    got = complex(np.asarray(doe_field(rows, MapColumns(jnp.float32(5e5))))[0, 0])
     assert got == pytest.approx(0.5 * np.exp(2j * np.pi * 0.375), abs=4e-6)

@@ -16,7 +16,7 @@ from fab.process import Disc, MaskDisc, Process, Variation, error_names, variati
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.propagation.pupil import cis
-from sim.psf_bank import psf_bank, surface_bank
+from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 1.85e-6
@@ -86,8 +86,8 @@ def test_without_errors_the_plate_is_as_drawn_bit_for_bit(level: np.ndarray, not
 
 
 def test_without_errors_the_bank_is_that_of_the_height_map(level: np.ndarray):
-    made = surface_bank(CAMERA, plate(level), [4e-3, np.inf])
-    drawn = psf_bank(CAMERA, height_of(level, LEVELS), [4e-3, np.inf])
+    made = psf(plate(level), depths=[4e-3, np.inf])
+    drawn = psf(height_of(level, LEVELS), CAMERA, [4e-3, np.inf])
     # The same field but for the order in which phases are added, in float32.
     assert relative_error(made.energy, drawn.energy.astype(np.float64)) < 1e-6
     assert (made.colours, made.depths_m, made.pixel_m) == (drawn.colours, drawn.depths_m, drawn.pixel_m)
@@ -314,7 +314,7 @@ def test_a_wider_sensor_is_served_in_half_cells(level: np.ndarray):
     assert as_fabricated(level, wide, PROCESS, Variation(common_depth_scale=0.1)).grid == GRID
     # Parts of a cell give the same PSF as the cell.
     drawn = as_fabricated(shifted_planes(level, 1, (0, 1)), wide, PROCESS, Variation())
-    fine, coarse = (surface_bank(wide, s, [np.inf]).energy for s in (moved, drawn))
+    fine, coarse = (psf(s, depths=[np.inf]).energy for s in (moved, drawn))
     assert relative_error(fine, coarse.astype(np.float64)) < 1e-4  # float32; measured 2e-5
 
 

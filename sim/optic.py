@@ -1,0 +1,287 @@
+"""Optics: whatever images a point source onto a camera's pixels, asked by one protocol.
+
+`Optic` answers for one wavelength, source and field. The host prepares, in double precision, a plan of the propagation
+and the source's phase (`plan`, `source`); `energy` turns both into pixel energies and may be traced by jax. A height
+map (`HeightOptic`) and a DOE as fabricated (`sim.surface.FabricatedDoe`) are made of cells (`CellOptic`), `RingOptic`
+of rings, and `sim.psf_bank.BankOptic` holds PSFs that are known already.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from sim.aperture import circle_coverage
+from sim.camera import Camera, SpectralLine
+from sim.propagation.farfield import FarField, plan_far_field
+from sim.propagation.fresnel import DirectPath, plan_direct
+from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
+from sim.propagation.pupil import DoeRows, SourceColumns, doe_field
+from sim.source import SeparableSource, SourceMap
+
+Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
+CellSource = SourceMap | SeparableSource
+ON_AXIS = (0.0, 0.0)
+
+
+class Optic(eqx.Module):
+    """Something that images point sources.
+
+    Attributes:
+        camera: lens, sensor and substrate; None where only PSFs are known.
+        colours: names of the colour channels.
+        pixel_m: pixel pitch, metres.
+        lines: wavelengths of all colours, colour by colour.
+    """
+
+    camera: eqx.AbstractVar[Camera | None]
+    colours: eqx.AbstractVar[tuple[str, ...]]
+    pixel_m: eqx.AbstractVar[float]
+    lines: eqx.AbstractVar[tuple[SpectralLine, ...]]
+
+    @abstractmethod
+    def plan(
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+    ) -> Any:
+        """Operators of one wavelength and source depth (metres), made on the host.
+
+        Args:
+            line: the wavelength.
+            depth_m: source depth.
+            propagation: far field, or one of the direct kernels (for DOEs of cells).
+            sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
+
+        Raises:
+            InputError: a direct path where eq. 6 does not hold.
+        """
+
+    @abstractmethod
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> Any:
+        """A point source at a depth (metres) and field angles (y, x), its phase wrapped in double precision."""
+
+    @abstractmethod
+    def energy(self, line: SpectralLine, plan: Any, source: Any) -> Float[Array, "v u"]:
+        """Energy `[y, x]` in every pixel, per unit power on the clear aperture and without `line.factor`; traceable."""
+
+    def as_optic(self) -> "Optic":
+        """Return it as it is."""
+        return self
+
+
+@runtime_checkable
+class HasOptic(Protocol):
+    """Whatever carries an optic."""
+
+    def as_optic(self) -> Optic:
+        """Return the optic."""
+        ...
+
+
+class CameraOptic(Optic):
+    """An optic that is computed for a camera."""
+
+    camera: eqx.AbstractVar[Camera]
+
+    @property
+    def colours(self) -> tuple[str, ...]:
+        """Names of the colour channels."""
+        return tuple(colour.name for colour in self.camera.colours)
+
+    @property
+    def pixel_m(self) -> float:
+        """Pixel pitch, metres."""
+        return self.camera.pixel_m
+
+    @property
+    def lines(self) -> tuple[SpectralLine, ...]:
+        """Wavelengths of all colours."""
+        return self.camera.lines
+
+
+class CellOptic(CameraOptic):
+    """A DOE of square cells behind a camera's clear aperture.
+
+    Attributes:
+        camera: lens, sensor and substrate; its grid is that of the cells.
+        coverage: `[y, x]` open share of every cell.
+        source_kind: how sources are described (`sim.source`).
+    """
+
+    camera: eqx.AbstractVar[Camera]
+    coverage: eqx.AbstractVar[Float[Array, "y x"]]
+    source_kind: eqx.AbstractVar[type[SourceMap] | type[SeparableSource]]
+
+    @abstractmethod
+    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
+        """Height in metres and transmission besides it, both `[y, x]`; None where there is none."""
+
+    def plan(
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+    ) -> FarField | DirectPath:
+        """Operators of the far field, or of a direct kernel (which serves every depth)."""
+        if propagation == "far_field":
+            return plan_far_field(self.camera, line.wavelength_m, depth_m=depth_m, sampling=sampling)
+        return plan_direct(self.camera, line.wavelength_m, propagation)
+
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
+        """The path to every cell; the window follows the chief ray."""
+        return self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad)
+
+    def rows(self, line: SpectralLine, source: CellSource) -> tuple[DoeRows, SourceColumns]:
+        """The two arguments of `doe_field`."""
+        rows, columns = source.over(self.camera.grid)
+        return DoeRows(self.coverage, *self.cells(line), rows), columns
+
+    def energy(self, line: SpectralLine, plan: FarField | DirectPath, source: CellSource) -> Float[Array, "v u"]:
+        """Energy in every pixel."""
+        return plan.energy(doe_field, *self.rows(line, source))
+
+    def with_camera(self, camera: Camera) -> "CellOptic":
+        """The same DOE before another lens or sensor; the cells stay.
+
+        Raises:
+            ValueError: a camera with another aperture or substrate.
+        """
+        own = self.camera
+        if (camera.aperture_m, camera.material) != (own.aperture_m, own.material):
+            wanted, got = f"{own.aperture_m} m of {own.material}", f"{camera.aperture_m} m of {camera.material}"
+            raise ValueError(f"`camera` must have the DOE's aperture and substrate, {wanted}, but got {got}")
+        return replace(self, camera=replace(camera, grid=own.grid))
+
+    def field(self, line: SpectralLine, depth_m: float = np.inf) -> Complex[Array, "y x"]:
+        """The whole field behind the DOE for a source on the axis, `[y, x]`, unit amplitude where open."""
+        return _whole_field(*self.rows(line, self.source(line, depth_m)))
+
+
+_whole_field = jax.jit(doe_field)
+
+
+class HeightOptic(CellOptic):
+    """A DOE given by its height map.
+
+    Attributes:
+        camera: lens, sensor, substrate and DOE grid.
+        coverage: `[y, x]` open share of every cell.
+        height_m: `[y, x]` DOE height, metres; None for the bare lens.
+        deviation: `[line, y, x]` transmission of a DOE as fabricated over that of its heights, or None.
+        source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
+    """
+
+    camera: Camera = eqx.field(static=True)
+    coverage: Float[Array, "y x"]
+    height_m: Float[Array, "y x"] | None = None
+    deviation: Complex[Array, "line y x"] | None = None
+    source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
+
+    @classmethod
+    def of(cls, camera: Camera, height_m: Any = None) -> "HeightOptic":
+        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); none for the bare lens.
+
+        Raises:
+            ValueError: a map of another shape.
+        """
+        if height_m is not None and np.shape(height_m) != camera.grid.shape:
+            got = np.shape(height_m)
+            raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {got}")
+        coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+        return cls(camera, coverage, None if height_m is None else jnp.asarray(height_m, jnp.float32))
+
+    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
+        """Heights, and what a DOE as fabricated does besides."""
+        return self.height_m, None if self.deviation is None else self.deviation[self.lines.index(line)]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of what `with_heights` takes."""
+        return self.camera.grid.shape
+
+    def with_heights(self, height_m: Float[Array, "y x"]) -> "HeightOptic":
+        """The same with other heights."""
+        return replace(self, height_m=height_m)
+
+    def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+        """Heights of the cells of `with_heights`."""
+        return height_m
+
+    def heights_of(self, map_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"] | None:
+        """What `with_heights` takes of a map on the grid."""
+        return map_m
+
+
+class RingOptic(CameraOptic):
+    """Rings drawn as rings, seen on the axis; each is as wide as a cell.
+
+    Attributes:
+        camera: lens, sensor and substrate.
+        profile_m: `[ring]` height of every ring, metres (`sim.propagation.hankel.ring_count` of them).
+    """
+
+    camera: Camera = eqx.field(static=True)
+    profile_m: Float[Array, " ring"]
+
+    def plan(
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+    ) -> Hankel:
+        """Operators of the Hankel transform, for every depth."""
+        if propagation != "far_field":
+            raise ValueError(f"`propagation` must be 'far_field' for rings, but got {propagation!r}")
+        return plan_hankel(self.camera, line.wavelength_m)
+
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> SourceMap:
+        """The path to every sub-ring.
+
+        Raises:
+            ValueError: a source off the axis.
+        """
+        if any(field_rad):
+            raise ValueError(f"`field_rad` must be (0, 0) for rings, but got {field_rad}")
+        waves = ring_source_waves(self.camera, depth_m, line.wavelength_m)
+        return SourceMap(jnp.asarray(waves), jnp.float32(self.camera.waves_per_metre(line.wavelength_m)))
+
+    def energy(self, line: SpectralLine, plan: Hankel, source: SourceMap) -> Float[Array, "v u"]:
+        """Energy in every pixel."""
+        return plan.energy(self.profile_m, source.source_waves, source.waves_per_metre)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of what `with_heights` takes."""
+        return (ring_count(self.camera),)
+
+    def with_heights(self, height_m: Float[Array, " ring"]) -> "RingOptic":
+        """The same with another profile."""
+        return replace(self, profile_m=height_m)
+
+    def raster(self, height_m: Float[np.ndarray, " ring"]) -> Float[np.ndarray, "y x"]:
+        """Heights of the cells that draw a profile."""
+        return revolve(height_m, self.camera.grid)
+
+    def heights_of(self, map_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, " ring"] | None:
+        """The profile whose raster a map is, or None if it is none."""
+        profile = radial_profile(map_m, self.camera.grid)
+        return None if profile is None else profile[: ring_count(self.camera)]
+
+
+def colour_energies(optic: Optic, plans: Sequence[Any], sources: Sequence[Any]) -> Float[Array, "c y x"]:
+    """PSF of every colour from the plans and sources of `optic.lines`; for use within a compiled function."""
+    images: list[list[Array]] = [[] for _ in optic.colours]
+    for line, plan, source in zip(optic.lines, plans, sources, strict=True):
+        images[line.colour].append(line.factor * optic.energy(line, plan, source))
+    return jnp.stack([jnp.sum(jnp.stack(parts), axis=0) for parts in images])
