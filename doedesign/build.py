@@ -123,7 +123,7 @@ def require_levels_of(process: Process, levels: Levels, where: str) -> Process:
         InputError: it makes another one.
     """
     if process.levels != levels:
-        raise InputError(where, f"must be for {levels.told}", process.levels.told, "Give a process for this design.")
+        raise InputError(where, f"must be for {levels}", process.levels, "Give a process for this design.")
     return process
 
 

@@ -95,7 +95,7 @@ def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Se
         log.info("evaluating the design")
         design = finished_design(spec, problem, state, history)
         if spec.process.chooses_depths:
-            log.info(f"chosen: {design.levels.told}")
+            log.info(f"chosen: {design.levels}")
         results = _write_results(run, problem, design)
         finish_run(run, inputs, overrides, results, design.levels.depths_m)
     return open_design(open_run(folder), levels=spec.process.levels)

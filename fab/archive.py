@@ -26,12 +26,7 @@ _HEADER, _DIGEST = "header", "sha256"
 
 
 def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a header for JSON and named arrays; the folder of the file is made if missing.
-
-    Raises:
-        InputError: the system refuses the path.
-        ValueError: `header` holds what JSON cannot say.
-    """
+    """Write a header for JSON and named arrays; the folder of the file is made if missing."""
     told = canonical_json({**header, _DIGEST: _digest(header, arrays)})
     named: dict[str, Any] = {_HEADER: np.frombuffer(told, np.uint8), **arrays}
     stream = io.BytesIO()

@@ -53,11 +53,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing.
-
-    Raises:
-        InputError: the system refuses the path (read-only, full, not a folder ...).
-    """
+    """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing."""
     path = Path(path)
     temporary: Path | None = None
     try:
@@ -167,11 +163,7 @@ def sha256_bytes(data: bytes | memoryview) -> str:
 
 
 def sha256_file(path: str | Path) -> str:
-    """Return the SHA-256 of a file's content, in lower-case hexadecimal.
-
-    Raises:
-        InputError: the file is missing or cannot be read.
-    """
+    """Return the SHA-256 of a file's content, in lower-case hexadecimal."""
     try:
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -182,18 +174,13 @@ def sha256_file(path: str | Path) -> str:
 def canonical_json(value: object) -> bytes:
     """Return a value as JSON whose bytes depend on it alone: sorted keys, one-space indent, newline at the end.
 
-    Raises:
-        ValueError: the value holds NaN or an infinity, which JSON cannot say.
+    NaN and infinities, which JSON cannot say, raise a ValueError.
     """
     return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object.
-
-    Raises:
-        InputError: the file is missing, is not JSON, or holds something else than an object.
-    """
+    """Read a JSON file that holds one object."""
     try:
         text = Path(path).read_bytes()
     except OSError as error:

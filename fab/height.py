@@ -35,6 +35,9 @@ class HeightMap:
         height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative.
         grid: the raster.
         aperture_m: diameter of the clear aperture, metres.
+
+    Raises:
+        InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
     """
 
     height_m: NDArray[np.floating]
@@ -42,11 +45,7 @@ class HeightMap:
     aperture_m: float
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
-        """
+        """Check the values."""
         if self.height_m.shape != self.grid.shape:
             got = f"{self.height_m.shape} on {self.grid.shape}"
             raise InputError("height map", "must have the grid's shape", got, "Use its own grid.")
@@ -73,17 +72,10 @@ class HeightMap:
 
 
 def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where: str, rule: str, cure: str) -> None:
-    """Refuse a map if any pixel breaks a rule, and say how many do and where the first is.
+    """Raise InputError if any pixel breaks a rule, saying how many do and where the first is.
 
-    Args:
-        height_m: heights, metres, ``[y, x]``.
-        wrong: true where the rule is broken, same shape.
-        where: what the message starts with.
-        rule: the rule.
-        cure: what to do.
-
-    Raises:
-        InputError: some pixel is wrong.
+    `where`, `rule` and `cure` are those of the message; `wrong` is true where the rule is broken, ``[y, x]`` like
+    `height_m`.
     """
     count = int(np.count_nonzero(wrong))
     if count:
@@ -95,15 +87,7 @@ def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where
 
 
 def require_heights(height_m: NDArray[Any], where: str) -> None:
-    """Check that an array can be a height map.
-
-    Args:
-        height_m: the array.
-        where: what the message starts with.
-
-    Raises:
-        InputError: not two-dimensional, empty, not real floats, or a height that is NaN, infinite or negative.
-    """
+    """Check that an array can be a height map: two-dimensional, filled, float32 or float64, finite and not negative."""
     if height_m.ndim != 2 or height_m.size == 0 or height_m.dtype not in (np.float32, np.float64):
         got = f"{height_m.dtype} of shape {height_m.shape}"
         rule = "must be a filled two-dimensional array of float32 or float64"

@@ -45,6 +45,10 @@ class LevelMap:
         aperture_m: diameter of the relief, metres; infinite where all of the raster is relief, as in a piece that was
             cut out of a DOE.
         name: the owner's name for it.
+
+    Raises:
+        InputError: the array is no level map of the staircase, its shape is not the grid's, or the aperture does not
+            fit the raster.
     """
 
     level: NDArray[np.uint8]
@@ -54,12 +58,7 @@ class LevelMap:
     name: str = "doe"
 
     def __post_init__(self) -> None:
-        """Check the values and leave the glass blank outside the aperture.
-
-        Raises:
-            InputError: the array is no level map of the staircase, its shape is not the grid's, or the aperture does
-                not fit the raster.
-        """
+        """Check the values and leave the glass blank outside the aperture."""
         checked = require_levels(np.asarray(self.level), self.levels)
         if checked.shape != self.grid.shape:
             rule = f"must have the grid's shape {self.grid.shape}"
@@ -76,11 +75,7 @@ class LevelMap:
     def from_height(cls, height: HeightMap, levels: Levels, name: str = "doe", *, wrapped: bool = False) -> "LevelMap":
         """Give every pixel of a height map the nearest level.
 
-        Args:
-            height: the heights, metres.
-            levels: the staircase.
-            name: the owner's name for it.
-            wrapped: whether heights repeat after one wave of the design (`fab.levels.quantise_wrapped`).
+        If `wrapped`, heights repeat after one wave of the design (`fab.levels.quantise_wrapped`).
 
         Raises:
             InputError: a height above the staircase that is not to be wrapped, or the aperture does not fit.
@@ -126,7 +121,7 @@ class LevelMap:
         ny, nx = self.shape
         rows = {
             "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
-            "levels": str(self.levels.told),
+            "levels": str(self.levels),
             "clear aperture": length_text(self.aperture_m),
             "SHA-256": self.digest[:12],
         }
@@ -135,7 +130,7 @@ class LevelMap:
     def __str__(self) -> str:
         """Return "quick: 320 x 320 pixels of 1.85 um in 16 levels of 75 nm"."""
         ny, nx = self.shape
-        return f"{self.name}: {ny} x {nx} pixels of {format_length(self.grid.pitch_m)} in {self.levels.told}"
+        return f"{self.name}: {ny} x {nx} pixels of {format_length(self.grid.pitch_m)} in {self.levels}"
 
 
 def level_digest(level: NDArray[np.uint8]) -> str:
@@ -144,11 +139,7 @@ def level_digest(level: NDArray[np.uint8]) -> str:
 
 
 def write_level_map(path: str | Path, level_map: LevelMap) -> None:
-    """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres.
-
-    Raises:
-        InputError: the system refuses the path.
-    """
+    """Write a level map without loss to `path`; the same `level_map` gives the same bytes. Lengths in it are metres."""
     levels, grid = level_map.levels, level_map.grid
     header = {
         "format": FORMAT,

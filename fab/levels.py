@@ -35,6 +35,10 @@ class Levels:
         step_m: height of one step, metres; `count` steps are the height of one wave of the design, after which heights
             repeat.
         depths_m: how deep each mask etches, metres, mask 0 first; ``2**k * step_m`` where none are given.
+
+    Raises:
+        InputError: a count that is not a power of two from 2 to 64, a step that is not positive, or depths that are not
+            one per mask, not positive, or leave two levels at one height.
     """
 
     count: int
@@ -42,12 +46,7 @@ class Levels:
     depths_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the values, and fill in the depths.
-
-        Raises:
-            InputError: a count that is not a power of two from 2 to 64, a step that is not positive, or depths that
-                are not one per mask, not positive, or leave two levels at one height.
-        """
+        """Check the values, and fill in the depths."""
         if self.count not in (2, 4, 8, 16, 32, 64):
             raise InputError(
                 "levels", "must be a power of two from 2 to 64", self.count, "Choose 2, 4, 8, 16, 32 or 64."
@@ -65,15 +64,15 @@ class Levels:
         even = all(math.isclose(depth, due, rel_tol=_SAME) for depth, due in zip(depths, binary, strict=False))
         object.__setattr__(self, "depths_m", binary if even else depths)
         if not even:
-            self._refuse_twins()
+            self._require_different_heights()
 
-    def _refuse_twins(self) -> None:
+    def _require_different_heights(self) -> None:
         order, heights = self.by_height()
         twins = np.flatnonzero(np.diff(heights) < _APART * self.step_m)
         if twins.size:
             # The shallowest pair is made by the fewest masks.
             pair = slice(twins[-1], twins[-1] + 2)
-            lower, upper = (_told_masks(self.count - 1 - int(level)) for level in order[pair])
+            lower, upper = (_masks_in_words(self.count - 1 - int(level)) for level in order[pair])
             depth = format_length(float(f"{self.total_m - heights[pair][0]:.6g}"))
             got = f"{depth} deep both by {lower} and by {upper}"
             cure = "Change one of the depths; otherwise a level is made in two ways and another is missing."
@@ -99,9 +98,8 @@ class Levels:
         """Height of the blank glass above the deepest floor, metres."""
         return (self.count - 1) * self.step_m if self.is_binary else math.fsum(self.depths_m)
 
-    @property
-    def told(self) -> str:
-        """The staircase in words: "16 levels of 75 nm", or "4 levels by etches of 80 nm and 150 nm"."""
+    def __str__(self) -> str:
+        """Return "16 levels of 75 nm", or "4 levels by etches of 80 nm and 150 nm"."""
         if self.is_binary:
             return f"{self.count} levels of {format_length(self.step_m)}"
         *most, last = (format_length(depth) for depth in self.depths_m)
@@ -122,40 +120,19 @@ class Levels:
         return order, heights[order]
 
     def etch_depth_m(self, bit: int) -> float:
-        """Return how deep one mask etches.
-
-        Args:
-            bit: the mask, from 0 to ``bits - 1``.
-
-        Returns:
-            ``depths_m[bit]``, metres.
-
-        Raises:
-            ValueError: there is no such mask.
-        """
+        """Return how deep mask `bit` etches, ``depths_m[bit]``, metres; ValueError if there is no such mask."""
         if not 0 <= bit < self.bits:
             raise ValueError(f"`bit` must lie from 0 to {self.bits - 1}, but got {bit}")
         return self.depths_m[bit]
 
 
-def _told_masks(bits: int) -> str:
+def _masks_in_words(bits: int) -> str:
     masks = [str(bit) for bit in range(bits.bit_length()) if bits >> bit & 1]
     return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
 
 def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
-    """Check that an array is a level map of this staircase.
-
-    Args:
-        level_map: integers ``[y, x]`` from 0 to ``levels.count - 1``.
-        levels: the staircase.
-
-    Returns:
-        The same numbers as a C-ordered uint8 array.
-
-    Raises:
-        InputError: not two-dimensional, empty, not integers, or a level that the staircase lacks.
-    """
+    """Check that integers ``[y, x]`` are a level map of this staircase; return them as a C-ordered uint8 array."""
     cure = "Quantise the height map with these levels first."
     if level_map.ndim != 2 or level_map.size == 0 or level_map.dtype.kind not in "iu":
         got = f"{level_map.dtype} of shape {level_map.shape}"
@@ -169,16 +146,12 @@ def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np
 def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8]:
     """Give every pixel the nearest level; halfway goes up, and the top level catches the half step above it.
 
-    Args:
-        height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64.
-        levels: the staircase.
-
-    Returns:
-        Level numbers from 0 to ``levels.count - 1``, ``[y, x]``.
+    Heights ``[y, x]`` are metres above the deepest floor, float32 or float64. Levels ``[y, x]`` are 0 to ``levels.count
+    - 1``.
 
     Raises:
-        InputError: heights that are NaN, infinite, negative or more than half a step above the top level
-            (the message says how many and where the first is), or an array of another kind.
+        InputError: heights that are NaN, infinite, negative or more than half a step above the top level (the message
+            says how many and where the first is), or an array of another kind.
     """
     require_heights(height_m, "height map")
     top = (levels.count - 0.5) * levels.step_m if levels.is_binary else levels.total_m + 0.5 * levels.step_m
@@ -187,7 +160,7 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
         height_m,
         height_m > top + 1e-6 * levels.step_m,
         "height map",
-        f"no height may lie more than half a step above the top level ({format_length(top)} for {levels.told})",
+        f"no height may lie more than half a step above the top level ({format_length(top)} for {levels})",
         "Wrap the map to one wave of height, or choose more levels or a larger step.",
     )
     order, heights = levels.by_height()
@@ -206,9 +179,6 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
 def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Divide one wave of height among the levels, each of which gets what is nearest to it, waves taken off.
 
-    Args:
-        levels: the staircase.
-
     Returns:
         Edges in ascending order, metres, ``(count,)``, and the level below the first edge, between any two, and above
         the last one, ``(count + 1,)``. The first and the last are the same: the wave begins within that level's share.
@@ -224,16 +194,9 @@ def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8
 
 
 def quantise_wrapped(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8]:
-    """Give every pixel the nearest level if heights repeat after one wave of the design.
+    """Give every pixel ``[y, x]`` the nearest level if heights (metres) repeat after one wave of the design.
 
     The top of the wave is as near to the lowest level as its foot is.
-
-    Args:
-        height_m: heights, metres, ``[y, x]``.
-        levels: the staircase.
-
-    Returns:
-        Level numbers from 0 to ``levels.count - 1``, ``[y, x]``.
     """
     if levels.is_binary:
         return np.mod(np.rint(height_m / levels.step_m), levels.count).astype(np.uint8)
@@ -242,16 +205,5 @@ def quantise_wrapped(height_m: NDArray[np.floating], levels: Levels) -> NDArray[
 
 
 def height_of(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.float64]:
-    """Return the height of every pixel of a level map.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-
-    Returns:
-        Heights ``levels.heights_m()[level]`` in metres, ``[y, x]``.
-
-    Raises:
-        InputError: the array is not a level map of this staircase.
-    """
+    """Return the height of every pixel of a level map ``[y, x]``, ``levels.heights_m()[level]``, metres."""
     return levels.heights_m()[require_levels(level_map, levels)]

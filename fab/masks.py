@@ -12,18 +12,7 @@ from fab.levels import Levels, require_levels
 
 
 def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
-    """Split a level map into its etch masks.
-
-    Args:
-        level_map: level numbers ``[y, x]``.
-        levels: the staircase.
-
-    Returns:
-        ``[bit, y, x]``: 1 where mask `bit` is open (etched), 0 where resist stays.
-
-    Raises:
-        InputError: the array is not a level map of this staircase.
-    """
+    """Split a level map ``[y, x]`` into its etch masks ``[bit, y, x]``: 1 where mask `bit` is open (etched)."""
     etched = np.uint8(levels.count - 1) - require_levels(level_map, levels)
     out = np.empty((levels.bits, *etched.shape), dtype=np.uint8)
     for bit in range(levels.bits):
@@ -32,18 +21,7 @@ def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
 
 
 def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
-    """Join etch masks into the level map that they make.
-
-    Args:
-        bit_planes: ``[bit, y, x]`` of 0 and 1, one plane per mask, mask 0 first.
-        levels: the staircase.
-
-    Returns:
-        Level numbers ``[y, x]``.
-
-    Raises:
-        InputError: the number of planes is not that of the staircase, or a value is neither 0 nor 1.
-    """
+    """Join etch masks ``[bit, y, x]`` of 0 and 1, mask 0 first, into the level map ``[y, x]`` that they make."""
     if bit_planes.ndim != 3 or bit_planes.shape[0] != levels.bits:
         rule = f"{levels.count} levels need {levels.bits} planes [bit, y, x]"
         raise InputError("bit planes", rule, f"shape {bit_planes.shape}", "Give one plane per mask.")

@@ -113,7 +113,7 @@ def process_from(given: Process | str | None, levels: Levels) -> Process:
         process = given or Process(levels)
         if process.levels != levels:
             cure = "Give a process for this design."
-            raise InputError("process", f"must be for {levels.told}", process.levels.told, cure)
+            raise InputError("process", f"must be for {levels}", process.levels, cure)
         return process
     if given not in known:
         raise InputError("process", "must be a process or the name of one", repr(given), f"Name {' or '.join(known)}.")

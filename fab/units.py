@@ -54,33 +54,17 @@ def _parse(text: object, unit: str, example: str) -> float:
 
 
 def parse_length(text: str) -> float:
-    """Turn a length with its unit into metres.
-
-    Args:
-        text: for example ``"75 nm"``, ``"1.85um"``, ``"0.4 m"``.
-
-    Returns:
-        The length in metres.
+    """Return a length given as text with its unit (``"75 nm"``, ``"1.85um"``, ``"0.4 m"``) in metres.
 
     Raises:
-        ValueError: no unit, a unit that is not a length, or no finite number; the text says so and
-            gives an example, ready to stand behind a file and a key.
+        ValueError: no unit, a unit that is not a length, or no finite number; the text says so and gives an example,
+            ready to stand behind a file and a key.
     """
     return _parse(text, "m", "75 nm")
 
 
 def parse_angle(text: str) -> float:
-    """Turn an angle with its unit into radians.
-
-    Args:
-        text: for example ``"2 deg"``, ``"5 mrad"``, ``"0.1 rad"``.
-
-    Returns:
-        The angle in radians.
-
-    Raises:
-        ValueError: no unit, a unit that is not an angle, or no finite number.
-    """
+    """Return an angle given as text with its unit (``"2 deg"``, ``"5 mrad"``) in radians; see `parse_length`."""
     return _parse(text, "rad", "2 deg")
 
 
@@ -110,14 +94,9 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
 
 
 def format_length(length_m: float) -> str:
-    """Write a length in the largest unit of m, mm, um, nm that leaves at least one whole unit.
+    """Return a length of any sign in the largest unit of m, mm, um, nm that leaves at least one whole unit.
 
-    Args:
-        length_m: the length in metres; any sign.
-
-    Returns:
-        Text such as ``"75 nm"`` or ``"4.44 mm"``, ASCII only and exact to twelve digits, which
-        `parse_length` reads back.
+    The text (``"75 nm"``, ``"4.44 mm"``) is ASCII and exact to twelve digits, which `parse_length` reads back.
     """
     size = abs(length_m)
     for unit_m, name in _LENGTH_STEPS:

@@ -79,7 +79,7 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
         level_map = read_level_map(file)
         if level_map.levels != own:
             cure = "Restore the manifest of the run, or optimise again."
-            raise InputError(str(file), f"must be for {own.told}", level_map.levels.told, cure)
+            raise InputError(str(file), f"must be for {own}", level_map.levels, cure)
         return level_map
     levels = Levels(count, own.period_m / max(count, 1))
     # The design repeats with the full height, so the top half step rounds to the lowest level.
@@ -207,7 +207,7 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
         raise InputError(
             str(folder),
             f"the masks must be those of this run, {level_map}",
-            f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels.told}",
+            f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}",
             "Give the masks of this run (--masks).",
         )
     combined, moves = folder / manifest.combined_gds, manifest.edge_moves()

@@ -96,9 +96,6 @@ def write_gds(path: str | Path, layout: Layout) -> None:
     """Write a layout as GDSII; the memory needed does not grow with the file.
 
     Write it inside an `atomic_folder` where a half-written file would do harm.
-
-    Raises:
-        InputError: the system refuses the path or the disk is full.
     """
     try:
         with open(path, "wb", buffering=0) as stream:
@@ -116,11 +113,7 @@ def write_gds(path: str | Path, layout: Layout) -> None:
 
 
 def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> None:
-    """Write the content of a GDSII file of `write_gds` as compressed OASIS, with the names of `layers`.
-
-    Raises:
-        InputError: a file cannot be read or written.
-    """
+    """Write the content of a GDSII file of `write_gds` as compressed OASIS, with the names of `layers`."""
     import klayout.db as kdb
 
     layout = kdb.Layout()
@@ -142,9 +135,7 @@ def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> N
 def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:
     """Write the content of an OASIS file, which may be broken, as GDSII, through KLayout.
 
-    Raises:
-        InputError: KLayout refuses the file, or it holds more than `most` shapes; a broken count can stand for
-            billions.
+    It may hold at most `most` shapes, since a broken count can stand for billions.
     """
     import klayout.db as kdb
 

@@ -25,11 +25,7 @@ _LIMIT = 2**31 - 1
 
 
 def edge_moves(bias_m: Sequence[float], dbu_m: float) -> tuple[int, ...]:
-    """Return how far the edges of every mask must move outward to undo the bias of the process, database units.
-
-    Raises:
-        InputError: a bias (metres, outward) that is not finite.
-    """
+    """Return how far the edges of every mask must move outward to undo the bias of the process, database units."""
     if not np.all(np.isfinite(bias_m)):
         raise InputError("CD bias", "must be finite", list(bias_m), "Give one length per mask.")
     return tuple(-round(bias / dbu_m) for bias in bias_m)

@@ -21,15 +21,12 @@ def mask_layout(
         level_map: the DOE.
         cell: name of the cell.
         chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
-        edge_moves: per mask, how far every edge of an etched area is moved outward, database units; nowhere if left
-            out (`fab.layout.compensation`).
+        edge_moves: per mask, how far every edge of an etched area is moved outward, database units; nowhere if left out
+            (`fab.layout.compensation`).
         bits: which plane each mask draws, its own if left out (`fab.layout.split`).
 
     Returns:
         One layer per etch mask, mask 0 first, and the chrome last.
-
-    Raises:
-        InputError: a number is out of range, or the map has no aperture to draw chrome around.
     """
     levels, edges = level_map.levels, pixel_edges(level_map.grid)
     moves = edge_moves or (0,) * levels.bits

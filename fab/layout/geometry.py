@@ -152,12 +152,7 @@ class Layout:
 
 
 def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
-    """Sort cells so that each comes after those that it places.
-
-    Raises:
-        ValueError: a name is there twice, a placed cell is missing, cells place each other, or there is not
-            exactly one that no other places.
-    """
+    """Sort cells so that each comes after those that it places, the one top cell last; ValueError if they cannot be."""
     waiting = {}
     for cell in cells:
         if cell.name in waiting:
@@ -195,11 +190,7 @@ class Chrome:
     chord_error_m: float = 5e-9
 
     def radii_m(self, level_map: LevelMap) -> tuple[float, float]:
-        """Return the radius of the opening and the outer radius for one DOE, metres.
-
-        Raises:
-            InputError: nothing of the opening, or nothing of the chrome, would be left.
-        """
+        """Return the radius of the opening and the outer radius for one DOE, metres."""
         grid, aperture_m = level_map.grid, level_map.aperture_m
         inner = aperture_m / 2 - self.overlap_m
         outer = self.outer_m
@@ -262,11 +253,7 @@ def pixel_edges(grid: Grid) -> PixelEdges:
 
 
 def require_name(name: str) -> str:
-    """Check the name of a cell or of a mask file (without its suffix) and return it.
-
-    Raises:
-        InputError: characters other than A-Z, 0-9 and _, more than 32 of them, none, or "MAIN".
-    """
+    """Check the name of a cell or of a mask file (without its suffix) and return it."""
     if not _NAME.fullmatch(name) or name == "MAIN":
         rule = "must be 1 to 32 characters A-Z, 0-9 or _, and not MAIN"
         raise InputError("mask name", rule, repr(name), "Choose a plainer or shorter name.")
@@ -287,9 +274,6 @@ def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
     """Draw the chrome around the clear aperture as an annulus; a polygon means "chrome here".
 
     The polygons are sectors that share their radial edges, on a database unit of `dbu_m` (metres).
-
-    Raises:
-        InputError: the radii leave nothing, or do not fit 32-bit coordinates.
     """
     inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(level_map))
     if outer > _LIMIT:

@@ -71,10 +71,7 @@ _GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {
 def letter_boxes(text: str) -> NDArray[np.int32]:
     """Return the disjoint rectangles of a line of text that stands on y = 0 from x = 0.
 
-    They are ``(n, 4)``: x0, y0, x1, y1, in strokes.
-
-    Raises:
-        InputError: another character than A-Z, 0-9, ``. - _ / : +`` and spaces.
+    They are ``(n, 4)``: x0, y0, x1, y1, in strokes. The text may hold A-Z, 0-9, ``. - _ / : +`` and spaces.
     """
     odd = sorted(set(text) - set(_GLYPHS))
     if odd:
@@ -88,9 +85,6 @@ def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
     """Draw a line of text that stands on y = 0 from x = 0, with letters of a height in metres.
 
     A stroke is a seventh of the height, rounded to whole database units.
-
-    Raises:
-        InputError: a character that cannot be drawn (`letter_boxes`), or letters too small to be drawn.
     """
     stroke = round(height_m / HEIGHT / dbu_m)
     if stroke < 1:
@@ -113,17 +107,8 @@ def mask_label(job: str, plate: Photomask, reading: str, digest: str) -> list[st
 def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: float, dbu_m: float) -> Part:
     """Write the labels of several masks one below the other, so that no two meet on the wafer.
 
-    Args:
-        labels: photomasks and their lines, the first on top.
-        height_m: height of the letters, metres.
-        dbu_m: database unit, metres.
-
-    Returns:
-        The lettering on datatype 3 of each plate, its lower left corner at (0, 0). Places: "label, mask 3", the lower
-        left corner of each.
-
-    Raises:
-        InputError: a character that cannot be drawn, or letters that are too small.
+    Labels are photomasks and their lines, the first on top; letters are `height_m` (metres) high. The lettering is on
+    datatype 3 of each plate, its lower left corner at (0, 0). Places: "label, mask 3", the lower left corner of each.
     """
     stroke_m = height_m / HEIGHT
     blocks = []

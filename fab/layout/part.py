@@ -89,11 +89,7 @@ class Photomask:
 
 
 def photomasks_of(
-    levels: Levels,
-    order: Sequence[int],
-    tone: Tone,
-    chrome: Literal["liftoff", "etch", "none"],
-    zero_layer: bool,
+    levels: Levels, order: Sequence[int], tone: Tone, chrome: Literal["liftoff", "etch", "none"], zero_layer: bool
 ) -> tuple[Photomask, ...]:
     """List the photomasks of a job in the order in which they are used.
 
@@ -146,8 +142,7 @@ def turned(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 def block(layer: Layer, boxes_um: ArrayLike, dbu_m: float) -> Part:
     """Draw disjoint boxes ``(n, 4)`` (x0, y0, x1, y1 in micrometres) on one layer; the part has no places.
 
-    Raises:
-        ValueError: a corner that is no whole database unit.
+    A corner that is no whole database unit is a ValueError.
     """
     exact = np.asarray(boxes_um, dtype=np.float64).reshape(-1, 4) * (UM / dbu_m)
     whole = np.rint(exact)
@@ -171,11 +166,7 @@ def _shifted(part: Part, dx: int, dy: int) -> Part:
 
 
 def moved(part: Part, x_m: float, y_m: float) -> Part:
-    """Move a part and its places by metres, rounded to whole database units.
-
-    Raises:
-        ValueError: the result does not fit 32-bit coordinates.
-    """
+    """Move a part and its places by metres, rounded to whole database units."""
     return _shifted(part, round(x_m / part.dbu_m), round(y_m / part.dbu_m))
 
 
@@ -187,8 +178,7 @@ def prefixed(part: Part, prefix: str) -> Part:
 def joined(parts: Iterable[Part]) -> Part:
     """Put parts together as they lie; layers come in the order of their numbers and datatypes.
 
-    Raises:
-        ValueError: no part, different units, or a name of a place twice.
+    ValueError where there is no part, or different units, or a name of a place twice.
     """
     parts = list(parts)
     if len({part.dbu_m for part in parts}) != 1:

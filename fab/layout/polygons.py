@@ -74,9 +74,7 @@ def _sweep(bitmap, x_edges, y_edges, out):  # pragma: no cover - compiled
 
 
 def rectangles(
-    bitmap: NDArray[np.uint8],
-    x_edges: NDArray[np.int32] | None = None,
-    y_edges: NDArray[np.int32] | None = None,
+    bitmap: NDArray[np.uint8], x_edges: NDArray[np.int32] | None = None, y_edges: NDArray[np.int32] | None = None
 ) -> NDArray[np.int32]:
     """Cover the set pixels of a bitmap ``[y, x]`` with disjoint rectangles.
 

@@ -133,9 +133,6 @@ def grating_periods_m(levels: Levels, pitch_m: float, dbu_m: float, minimum_line
     """Return the periods of the binary and of the blazed grating as they are drawn, metres.
 
     They are four stripes and as many stripes as levels; a stripe is the fewest whole pixels that can be printed.
-
-    Raises:
-        InputError: a pitch below the database unit.
     """
     stripe_m = _stripe(pitch_m, dbu_m, minimum_line_m) * dbu_m
     return 4 * stripe_m, levels.count * stripe_m
@@ -194,9 +191,6 @@ def process_monitor(
         The structures, centred on the origin, about 4.5 mm x 5 mm for 16 levels. Places: those of `cd_bars`,
         `depth_pads` and `staircase`, and the middles of "grating binary", "grating blazed" and "grating blank" (an
         empty window in the same chrome frame, if there is chrome).
-
-    Raises:
-        InputError: a pitch below the database unit.
     """
     tested = sorted((plate for plate in plates if plate.makes != "zero layer"), key=lambda plate: plate.layer)
     cells = []

@@ -61,11 +61,7 @@ class Wafer:
             self.require_room(self.dies)
 
     def require_room(self, dies: tuple[int, int]) -> None:
-        """Check that splits leave a die as ordered on so many rows and columns of dies.
-
-        Raises:
-            InputError: they do not.
-        """
+        """Check that splits leave a die as ordered on so many rows and columns of dies."""
         rows, columns = dies
         split = len(self.line_splits_m) + self.order_control
         if split >= rows * columns:

@@ -88,7 +88,7 @@ class Order:
         """Draw heights, chrome and every etch mask (`fab.plots.masks.plot_masks`)."""
         from fab.plots.masks import plot_masks
 
-        title = f"{self.stem}: {self.level_map.levels.told}, level map {self.level_map.digest[:12]}"
+        title = f"{self.stem}: {self.level_map.levels}, level map {self.level_map.digest[:12]}"
         return plot_masks(self.level_map, self.chrome.radii_m(self.level_map), title, ax)
 
     def plate_stem(self, plate: Photomask) -> str:
@@ -119,11 +119,7 @@ def plan_order(
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
 ) -> Order:
-    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`.
-
-    Raises:
-        InputError: the process cannot print the map and `on_violation` is "fail", or an argument is out of range.
-    """
+    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`."""
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
     for headline in report.headlines():
@@ -148,9 +144,6 @@ def order_id(name: str, digest: str) -> str:
 
     It is the name in capitals, with _ for everything that is not a letter or digit; if that is longer than 13
     characters, its first 8 and 4 of `digest`, that of the level map, which keeps shortened names apart.
-
-    Raises:
-        InputError: nothing of the name is left.
     """
     plain = re.sub(r"[^A-Z0-9]+", "_", name.upper()).strip("_")
     if not plain:

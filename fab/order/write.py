@@ -31,25 +31,11 @@ from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_fil
 from fab.gds.writer import write_gds, write_oasis
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
-from fab.layout.geometry import (
-    Cell,
-    Chrome,
-    Layer,
-    Layout,
-    Shapes,
-    pixel_edges,
-)
+from fab.layout.geometry import Cell, Chrome, Layer, Layout, Shapes, pixel_edges
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry
-from fab.manifest.records import (
-    CONVENTIONS,
-    FORMAT,
-    CellEntry,
-    FileEntry,
-    Manifest,
-    read_manifest,
-)
+from fab.manifest.records import CONVENTIONS, FORMAT, CellEntry, FileEntry, Manifest, read_manifest
 from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entry, wafer_entry
 from fab.order.order import OnViolation, Order, plan_order
 from fab.process import Process
@@ -132,12 +118,7 @@ def _drawn_does(order: Order) -> Layout:
 
 
 def _write_masks(
-    folder: Path,
-    order: Order,
-    layout: Layout,
-    doe_layers: list[Layer],
-    gds: str,
-    oasis: str,
+    folder: Path, order: Order, layout: Layout, doe_layers: list[Layer], gds: str, oasis: str
 ) -> list[FileContent]:
     """Write the review files and one file per mask."""
     log.info("writing GDSII")

@@ -330,11 +330,7 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
 
 
 def rules_from(process: Process | Rules | str, levels: Levels) -> Rules:
-    """Return the rules of a process or of a stock process by its name; rules are returned as they are.
-
-    Raises:
-        InputError: a process of another staircase, or one of an unknown name.
-    """
+    """Return the rules of a process or of a stock process by its name; rules are returned as they are."""
     return process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
 
 

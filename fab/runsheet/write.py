@@ -312,9 +312,6 @@ def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None)
     """Write the run sheet as a page and as JSON; return the names "<stem>_RUNSHEET.html" and "<stem>_RUNSHEET.json".
 
     `picture` is a PNG of the PSFs that the finished DOE should show, if there is one.
-
-    Raises:
-        InputError: the system refuses the folder.
     """
     names = tuple(f"{sheet.stem}_RUNSHEET.{suffix}" for suffix in ("html", "json"))
     content = record(sheet)

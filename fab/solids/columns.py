@@ -31,11 +31,7 @@ class PixelWindow:
     columns: int
 
     def require(self, grid: Grid) -> None:
-        """Check that the window lies on a grid.
-
-        Raises:
-            InputError: it is empty or reaches beyond the grid.
-        """
+        """Check that the window is filled and lies on a grid."""
         ny, nx = grid.shape
         inside = 0 <= self.row < self.row + self.rows <= ny and 0 <= self.column < self.column + self.columns <= nx
         if not inside:
@@ -125,11 +121,7 @@ def _heights_m(levels: Levels) -> NDArray[np.float64]:
 
 
 def window_cells(level_map: LevelMap, window: PixelWindow) -> Columns:
-    """Take a window of a map at full resolution: one column per pixel, where the window lies on the DOE.
-
-    Raises:
-        InputError: the window leaves the map or holds more than 4 million pixels.
-    """
+    """Take a window of at most 4 million pixels at full resolution: one column per pixel, where it lies on the DOE."""
     window.require(level_map.grid)
     if window.rows * window.columns > _MOST_CELLS:
         rule = f"a mesh may have at most {_MOST_CELLS} columns"
@@ -145,9 +137,6 @@ def reduced_cells(level_map: LevelMap, most: int = 1000) -> Columns:
     The block is the smallest that leaves at most `most` columns (1 to 2000) along the longer side. Blocks at the high
     end of an axis are cut where the map ends. A mean across a jump of one wave stands between its two sides: a reduced
     map is for looking at and for weighing, not for optics.
-
-    Raises:
-        InputError: `most` is out of range.
     """
     grid = level_map.grid
     if not 1 <= most <= math.isqrt(_MOST_CELLS):

@@ -70,12 +70,9 @@ def _exact_scale(levels: Levels) -> tuple[NDArray[np.int64], float]:
 def write_tiff(path: str | Path, level_map: LevelMap) -> float:
     """Write the heights as a 16-bit grey TIFF, first row at the highest y; return the metres per count.
 
-    Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded
-    to the nearest of 65535 counts. Count times metres per count is the height above the deepest floor. The description
-    in the file says metres per count, rounding, pitch and orientation; the resolution tags hold the pitch too.
-
-    Raises:
-        InputError: the file cannot be written.
+    Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded to the
+    nearest of 65535 counts. Count times metres per count is the height above the deepest floor. The description in the
+    file says metres per count, rounding, pitch and orientation; the resolution tags hold the pitch too.
     """
     counts, scale_m = _exact_scale(level_map.levels)
     about = _description(level_map, scale_m, counts)
@@ -84,25 +81,18 @@ def write_tiff(path: str | Path, level_map: LevelMap) -> float:
 
 
 def write_npy(path: str | Path, level_map: LevelMap) -> None:
-    """Write the heights as a bare array: float64 metres above the deepest floor, ``[y, x]``, row 0 at the lowest y.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the heights as a bare array: float64 metres, ``[y, x]``, row 0 at the lowest y."""
     stream = io.BytesIO()
     np.save(stream, level_map.levels.heights_m()[level_map.level], allow_pickle=False)
     write_atomic(path, stream.getvalue())
 
 
 def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
-    """Write the picture that greyscale and two-photon writers expose: PNG, white highest; return the metres per count.
+    """Write a grey PNG for greyscale and two-photon writers, white highest; return the metres per count.
 
     Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is linear in height,
     rounded to the nearest count, and exact for 2, 4 and 16 even levels. The first row is at the highest y. The text
     chunk "Description" says metres per count, rounding, pitch and orientation.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     counts, scale_m = _full_scale(level_map.levels, 2**bits - 1)
     pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level]
@@ -115,22 +105,13 @@ def write_zemax_sag(
 ) -> None:
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
-    The blank surface is the vertex plane, sag 0, as outside the grid. Light runs toward +z. If the relief is
-    on the exit side (glass before the surface), etched glass is missing toward -z and the sag is minus the
-    etch depth. On the entry side (glass after the surface) it is plus the etch depth. x and y are those
-    of the map in both cases; a plate that is turned over must be mirrored in the optics program.
+    The blank surface is the vertex plane, sag 0, as outside the grid. Light runs toward +z. If the relief is on the
+    exit side (glass before the surface), etched glass is missing toward -z and the sag is minus the etch depth. On the
+    entry side (glass after the surface) it is plus the etch depth. x and y are those of the map in both cases; a plate
+    that is turned over must be mirrored in the optics program.
 
-    Sags are written to a picometre, 22 bytes a point: a 4400 x 4400 map makes 426 MB, so choose a window.
-
-    Args:
-        path: the file.
-        level_map: the DOE.
-        window: the pixels to write; all of them if left out. The decentre in the header puts them where they are.
-        side: on which side of the glass the relief is.
-
-    Raises:
-        InputError: fewer than 5 points along an axis, a window off the map, a suffix that OpticStudio does not read, or
-            a file that cannot be written.
+    Sags are written to a picometre, 22 bytes a point: a 4400 x 4400 map makes 426 MB, so choose a window of pixels (at
+    least 5 either way); the decentre in the header puts them where they are.
     """
     if Path(path).suffix.upper() != ".DAT":
         raise InputError(str(path), "OpticStudio reads grid sags from .DAT files", Path(path).suffix, "Use .DAT.")

@@ -104,11 +104,7 @@ def _rows_of_xml(values: NDArray[np.int64], decimals: int, words: tuple[bytes, .
 
 
 def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
-    """Write a mesh as 3MF, which states its unit (``"mm"`` or ``"um"``); numbers are rounded to a picometre.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a mesh as 3MF, which states its unit (``"mm"`` or ``"um"``); numbers are rounded to a picometre."""
     decimals = {"mm": 9, "um": 6}[unit]
     picometres = np.rint(mesh.vertices_m * 1e12).astype(np.int64)
     vertices = _rows_of_xml(picometres, decimals, (b'<vertex x="', b'" y="', b'" z="', b'"/>\n'))
@@ -140,9 +136,6 @@ def write_glb(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh as binary glTF for viewers: metres, as the format demands, float32.
 
     A viewer's up is +y, so the one node turns z up; what was +y points away from the viewer.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     positions = mesh.vertices_m.astype(np.float32)
     indices = mesh.triangles.astype(np.uint32)
@@ -185,9 +178,6 @@ def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
     """Write a mesh as binary STL, float32, in ``"mm"`` or ``"um"``.
 
     The format knows no unit, so the header says it in words; let the name of the file say it too.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets = np.zeros(len(mesh.triangles), dtype=kind)
@@ -230,15 +220,11 @@ def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
     """Read a mesh file with a parser that had no part in writing it: trimesh, and for 3MF Python's own for XML.
 
     Args:
-        path: a ``.3mf``, ``.glb`` or ``.stl`` file.
+        path: a ``.3mf``, ``.glb`` or ``.stl`` file that holds one mesh.
         unit: what the numbers of an STL file mean; the other kinds say it themselves.
 
     Returns:
         The triangles in metres, z up (the axes of a glTF file are turned back).
-
-    Raises:
-        InputError: the file is missing, damaged, of another kind, or holds no mesh or several; or the unit of an STL
-            file is not given.
     """
     path = Path(path)
     kind = path.suffix.lower()

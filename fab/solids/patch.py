@@ -43,11 +43,7 @@ class Patch:
     step: bool = True
 
     def window(self, grid: Grid) -> PixelWindow:
-        """Return the pixels nearest to the patch.
-
-        Raises:
-            InputError: there is none, or the patch reaches beyond the map.
-        """
+        """Return the pixels nearest to the patch, which must lie on the map."""
         (ny, nx), pitch_m = grid.shape, grid.pitch_m
         count = round(self.width_m / pitch_m) if abs(self.width_m) < math.inf else 0
         half_y_m, half_x_m = (extent / 2 * (1 + 1e-9) for extent in grid.extent_m)
@@ -63,11 +59,7 @@ class Patch:
         return window
 
     def require(self, level_map: LevelMap) -> None:
-        """Check that the files of the patch stay small enough to be opened.
-
-        Raises:
-            InputError: it is too large for a mesh, or has too many boxes for STEP, or reaches beyond the map.
-        """
+        """Check that a mesh, and if wanted a STEP file, of the patch stay small enough to be opened."""
         window = self.window(level_map.grid)
         if window.rows > _MOST_PIXELS:
             rule = f"a mesh at full resolution may have at most {_MOST_PIXELS} x {_MOST_PIXELS} pixels"
@@ -111,17 +103,10 @@ def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M
 def patch_step(
     path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
 ) -> None:
-    """Write a window of a map as STEP. The part is named PATCH and lies where the window does.
+    """Write a window of a map as STEP, in boxes on `base_m` (metres) of glass below the deepest floor.
 
-    Args:
-        path: the file.
-        level_map: the DOE.
-        window: the pixels to write.
-        base_m: glass below the deepest floor, metres.
-        most_boxes: most boxes allowed, up to 20000, which make a file of about 140 MB.
-
-    Raises:
-        InputError: too many boxes, a window off the map, or a file that cannot be written.
+    The part is named PATCH and lies where the window does. `most_boxes` may be up to 20000, which make a file of about
+    140 MB.
     """
     window.require(level_map.grid)
     if not 0 < base_m < math.inf:

@@ -212,11 +212,7 @@ def _recount() -> Callable[[re.Match[bytes]], bytes]:
 
 
 def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
-    """Write named parts, shapes of the kernel, as one STEP assembly whose bytes depend on them alone.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write named parts, shapes of the kernel, as one STEP assembly whose bytes depend on them alone."""
     from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
     from OCP.Interface import Interface_Static
     from OCP.STEPCAFControl import STEPCAFControl_Writer

@@ -224,17 +224,11 @@ def substrate_step(
 
     Without rings the surface is flat, with the clear aperture (its diameter in metres) as a face of its own. The chrome
     lies flat at z = 0, also where it reaches over etched rings.
-
-    Raises:
-        InputError: something does not fit, or the file cannot be written.
     """
     _require_fit(substrate, aperture_m, chrome, rings)
     profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (aperture_m / 2, 0.0)]
     surface = outline(substrate.width_m, None if substrate.outline == "die" else substrate.flat_m)
-    parts = {
-        "SUBSTRATE": plate(surface, substrate.thickness_m, profile),
-        "DATUM_CLEAR_APERTURE": disc(aperture_m / 2),
-    }
+    parts = {"SUBSTRATE": plate(surface, substrate.thickness_m, profile), "DATUM_CLEAR_APERTURE": disc(aperture_m / 2)}
     if chrome is not None:
         parts["CHROME"] = chrome.solid()
     write_step(path, "DOE", parts)
@@ -252,15 +246,7 @@ def wafer_step(
 ) -> None:
     """Write a wafer as STEP before it is diced: flat glass, and chrome and clear aperture of every die.
 
-    Args:
-        path: the file.
-        wafer: the glass.
-        aperture_m: diameter of the clear apertures, metres.
-        chrome: the chrome of one die.
-        places_m: middles of the dies x, y, metres.
-
-    Raises:
-        InputError: a die does not fit, or the file cannot be written.
+    `aperture_m` is the diameter of the clear apertures, `places_m` the middles of the dies x, y, metres.
     """
     for x, y in places_m:
         if not wafer.holds(x, y, chrome.outer_m):

@@ -112,12 +112,7 @@ def _boxes(cell: Cell, done: Mapping[str, dict[Layer, Box]]) -> dict[Layer, Box]
 
 def _placed(box: Box, at: Reference) -> Box:
     far_x, far_y = at.x + (at.columns - 1) * at.step_x, at.y + (at.rows - 1) * at.step_y
-    return (
-        box[0] + min(at.x, far_x),
-        box[1] + min(at.y, far_y),
-        box[2] + max(at.x, far_x),
-        box[3] + max(at.y, far_y),
-    )
+    return (box[0] + min(at.x, far_x), box[1] + min(at.y, far_y), box[2] + max(at.x, far_x), box[3] + max(at.y, far_y))
 
 
 def _place_problems(layout: Layout, blank_m: float) -> list[str]:

@@ -81,11 +81,7 @@ class VerificationReport:
         return html_of(f"{sum(check.passed for check in self.checks)} of {len(self.checks)} checks passed", rows)
 
     def require(self) -> None:
-        """Raise if anything differs.
-
-        Raises:
-            CheckFailed: with the differences.
-        """
+        """Raise `CheckFailed` with the differences, if there are any."""
         if not self.passed:
             raise CheckFailed(self.differences)
 

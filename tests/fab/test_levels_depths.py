@@ -49,8 +49,8 @@ def test_the_height_of_a_level_is_what_the_closed_masks_leave():
     assert SWAPPED.by_height()[0].tolist() == [0, 2, 1, 3]
     assert (UNEVEN.total_m, UNEVEN.period_m) == (250 * NM + 600 * NM, 4 * STEP_M)
     assert [UNEVEN.etch_depth_m(bit) for bit in range(2)] == [250 * NM, 600 * NM]
-    assert UNEVEN.told == "4 levels by etches of 250 nm and 600 nm"
-    assert Levels(2, STEP_M, (250 * NM,)).told == "2 levels by an etch of 250 nm"
+    assert str(UNEVEN) == "4 levels by etches of 250 nm and 600 nm"
+    assert str(Levels(2, STEP_M, (250 * NM,))) == "2 levels by an etch of 250 nm"
 
 
 @pytest.mark.parametrize("count", [2, 4, 8, 16, 32, 64])
