@@ -18,25 +18,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import explain_os_error
-from fab.gds.writer import (
-    AREF,
-    BGNLIB,
-    BGNSTR,
-    BOUNDARY,
-    COLROW,
-    DATATYPE,
-    ENDEL,
-    ENDLIB,
-    ENDSTR,
-    HEADER,
-    LAYER,
-    LIBNAME,
-    SNAME,
-    SREF,
-    STRNAME,
-    UNITS,
-    XY,
-)
+from fab.gds import writer as gds
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order
 from fab.units import UM
 
@@ -47,9 +29,9 @@ _LONGEST = 1 << 17
 _SHORTEST = 4 + 6 + 6 + 4 + 4 * 8 + 4
 _SPOILED = "Write the order again, or fetch the file again."
 # The words that mark an element: length of the record, then its type.
-_BOUNDARY, _LAYER = 4 << 16 | BOUNDARY, 6 << 16 | LAYER
-_ENDEL, _ENDSTR = 4 << 16 | ENDEL, 4 << 16 | ENDSTR
-_SREF, _AREF = 4 << 16 | SREF, 4 << 16 | AREF
+_BOUNDARY, _LAYER = 4 << 16 | gds.BOUNDARY, 6 << 16 | gds.LAYER
+_ENDEL, _ENDSTR = 4 << 16 | gds.ENDEL, 4 << 16 | gds.ENDSTR
+_SREF, _AREF = 4 << 16 | gds.SREF, 4 << 16 | gds.AREF
 # Records that people know by name and no mask holds.
 _FOREIGN: dict[int | None, str] = {
     0x0900: "a path",
@@ -85,10 +67,10 @@ def _walk(words, rects, rect_keys, points, ends, keys):  # pragma: no cover - co
             return p, count, polygons, _UNEXPECTED
         if p + 5 > stop:
             break
-        if words[p + 1] != _LAYER or words[p + 2] & 0xFFFF != 6 or words[p + 3] >> 16 != DATATYPE:
+        if words[p + 1] != _LAYER or words[p + 2] & 0xFFFF != 6 or words[p + 3] >> 16 != gds.DATATYPE:
             return p + 1, count, polygons, _UNEXPECTED
         length = (words[p + 4] >> 16) & 0xFFFF
-        if words[p + 4] & 0xFFFF != XY or length < 36 or length % 8 != 4:
+        if words[p + 4] & 0xFFFF != gds.XY or length < 36 or length % 8 != 4:
             return p + 4, count, polygons, _UNEXPECTED
         q = p + 5
         end = q + length // 4 - 1
@@ -215,9 +197,9 @@ def _name(data: bytes) -> str:
 
 def _read_unit(stream: _Stream) -> float:
     """Read the opening of the file; return the database unit in metres."""
-    for kind in (HEADER, BGNLIB, LIBNAME):
+    for kind in (gds.HEADER, gds.BGNLIB, gds.LIBNAME):
         stream.record(_WHOLE, kind)
-    units = stream.record(_WHOLE, UNITS)[1]
+    units = stream.record(_WHOLE, gds.UNITS)[1]
     dbu_m = _from_real(units[8:16])
     if len(units) != 16 or not 1e-12 <= dbu_m <= 1e-3 or abs(_from_real(units[:8]) * UM / dbu_m - 1) > 1e-9:
         rule = "the user unit must be 1 um and the database unit must lie from 1 pm to 1 mm"
@@ -227,14 +209,14 @@ def _read_unit(stream: _Stream) -> float:
 
 def _read_reference(stream: _Stream) -> Reference:
     rule = "a reference must be upright and whole"
-    kind, _ = stream.record(rule, SREF, AREF)
-    name = _name(stream.record(rule, SNAME)[1])
+    kind, _ = stream.record(rule, gds.SREF, gds.AREF)
+    name = _name(stream.record(rule, gds.SNAME)[1])
     at = stream.offset
-    counts = stream.record(rule, COLROW)[1] if kind == AREF else struct.pack(">2h", 1, 1)
-    points = stream.record(rule, XY)[1]
-    if len(counts) != 4 or len(points) != (24 if kind == AREF else 8):
+    counts = stream.record(rule, gds.COLROW)[1] if kind == gds.AREF else struct.pack(">2h", 1, 1)
+    points = stream.record(rule, gds.XY)[1]
+    if len(counts) != 4 or len(points) != (24 if kind == gds.AREF else 8):
         _refuse(stream.path, rule, at)
-    stream.record(rule, ENDEL)
+    stream.record(rule, gds.ENDEL)
     columns, rows = struct.unpack(">2h", counts)
     if columns < 1 or rows < 1:
         _refuse(stream.path, rule, at)
@@ -249,7 +231,7 @@ def _read_reference(stream: _Stream) -> Reference:
 
 def _read_cell(stream: _Stream, found: _Found) -> Cell:
     """Read a cell from its name to its end."""
-    name = _name(stream.record(_WHOLE, STRNAME)[1])
+    name = _name(stream.record(_WHOLE, gds.STRNAME)[1])
     references = []
     while True:
         read, why = found.take(stream.buffer, stream.kept)
@@ -283,7 +265,7 @@ def read_gds(path: str | Path) -> Layout:
         with open(path, "rb", buffering=0) as file:
             stream, found, cells = _Stream(path, file), _Found(), []
             dbu_m = _read_unit(stream)
-            while stream.record(_WHOLE, BGNSTR, ENDLIB)[0] == BGNSTR:
+            while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
                 cells.append(_read_cell(stream, found))
             # Zeros may follow, since some programs fill the last block of a tape.
             while stream.kept or stream.fill():

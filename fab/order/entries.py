@@ -9,7 +9,6 @@ from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
 from fab.layout.split import Split
 from fab.layout.wafer import READING
-from fab.levels import Levels
 from fab.manifest.cells import geometry, shapes_digest
 from fab.manifest.records import (
     CONVENTIONS,
@@ -97,20 +96,27 @@ def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
     )
 
 
-def split_entry(split: Split, cell: Cell, die: int, levels: Levels, dbu_m: float) -> SplitEntry:
-    """Return the manifest's entry of a die that draws the DOE differently; `cell` is that of its DOE."""
-    layers = [
+def split_entries(order: Order, drawn: Layout, frame: Frame) -> list[SplitEntry]:
+    """Return the manifest's entries of the dies that draw the DOE differently, as the cells of `drawn` do."""
+    return [
+        SplitEntry(cell.name, split.words, frame.splits.index(number) + 1, _drawn_entries(order, split, cell))
+        for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
+        if number
+    ]
+
+
+def _drawn_entries(order: Order, split: Split, cell: Cell) -> list[DrawnEntry]:
+    layers = [etch_layer(mask, order.level_map.levels) for mask in range(order.process.masks)]
+    return [
         DrawnEntry(
             layer=layer.number,
             datatype=layer.datatype,
             bit=bit,
-            edge_move_nm=round(move * dbu_m / NM, 9),
-            **geometry(cell.shapes[layer], dbu_m),  # type: ignore[arg-type]
+            edge_move_nm=round(move * order.dbu_m / NM, 9),
+            **geometry(cell.shapes[layer], order.dbu_m),  # type: ignore[arg-type]
         )
-        for mask, (bit, move) in enumerate(zip(split.bits, split.moves, strict=True))
-        for layer in [etch_layer(mask, levels)]
+        for layer, bit, move in zip(layers, split.bits, split.moves, strict=True)
     ]
-    return SplitEntry(cell.name, split.words, die, layers)
 
 
 def describe_edges(edges: PixelEdges) -> str:

@@ -20,14 +20,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.figure import html_of, save
-from fab.files import MANIFEST_NAME, atomic_folder, explain_os_error, sha256_file
+from fab.files import MANIFEST_NAME, atomic_folder, sha256_file
 from fab.gds.writer import write_gds, write_oasis
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
@@ -36,7 +35,7 @@ from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import CONVENTIONS, FORMAT, CellEntry, FileEntry, Manifest, read_manifest
-from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entry, wafer_entry
+from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entries, wafer_entry
 from fab.order.order import OnViolation, Order, plan_order
 from fab.process import Process
 from fab.solids.model import DoeModel
@@ -56,16 +55,6 @@ _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
-class FileContent(NamedTuple):
-    """Format of a file, for the manifest; of a mask file also top cell, DOE layers and other cells."""
-
-    file: str
-    format: str
-    cell: str | None = None
-    layers: Sequence[Layer] = ()
-    cells: Sequence[CellEntry] = ()
-
-
 def _merged(parts: list[Shapes]) -> Shapes:
     if len(parts) == 1:
         return parts[0]
@@ -81,13 +70,6 @@ def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
         name = top if cell is layout.top else cell.name
         cells.append(Cell(name, {layer: _merged(parts)} if parts else {}, cell.references))
     return Layout(layout.dbu_m, tuple(cells))
-
-
-def _write_map(path: Path, level: NDArray[np.uint8]) -> None:
-    try:
-        np.save(path, level, allow_pickle=False)
-    except OSError as error:
-        raise explain_os_error(error, path) from error
 
 
 def _frame(order: Order, dbu_m: float) -> Frame:
@@ -117,35 +99,32 @@ def _drawn_does(order: Order) -> Layout:
     return Layout(drawn[0].dbu_m, tuple(one.top for one in drawn))
 
 
+def _file_entry(
+    path: Path, kind: str = "", cell: str | None = None, layers: Sequence[Layer] = (), cells: Sequence[CellEntry] = ()
+) -> FileEntry:
+    """Return the manifest's entry of a file; that of a mask file has a top cell, DOE layers and other cells, too."""
+    named = [str(layer) for layer in layers]
+    size, digest = path.stat().st_size, sha256_file(path)
+    return FileEntry(path.name, kind or path.suffix[1:].upper(), size, digest, cell, named, list(cells))
+
+
 def _write_masks(
     folder: Path, order: Order, layout: Layout, doe_layers: list[Layer], gds: str, oasis: str
-) -> list[FileContent]:
+) -> list[FileEntry]:
     """Write the review files and one file per mask."""
     log.info("writing GDSII")
     write_gds(folder / gds, layout)
-    contents = [FileContent(gds, "GDSII", layout.top.name, doe_layers, _around(order, layout))]
+    review = (layout.top.name, doe_layers, _around(order, layout))
+    entries = [_file_entry(folder / gds, "GDSII", *review)]
     for plate in order.plates:
         name, layer = order.plate_stem(plate), Layer(plate.layer)
         one = mask_file(layout, layer, name)
         write_gds(folder / f"{name}.gds", one)
         on = [layer] if layer in doe_layers else []
-        contents.append(FileContent(f"{name}.gds", "GDSII", name, on, _around(order, one)))
+        entries.append(_file_entry(folder / f"{name}.gds", "GDSII", name, on, _around(order, one)))
     log.info("writing OASIS")
     write_oasis(folder / oasis, folder / gds, layout.layers)
-    return [*contents, FileContent(oasis, "OASIS", layout.top.name, doe_layers, contents[0].cells)]
-
-
-def _file_entry(folder: Path, content: FileContent) -> FileEntry:
-    path = folder / content.file
-    return FileEntry(
-        file=content.file,
-        format=content.format,
-        bytes=path.stat().st_size,
-        sha256=sha256_file(path),
-        cell=content.cell,
-        layers=[str(layer) for layer in content.layers],
-        cells=list(content.cells),
-    )
+    return [*entries, _file_entry(folder / oasis, "OASIS", *review)]
 
 
 def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
@@ -154,25 +133,18 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     levels, grid = level_map.levels, level_map.grid
     log.info("drawing the masks")
     drawn = _drawn_does(order)
-    frame = _frame(order, drawn.dbu_m)
-    splits = [
-        split_entry(split, cell, frame.splits.index(number) + 1, levels, drawn.dbu_m)
-        for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
-        if number
-    ]
-    layout = Layout(drawn.dbu_m, (*drawn.cells, *frame.cells))
+    frame, dbu_m = _frame(order, drawn.dbu_m), drawn.dbu_m
+    splits = split_entries(order, drawn, frame)
+    layout = Layout(dbu_m, (*drawn.cells, *frame.cells))
     doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
-    del drawn
     masks = [mask_entry(order, layout, bit, plane) for bit, plane in enumerate(level_map.planes())]
     chrome = chrome_entry(order, layout)
-    gds, oasis, levels_file, preview = (
-        f"{order.stem}_{end}" for end in ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
-    )
-    contents = _write_masks(folder, order, layout, doe_layers, gds, oasis)
-    dbu_m = layout.dbu_m
-    del layout
+    endings = ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
+    gds, oasis, levels_file, preview = (f"{order.stem}_{end}" for end in endings)
+    files = _write_masks(folder, order, layout, doe_layers, gds, oasis)
+    del drawn, layout
     log.info("drawing the preview")
-    _write_map(folder / levels_file, level_map.level)
+    np.save(folder / levels_file, level_map.level, allow_pickle=False)
     save(order.plot(), folder / preview)
     log.info("drawing the solids")
     model = DoeModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
@@ -181,8 +153,7 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
         solids = pool.submit(write_models, folder, order.stem, model)
         added = add(folder, order, frame)
         models = solids.result()
-    others = [*(model.file for model in models), *added, levels_file, preview]
-    contents += [FileContent(name, Path(name).suffix[1:].upper()) for name in others]
+    files += [_file_entry(folder / name) for name in (*(m.file for m in models), *added, levels_file, preview)]
     return Manifest(
         format=FORMAT,
         name=level_map.name,
@@ -208,13 +179,13 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
         splits=splits,
         chrome=chrome,
         models=models,
-        files=[_file_entry(folder, content) for content in contents],
+        files=files,
         tools={"python": platform.python_version(), **{tool: version(tool) for tool in _TOOLS}},
     )
 
 
 def _require_own(folder: Path) -> None:
-    """Refuse to replace anything but an earlier mask order and the files it lists."""
+    """Check that nothing but an earlier mask order and the files it lists is replaced."""
     if not (folder / MANIFEST_NAME).exists():
         return
     listed = {MANIFEST_NAME, *(entry.file for entry in read_manifest(folder).files)}
