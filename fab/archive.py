@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, write_atomic
+from fab.files import canonical_json, os_errors_explained, write_atomic
 
 _HEADER, _DIGEST = "header", "sha256"
 
 
 def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a header for JSON and named arrays; the folder of the file is made if missing."""
-    told = canonical_json({**header, _DIGEST: _digest(header, arrays)})
-    named: dict[str, Any] = {_HEADER: np.frombuffer(told, np.uint8), **arrays}
+    text = canonical_json({**header, _DIGEST: _digest(header, arrays)})
+    named: dict[str, Any] = {_HEADER: np.frombuffer(text, np.uint8), **arrays}
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **named)
     write_atomic(path, stream.getvalue())
@@ -43,13 +43,11 @@ def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict
         InputError: the file is missing, cut off, another archive, or changed since it was written.
     """
     rule = f"must be a whole {what}"
-    try:
+    with os_errors_explained(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # What is compressed is none of ours, and could unfold to more than memory holds.
+            # A compressed member was not written here, and could unfold to more than memory holds.
             members = [member for member in archive.infolist() if member.compress_type == zipfile.ZIP_STORED]
             raw = {member.filename.removesuffix(".npy"): archive.read(member) for member in members}
         arrays = {name: np.lib.format.read_array(io.BytesIO(each), allow_pickle=False) for name, each in raw.items()}

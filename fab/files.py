@@ -2,7 +2,7 @@
 
 A result is first written under a temporary name beside its final place, forced to the disk and then renamed.
 Whatever happens in between (an exception, a full disk, a kill), the final path holds the old content or the
-new one and never a half. What the operating system refuses is told as an `InputError` that names the path.
+new one and never a half. What the operating system refuses is an `InputError` that names the path.
 """
 
 import errno
@@ -44,8 +44,18 @@ def explain_os_error(error: OSError, path: str | Path) -> InputError:
     return InputError(str(path), rule, f'"{error.strerror or error}"', cure)
 
 
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
+@contextmanager
+def os_errors_explained(path: str | Path) -> Iterator[None]:
+    """Turn every operating-system error within this block into an `InputError` that names the path."""
+    try:
+        yield
+    except OSError as error:
+        raise explain_os_error(error, path) from error
+
+
+def _sync(path: Path) -> None:
+    """Force a file or the list of a folder to the disk."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -55,22 +65,19 @@ def _sync_folder(folder: Path) -> None:
 def write_atomic(path: str | Path, data: bytes) -> None:
     """Write a whole file: temporary sibling, fsync, rename; its folder is made if missing."""
     path = Path(path)
-    temporary: Path | None = None
-    try:
+    with os_errors_explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         temporary = Path(name)
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    finally:
-        if temporary is not None:
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+            _sync(path.parent)
+        finally:
             temporary.unlink(missing_ok=True)
 
 
@@ -95,17 +102,6 @@ def _require_replaceable(path: Path) -> None:
         )
 
 
-def _sync_tree(folder: Path) -> None:
-    for root, _, names in os.walk(folder):
-        for name in names:
-            handle = os.open(Path(root) / name, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
-        _sync_folder(Path(root))
-
-
 def _swap(fresh: Path, path: Path) -> None:
     """Put `fresh` at `path`; an earlier result moves aside first and comes back if the rename fails."""
     aside = None
@@ -121,7 +117,7 @@ def _swap(fresh: Path, path: Path) -> None:
         raise
     if aside is not None:
         shutil.rmtree(aside, ignore_errors=True)
-    _sync_folder(path.parent)
+    _sync(path.parent)
 
 
 @contextmanager
@@ -137,23 +133,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_symlink():
         path = path.resolve()  # the link stays, and what it points to is replaced
-    temporary: Path | None = None
-    try:
+    with os_errors_explained(path):
         _require_replaceable(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.new.", dir=path.parent))
-        temporary.chmod(0o777 & ~_umask())
-        yield temporary
-        _sync_tree(temporary)
-        _swap(temporary, path)
-    except OSError as error:
-        raise explain_os_error(error, path) from error
-    except InputError as error:
-        # What a writer says of a file in the temporary folder is told of the folder that was asked for.
-        error.where = error.where.replace(str(temporary), str(path))
-        raise
-    finally:
-        if temporary is not None:
+        try:
+            temporary.chmod(0o777 & ~_umask())
+            yield temporary
+            for file in temporary.rglob("*"):
+                _sync(file)
+            _sync(temporary)
+            _swap(temporary, path)
+        except InputError as error:
+            # An error in the temporary folder is one in the folder that was asked for.
+            error.where = error.where.replace(str(temporary), str(path))
+            raise
+        finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
@@ -164,11 +159,8 @@ def sha256_bytes(data: bytes | memoryview) -> str:
 
 def sha256_file(path: str | Path) -> str:
     """Return the SHA-256 of a file's content, in lower-case hexadecimal."""
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+    with os_errors_explained(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def canonical_json(value: object) -> bytes:
@@ -181,18 +173,15 @@ def canonical_json(value: object) -> bytes:
 
 def read_json(path: str | Path) -> dict[str, Any]:
     """Read a JSON file that holds one object."""
-    try:
+    cure = "Write it again from its source."
+    with os_errors_explained(path):
         text = Path(path).read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     try:
         value = json.loads(text)
     except ValueError as error:
-        raise InputError(str(path), "the file must be JSON", str(error), "Write it again from its source.") from error
+        raise InputError(str(path), "the file must be JSON", str(error), cure) from error
     if not isinstance(value, dict):
-        raise InputError(
-            str(path), "the file must hold one JSON object", type(value).__name__, "Write it again from its source."
-        )
+        raise InputError(str(path), "the file must hold one JSON object", type(value).__name__, cure)
     return value
 
 

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error
+from fab.files import os_errors_explained
 from fab.gds import writer as gds
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order
 from fab.units import UM
@@ -261,19 +261,16 @@ def read_gds(path: str | Path) -> Layout:
         InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the file and the
             offset.
     """
-    try:
-        with open(path, "rb", buffering=0) as file:
-            stream, found, cells = _Stream(path, file), _Found(), []
-            dbu_m = _read_unit(stream)
-            while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
-                cells.append(_read_cell(stream, found))
-            # Zeros may follow, since some programs fill the last block of a tape.
-            while stream.kept or stream.fill():
-                if stream.buffer[: stream.kept].any():
-                    _refuse(path, "the file must end with its end record", stream.offset)
-                stream.drop(stream.kept)
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+    with os_errors_explained(path), open(path, "rb", buffering=0) as file:
+        stream, found, cells = _Stream(path, file), _Found(), []
+        dbu_m = _read_unit(stream)
+        while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+            cells.append(_read_cell(stream, found))
+        # Zeros may follow, since some programs fill the last block of a tape.
+        while stream.kept or stream.fill():
+            if stream.buffer[: stream.kept].any():
+                _refuse(path, "the file must end with its end record", stream.offset)
+            stream.drop(stream.kept)
     try:
         return Layout(dbu_m, in_order(cells))
     except ValueError as error:

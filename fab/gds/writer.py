@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error
+from fab.files import os_errors_explained
 from fab.layout.geometry import Layer, Layout, Reference, require_name
 from fab.units import UM
 
@@ -97,19 +97,16 @@ def write_gds(path: str | Path, layout: Layout) -> None:
 
     Write it inside an `atomic_folder` where a half-written file would do harm.
     """
-    try:
-        with open(path, "wb", buffering=0) as stream:
-            stream.write(_opening(layout.dbu_m))
-            for cell in layout.cells:
-                stream.write(_record(BGNSTR, _TIME) + _text(STRNAME, require_name(cell.name)))
-                for layer, shapes in cell.shapes.items():
-                    _write_rectangles(stream, layer, shapes.rectangles)
-                    for polygon in shapes.polygons:
-                        _write_polygon(stream, layer, polygon)
-                stream.write(b"".join(_reference(reference) for reference in cell.references) + _record(ENDSTR))
-            stream.write(_record(ENDLIB))
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+    with os_errors_explained(path), open(path, "wb", buffering=0) as stream:
+        stream.write(_opening(layout.dbu_m))
+        for cell in layout.cells:
+            stream.write(_record(BGNSTR, _TIME) + _text(STRNAME, require_name(cell.name)))
+            for layer, shapes in cell.shapes.items():
+                _write_rectangles(stream, layer, shapes.rectangles)
+                for polygon in shapes.polygons:
+                    _write_polygon(stream, layer, polygon)
+            stream.write(b"".join(_reference(reference) for reference in cell.references) + _record(ENDSTR))
+        stream.write(_record(ENDLIB))
 
 
 def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> None:

@@ -5,7 +5,7 @@ where nanometres are asked for, a wall measured from the horizontal or a share i
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -99,8 +99,8 @@ class _Table:
         data = self._take(key)
         return _Table(self.path, f"{self._short}.{key}", {} if data is None else data)
 
-    def number(self, key: str, low: float, high: float, cure: str) -> float | None:
-        """Return a number between two bounds, both allowed, or None for null."""
+    def number(self, key: str, low: float, high: float, cure: str, unit: float = 1.0) -> float | None:
+        """Return a number between two bounds, both allowed, times a unit; None for null."""
         value = self._take(key)
         if value is None:
             return None
@@ -108,7 +108,7 @@ class _Table:
             raise self.error(key, "must be a number, or null if it was not measured", value, "Write 74.2, not text.")
         if not low <= value <= high:
             raise self.error(key, f"must lie between {low:.6g} and {high:.6g}", value, cure)
-        return float(value)
+        return value * unit
 
     def text(self, key: str) -> str | None:
         """Return a text; a number, such as a wafer's, is one."""
@@ -132,15 +132,6 @@ def _short(value: object) -> str:
     return repr(value)[:60]
 
 
-def _scaled(value: float | None, unit_m: float) -> float | None:
-    return None if value is None else value * unit_m
-
-
-def _mean(values: Iterable[float]) -> float:
-    values = list(values)
-    return math.fsum(values) / len(values)
-
-
 _WIDEST_UM = 2.0
 _FARTHEST_UM = 50.0
 _NOT_PRINTED = "Check the unit (micrometres). A bar that did not print stays null."
@@ -161,29 +152,20 @@ def _edges_m(table: _Table) -> float | None:
         outward_um.append((width - drawn) / 2 if name.endswith("line") else (drawn - width) / 2)
     bars.finish()
     cure = "Check the unit (micrometres), and that it is per edge: half of what a bar grew."
-    given = table.number("cd_bias_um", -_WIDEST_UM, _WIDEST_UM, cure)
-    if given is not None and outward_um:
-        raise table.error("cd_bias_um", "must not be given besides cd_um", given, "Leave one of them null.")
-    if outward_um:
-        given = _mean(outward_um)
-    return _scaled(given, UM)
+    given_m = table.number("cd_bias_um", -_WIDEST_UM, _WIDEST_UM, cure, UM)
+    if given_m is not None and outward_um:
+        raise table.error("cd_bias_um", "must not be given besides cd_um", "both", "Leave one of them null.")
+    return math.fsum(outward_um) / len(outward_um) * UM if outward_um else given_m
 
 
 def _overlay(table: _Table, reference: bool = False) -> tuple[float | None, float | None]:
     cure = "Check the unit (micrometres): number of the vernier's line x 0.25."
-    x, y = (table.number(f"overlay_{axis}_um", -_FARTHEST_UM, _FARTHEST_UM, cure) for axis in ("x", "y"))
+    x, y = (table.number(f"overlay_{axis}_um", -_FARTHEST_UM, _FARTHEST_UM, cure, UM) for axis in ("x", "y"))
     if reference and (x, y) != (None, None):
         rule = "must stay null, because the others are aligned to the marks of this mask"
         key, got = ("overlay_y_um", y) if x is None else ("overlay_x_um", x)
         raise table.error(key, rule, got, "Fill in how far the others lie from it.")
-    return _scaled(x, UM), _scaled(y, UM)
-
-
-def _times(table: _Table) -> int | None:
-    times = table.number("times_etched", 0, 10, "0 is a missed etch, 2 a doubled one.")
-    if times is not None and times != int(times):
-        raise table.error("times_etched", "must be a whole number", times, "0 is a missed etch, 2 a doubled one.")
-    return None if times is None else int(times)
+    return x, y
 
 
 def _depths(table: _Table, target_m: float, times: int | None) -> tuple[tuple[float, float], ...]:
@@ -192,18 +174,22 @@ def _depths(table: _Table, target_m: float, times: int | None) -> tuple[tuple[fl
     low, high = due / 2, due * 1.5
     cure = "Check the unit (nanometres). If the etch was missed or repeated, fill in times_etched."
     pads = table.table("depth_by_pad_nm")
-    by_pad = {side: pads.number(name, low, high, cure) for name, side in PADS.items()}
+    by_pad = {side: pads.number(name, low, high, cure, NM) for name, side in PADS.items()}
     pads.finish()
-    found = [(side, depth * NM) for side, depth in by_pad.items() if depth is not None]
-    alone = table.number("depth_nm", low, high, cure)
+    found = [(side, depth) for side, depth in by_pad.items() if depth is not None]
+    alone = table.number("depth_nm", low, high, cure, NM)
     if alone is not None and found:
-        raise table.error("depth_nm", "must not be given besides depth_by_pad_nm", alone, "Leave one of them null.")
-    return tuple(found) if alone is None else ((math.inf, alone * NM),)
+        raise table.error("depth_nm", "must not be given besides depth_by_pad_nm", "both", "Leave one of them null.")
+    return tuple(found) if alone is None else ((math.inf, alone),)
 
 
 def _mask(table: _Table, target_m: float, edge_move_m: float, reference: bool) -> MaskMeasured:
     x, y = _overlay(table, reference)
-    times = _times(table)
+    cure = "0 is a missed etch, 2 a doubled one."
+    times = table.number("times_etched", 0, 10, cure)
+    if times is not None and times != int(times):
+        raise table.error("times_etched", "must be a whole number", times, cure)
+    times = None if times is None else int(times)
     measured = MaskMeasured(x, y, _edges_m(table), edge_move_m, times, _depths(table, target_m, times))
     table.finish()
     return measured
@@ -261,7 +247,7 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
     plate, notes = measured.table("plate"), measured.table("notes")
     tilt = "Give the tilt from the upright: 5 for a wall of 85 degrees."
     share = "Write 5 % as 0.05; it is a share of the light through the empty window."
-    corner = plate.number("corner_radius_um", 0.0, 20.0, "Check the unit (micrometres).")
+    corner = plate.number("corner_radius_um", 0.0, 20.0, "Check the unit (micrometres).", UM)
     sidewall = plate.number("sidewall_deg", 0.0, 44.9, tilt)
     gratings = [plate.number(f"grating_{kind}", 0.0, 1.0, share) for kind in ("binary", "blazed")]
     said = {key: notes.text(key) for key in ("wafer", "date", "remarks")}
@@ -272,7 +258,7 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
         level_map_sha256=digest,
         masks=masks,
         chrome=chrome,
-        corner_radius_m=_scaled(corner, UM),
+        corner_radius_m=corner,
         sidewall_rad=None if sidewall is None else math.radians(sidewall),
         grating_binary=gratings[0],
         grating_blazed=gratings[1],

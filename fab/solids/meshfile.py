@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error, write_atomic
+from fab.files import os_errors_explained, write_atomic
 from fab.solids.mesh import Mesh
 from fab.units import MM, UM
 
@@ -231,8 +231,9 @@ def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
     if kind not in (".3mf", ".glb", ".stl") or (kind == ".stl") != (unit is not None):
         rule = "the file must be .3mf or .glb, or .stl with its unit given"
         raise InputError(str(path), rule, f"{kind} and unit {unit}", "Give the unit of an STL file only.")
-    try:
+    with os_errors_explained(path):
         path.open("rb").close()
+    try:
         if kind == ".3mf":
             vertices, triangles, scale = _read_3mf(path)
         else:
@@ -241,8 +242,6 @@ def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
             parts: Any = trimesh.load_scene(path, process=False).dump()
             (part,) = parts
             vertices, triangles, scale = part.vertices, part.faces, _UNIT_M[unit] if unit else 1.0
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     # Each parser raises what it likes on a damaged file.
     except Exception as error:
         cure = "Write the file again from its source."

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fab.errors import CheckFailed, InputError
-from fab.files import explain_os_error, write_atomic
+from fab.files import os_errors_explained, write_atomic
 from fab.units import MM
 
 _HEADER_TIME = "2000-01-01T00:00:00"
@@ -267,10 +267,8 @@ def step_bodies(path: str | Path) -> dict[str, Body]:
     import cadquery
 
     path = Path(path)
-    try:
+    with os_errors_explained(path):
         path.open("rb").close()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     try:
         with _silence():
             read = cadquery.Assembly.importStep(str(path))

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
 from fab.figure import html_of
-from fab.files import explain_os_error, read_npy, sha256_file
+from fab.files import os_errors_explained, read_npy, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
@@ -259,7 +259,7 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
     manifest = read_manifest(folder)
     levels = manifest.staircase()
     edges = pixel_edges(manifest.grid())
-    try:
+    with os_errors_explained(folder):
         byte_checks = {entry.file: _check_bytes(folder, entry) for entry in manifest.files}
         checks = [*byte_checks.values(), *_check_nothing_else(folder, manifest)]
         reference, map_check = _reference(folder, manifest, levels, edges)
@@ -274,6 +274,4 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
             if byte_checks[model.file].passed:
                 problems = model_problems(folder, model, level_map)
                 checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
-    except OSError as error:
-        raise explain_os_error(error, folder) from error
     return VerificationReport(tuple(checks))
