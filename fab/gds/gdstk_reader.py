@@ -103,19 +103,27 @@ class _Collector(_Counter):
 
     def add(self, points_um: NDArray[np.float64]) -> None:
         """Take shapes of equal size, ``(n, v, 2)``."""
-        points = np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
-        low, high = points.min(axis=1), points.max(axis=1)
-        sides = np.count_nonzero(points != np.roll(points, -1, axis=1), axis=2)
-        upright = (points.shape[1] == 4) & (sides == 1).all(axis=1) & (low < high).all(axis=1)
-        self.boxes.append(np.concatenate([low, high], axis=1)[upright].astype(np.int32))
-        self.polygons.extend(points[~upright])
+        boxes, others = _upright(np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64))
+        self.boxes.append(boxes)
+        self.polygons.extend(others)
 
     def reading(self) -> LayerReading:
         """Return everything that was taken."""
-        rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *self.boxes])
         nothing = np.zeros((0, 0), dtype=np.int32)
-        shapes = Shapes(rects, tuple(polygon.astype(np.int32) for polygon in self.polygons))
-        return LayerReading(self.cell, self.layer, nothing, 0, self.polygons, shapes)
+        return LayerReading(self.cell, self.layer, nothing, 0, self.polygons, _shapes(self.boxes, self.polygons))
+
+
+def _upright(points: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Separate the rectangles x0, y0, x1, y1 from all other polygons ``(n, v, 2)``."""
+    low, high = points.min(axis=1), points.max(axis=1)
+    sides = np.count_nonzero(points != np.roll(points, -1, axis=1), axis=2)
+    upright = (points.shape[1] == 4) & (sides == 1).all(axis=1) & (low < high).all(axis=1)
+    return np.concatenate([low, high], axis=1)[upright].astype(np.int32), points[~upright]
+
+
+def _shapes(boxes: Iterable[NDArray[np.int32]], polygons: Iterable[NDArray[np.int64]]) -> Shapes:
+    rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *boxes])
+    return Shapes(rects, tuple(polygon.astype(np.int32) for polygon in polygons))
 
 
 def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
@@ -185,20 +193,15 @@ class _Around:
     def cells(self) -> list[Cell]:
         """Return everything."""
         return [
-            Cell(name, {layer: _sorted_out(found) for layer, found in self.shapes[name].items()}, references)
+            Cell(name, {layer: _from_polygons(found) for layer, found in self.shapes[name].items()}, references)
             for name, references in self.references.items()
         ]
 
 
-def _sorted_out(polygons: list[NDArray[np.int64]]) -> Shapes:
-    """Separate the rectangles from all other polygons."""
+def _from_polygons(polygons: list[NDArray[np.int64]]) -> Shapes:
     fours = np.array([points for points in polygons if len(points) == 4], dtype=np.int64).reshape(-1, 4, 2)
-    low, high = fours.min(axis=1), fours.max(axis=1)
-    sides = np.count_nonzero(fours != np.roll(fours, -1, axis=1), axis=2)
-    upright = (sides == 1).all(axis=1) & (low < high).all(axis=1)
-    others = [*fours[~upright], *(points for points in polygons if len(points) != 4)]
-    rects = np.concatenate([low, high], axis=1)[upright]
-    return Shapes(rects.astype(np.int32), tuple(points.astype(np.int32) for points in others))
+    boxes, others = _upright(fours)
+    return _shapes([boxes], [*others, *(points for points in polygons if len(points) != 4)])
 
 
 class GdstkReader:
