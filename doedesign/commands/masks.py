@@ -133,7 +133,7 @@ def _run_sheet(
             Die(f"die {number}", x, y, order.splits[split].words)
             for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
         ),
-        outlook=None if told is None else told.outlook,
+        predictions=None if told is None else told.predictions,
     )
     return sheet, None if told is None else told.picture
 

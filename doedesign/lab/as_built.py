@@ -1,27 +1,26 @@
-"""From what a lab measured to the errors of its plate, and how the plate compares with what the run sheet foretold.
+"""Errors of a DOE from the measurements of a lab, and the DOE as built beside the predictions of its run sheet.
 
-Whatever was not measured is taken at the mean that the process states, which is 0 if it states none. An error that was
-measured replaces the common part, too: a depth of a mask is all that happened to it.
+An error that was not measured is taken at the mean that the process states, which is 0 if it states none. An error that
+was measured replaces the common part, too: a depth of a mask is all that happened to it.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from doedesign.lab.predictions import grating_orders, seen_of
+from doedesign.lab.predictions import grating_orders, predicted_metrics
 from fab.process import Process, Variation, error_names, variation_of
 from fab.runsheet.as_built import AsBuilt, MaskMeasured
+from fab.runsheet.tables import PredictedMetrics
 from fab.units import NM
-
-__all__ = ["AsBuiltDoe", "Taken", "compared", "gratings_compared", "plate_of"]
 
 _ROUNDS = 20
 _PARTS = {"depth_scale": "common_depth_scale", "cd_bias_m": "common_cd_bias_m"}
 _COMPARED = ("strehl", "zeroth_order", "throughput", "ring_to_disc", "far_spot")
 
 
-class Taken(NamedTuple):
-    """One error of the plate and where its value comes from.
+class ErrorValue(NamedTuple):
+    """One error of the DOE and where its value comes from.
 
     Attributes:
         error: flat name, as in `fab.process.error_names`.
@@ -35,7 +34,7 @@ class Taken(NamedTuple):
 
 
 class AsBuiltDoe(NamedTuple):
-    """A plate as it was built.
+    """Errors of a DOE as it was built.
 
     Attributes:
         variation: its errors.
@@ -44,7 +43,7 @@ class AsBuiltDoe(NamedTuple):
     """
 
     variation: Variation
-    taken: tuple[Taken, ...]
+    taken: tuple[ErrorValue, ...]
     lag_per_nm: float | None
 
 
@@ -57,28 +56,24 @@ class _Lag(NamedTuple):
 
 
 def _fitted(masks: Sequence[MaskMeasured], lag: float) -> _Lag:
-    """Find depths and etch lag: a pad of width w is D (1 - lag D / w) deep, with a depth D of each mask.
+    """Find depths and etch lag by least squares over all pads of all masks; a lag is never negative.
 
-    Args:
-        masks: the masks.
-        lag: what is taken where no mask has pads of two widths.
-
-    Returns:
-        The least squares over all pads of all masks; a lag is never negative.
+    A pad of width w is D (1 - lag D / w) deep, with a depth D of each mask; `lag` is taken where no mask has pads of
+    two widths.
     """
     pads = {k: [(1 / w, depth) for w, depth in mask.depths_m] for k, mask in enumerate(masks) if mask.depths_m}
     depths = {k: max(depth for _, depth in found) for k, found in pads.items()}
     per_m = None
     # Linear in the depths and the lag but for the square of the depth, which hardly changes.
     for _ in range(_ROUNDS):
-        slopes = {k: [depths[k] ** 2 * narrow for narrow, _ in found] for k, found in pads.items()}
-        around = {k: [x - math.fsum(xs) / len(xs) for x in xs] for k, xs in slopes.items()}
+        factors = {k: [depths[k] ** 2 * narrow for narrow, _ in found] for k, found in pads.items()}
+        around = {k: [x - math.fsum(xs) / len(xs) for x in xs] for k, xs in factors.items()}
         square = math.fsum(x * x for xs in around.values() for x in xs)
         if square > 0:
             fall = math.fsum(-x * depth for k, xs in around.items() for x, (_, depth) in zip(xs, pads[k], strict=True))
             lag, per_m = max(0.0, fall / square), 1 / math.sqrt(square)
         for k, found in pads.items():
-            depths[k] = math.fsum(d + lag * x for (_, d), x in zip(found, slopes[k], strict=True)) / len(found)
+            depths[k] = math.fsum(d + lag * x for (_, d), x in zip(found, factors[k], strict=True)) / len(found)
     return _Lag(lag, depths, per_m)
 
 
@@ -113,7 +108,7 @@ def _mask_errors(process: Process, bit: int, mask: MaskMeasured, depth_m: float 
         found[f"depth_scale[{bit}]"] = depth_m / due_m - 1
     if mask.edges_m is not None:
         found[f"cd_bias_m[{bit}]"] = mask.edges_m
-    # The verniers stand at the die, and an overlay is told for the middle of the wafer.
+    # The verniers stand at the die; an overlay is that of the middle of the wafer.
     y, x = process.die_m
     turn, growth = _mean(process, f"rotation_rad[{bit}]"), _mean(process, f"magnification[{bit}]")
     if mask.overlay_y_m is not None:
@@ -123,16 +118,11 @@ def _mask_errors(process: Process, bit: int, mask: MaskMeasured, depth_m: float 
     return found
 
 
-def plate_of(measured: AsBuilt, process: Process) -> AsBuiltDoe:
-    """Turn measured numbers into the errors of a plate.
+def as_built_doe(measured: AsBuilt, process: Process) -> AsBuiltDoe:
+    """Turn measured numbers into the errors of a DOE; the process has target depths and means of what was not measured.
 
-    Args:
-        measured: the numbers.
-        process: what the lab does: target depths, and the means of what was not measured.
-
-    Returns:
-        The errors. Depths and line widths of all masks are whole, the common parts are 0. Edges that were moved on the
-        mask count with the line width.
+    Depths and line widths of all masks are whole, the common parts are 0. Edges that were moved on the mask count with
+    the line width.
     """
     values = _assumed(process)
     fit = _fitted(measured.masks, _mean(process, "etch_lag"))
@@ -152,12 +142,12 @@ def plate_of(measured: AsBuilt, process: Process) -> AsBuiltDoe:
         values[f"cd_bias_m[{bit}]"] += mask.edge_move_m
     repeats = tuple(0 if mask.times_etched is None else mask.times_etched - 1 for mask in measured.masks)
     taken = [
-        Taken(name, values[name], "measured" if name in found else _unmeasured(values[name]))
+        ErrorValue(name, values[name], "measured" if name in found else _unmeasured(values[name]))
         for name in values
         if name not in _PARTS.values()
     ]
-    said = {name: value for name, value in values.items() if value}
-    variation = variation_of(process.masks, said, repeats=repeats if any(repeats) else ())
+    given = {name: value for name, value in values.items() if value}
+    variation = variation_of(process.masks, given, repeats=repeats if any(repeats) else ())
     return AsBuiltDoe(variation, tuple(taken), None if fit.per_m is None else fit.per_m * NM)
 
 
@@ -165,11 +155,11 @@ def _unmeasured(value: float) -> str:
     return "process mean" if value else "not measured, taken as 0"
 
 
-def _of_sheet(predicted: Mapping[str, Any] | None, kind: str, seen: Any) -> Mapping[str, Any]:
-    """Return what a sheet foretold for the same colour and depth; nothing if it did not."""
+def _of_sheet(predicted: Mapping[str, Any] | None, kind: str, now: PredictedMetrics) -> Mapping[str, Any]:
+    """Return what a sheet predicted for the same colour and depth; nothing if it did not."""
     rows = (predicted or {}).get(kind)
     for row in rows if isinstance(rows, list) else []:
-        if isinstance(row, Mapping) and row.get("colour") == seen.colour and _same(row.get("depth_m"), seen.depth_m):
+        if isinstance(row, Mapping) and row.get("colour") == now.colour and _same(row.get("depth_m"), now.depth_m):
             return row
     return {}
 
@@ -180,11 +170,11 @@ def _same(one: Any, other: float | None) -> bool:
     return isinstance(one, int | float) and math.isclose(one, other, rel_tol=1e-6)
 
 
-def compared(rows: Sequence[dict[str, Any]], predicted: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """Put a plate beside what its run sheet foretold.
+def compare_with_sheet(rows: Sequence[dict[str, Any]], predicted: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """Compare a DOE as built with the predictions of its run sheet.
 
     Args:
-        rows: the prediction of the plate as built (`doedesign.prediction.plate_rows`).
+        rows: the prediction of the DOE as built (`doedesign.prediction.plate_rows`).
         predicted: "predicted" of the run sheet.
 
     Returns:
@@ -192,32 +182,23 @@ def compared(rows: Sequence[dict[str, Any]], predicted: Mapping[str, Any] | None
         `as_built`.
     """
     out = []
-    for seen in seen_of(rows):
-        before = {kind: _of_sheet(predicted, kind, seen) for kind in ("as_drawn", "expected")}
+    for now in predicted_metrics(rows):
+        before = {kind: _of_sheet(predicted, kind, now) for kind in ("as_drawn", "expected")}
         for quantity in _COMPARED:
-            value = getattr(seen, quantity)
+            value = getattr(now, quantity)
             if value is None:
                 continue
             old = {kind: row.get(quantity) for kind, row in before.items()}
-            out.append({"colour": seen.colour, "depth_m": seen.depth_m, "quantity": quantity, **old, "as_built": value})
+            out.append({"colour": now.colour, "depth_m": now.depth_m, "quantity": quantity, **old, "as_built": value})
     return out
 
 
-def gratings_compared(measured: AsBuilt, process: Process, variation: Variation, material: str) -> list[dict[str, Any]]:
-    """Put what the test gratings showed beside what the measured depths say that they should.
-
-    Args:
-        measured: the numbers.
-        process: target depths.
-        variation: the errors of the plate (`plate_of`).
-        material: of the substrate.
+def compare_gratings(measured: AsBuilt, process: Process, variation: Variation, material: str) -> list[dict[str, Any]]:
+    """Compare what the test gratings showed with what they should according to the measured depths.
 
     Returns:
         A row per grating with `as_drawn`, `as_built` and `measured` (None if it was not); none if the sheet does not
         say at which wavelength.
-
-    Raises:
-        InputError: a wavelength at which the glass is not known.
     """
     probe_nm = (measured.predicted or {}).get("probe_wavelength_nm")
     if not isinstance(probe_nm, int | float) or isinstance(probe_nm, bool) or probe_nm <= 0:
@@ -229,10 +210,8 @@ def gratings_compared(measured: AsBuilt, process: Process, variation: Variation,
     # The binary grating is that of the deepest target, whatever became of it.
     deepest = max(range(process.masks), key=lambda bit: nominal[bit])
     drawn = grating_orders(nominal, material, probe_nm * NM)
-    now = (
-        grating_orders([built[deepest]], material, probe_nm * NM)[0],
-        grating_orders(built, material, probe_nm * NM)[1],
-    )
+    binary = grating_orders([built[deepest]], material, probe_nm * NM)[0]
+    now = (binary, grating_orders(built, material, probe_nm * NM)[1])
     shown = (measured.grating_binary, measured.grating_blazed)
     return [
         {"grating": name, "wavelength_nm": probe_nm, "as_drawn": a, "as_built": b, "measured": m}

@@ -1,8 +1,8 @@
-"""What a run sheet foretells: the plate's light, the test gratings, and which measured number matters most.
+"""Predictions on a run sheet: the light of the DOE, the test gratings, and which measured number matters most.
 
 The ranking is the tolerance analysis of one error at a time, on a patch of the design: Strehl ratio and 0th order are
-means over the plate, and a patch half way to the rim has them about as the whole plate does. What the chrome does is
-not in it.
+means over the DOE, and a patch half way to the rim has them about as the whole DOE does. Errors of the chrome are not
+in it.
 """
 
 import math
@@ -37,39 +37,32 @@ from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
 
-__all__ = ["SheetPrediction", "grating_orders", "matters_of", "predict_sheet", "seen_of"]
-
 # A laser of the kind that most optics labs have, and that of the published prototype.
 PROBE_M = 520e-9
 _DEPTH_ERRORS = (-0.05, -0.02, 0.0, 0.02, 0.05)
 _PATCH = 256
 
 
-def seen_of(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
+def predicted_metrics(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
     """Return the rows of a prediction as a run sheet has them; a ratio without any light in the disc is left out."""
-    seen = []
+    metrics = []
     for row in rows:
         ratio = row.get("ring_to_disc")
         if ratio is not None and not math.isfinite(ratio):
             ratio = None
         shared = {name: row[name] for name in ("colour", "depth_m", "strehl", "zeroth_order", "throughput")}
-        seen.append(PredictedMetrics(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
-    return tuple(seen)
+        metrics.append(PredictedMetrics(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
+    return tuple(metrics)
 
 
 def grating_orders(
     depths_m: Sequence[float] | NDArray[np.floating], material: str, wavelength_m: float
 ) -> tuple[float, float]:
-    """Return what the test gratings send straight on, as shares of the light through an empty window.
+    """Return the shares of the light that the binary and the blazed test grating send straight on.
 
-    Args:
-        depths_m: depth of every mask's etch, metres.
-        material: of the substrate.
-        wavelength_m: vacuum wavelength.
-
-    Returns:
-        The binary grating, half of whose area the deepest etch opens: cos^2(phi / 2). The blazed one, which all
-        combinations of masks share alike: the product of cos^2(phi / 2) over all etches. phi is an etch's phase.
+    They are shares of the light through an empty window. The deepest etch opens half of the binary grating: cos^2(phi /
+    2), where phi is an etch's phase at the vacuum wavelength (metres). All combinations of masks share the blazed one
+    alike: the product of cos^2(phi / 2) over all etches. `depths_m` is the depth of every mask's etch, metres.
     """
     waves = np.asarray(depths_m) * (refractive_index(material, wavelength_m) - 1) / wavelength_m
     orders = np.cos(np.pi * waves) ** 2
@@ -97,17 +90,11 @@ def _row(surface: FabricatedDoe, nominal: FabricatedDoe) -> dict[str, Any]:
     return {"colour": "", "depth_m": None, **found}
 
 
-def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
-    """Rank the numbers that a lab measures by how much of the plates' differences they explain.
+def rank_importance(design: Design, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
+    """Rank the numbers that a lab measures by how much of the differences between the DOEs of a process they explain.
 
-    Args:
-        design: the design.
-        process: how far it strays.
-        wavelength_m: where Strehl ratio and 0th order are looked at.
-
-    Returns:
-        Numbers and their shares of the variance of both, the largest share of the Strehl ratio first; none if nothing
-        varies.
+    Strehl ratio and 0th order are those at one wavelength (metres). The largest share of the Strehl ratio's variance
+    comes first; there is none if nothing varies.
 
     Raises:
         InputError: errors beyond what the model describes.
@@ -121,9 +108,9 @@ def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[I
     keys = [EXPECTED, *one_at_a_time_keys(kept)]
     made = partial(as_fabricated, level, small, wavelengths_m=(wavelength_m,))
     nominal = made(Process(kept.levels), Variation())
-    plates = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
+    draws = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
     variances: dict[str, dict[str, float]] = {"strehl": {}, "zeroth_order": {}}
-    for change in one_at_a_time(kept, table_of(plates)):
+    for change in one_at_a_time(kept, table_of(draws)):
         if change.colour is None and change.quantity in variances:
             of = variances[change.quantity]
             name = _measured(change.error)
@@ -133,7 +120,7 @@ def matters_of(design: Design, process: Process, wavelength_m: float) -> tuple[I
         Importance(name, variance / totals["strehl"], variances["zeroth_order"][name] / totals["zeroth_order"])
         for name, variance in variances["strehl"].items()
     ]
-    return tuple(sorted(found, key=lambda matter: (-matter.strehl, matter.measured)))
+    return tuple(sorted(found, key=lambda one: (-one.strehl, one.measured)))
 
 
 def _measured(error: str) -> str:
@@ -153,14 +140,14 @@ def _full_wave_m(levels: Levels, material: str) -> float | None:
 
 
 class SheetPrediction(NamedTuple):
-    """What stands on the sheet, and a PNG picture of the PSFs of the plate with the process's mean errors."""
+    """Predictions on the sheet, and a PNG of the PSFs of the DOE with the process's mean errors."""
 
-    outlook: Predictions
+    predictions: Predictions
     picture: bytes
 
 
 def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float) -> FabricatedDoe:
-    """Return the plate as drawn on the raster of another, whose propagation is then compiled already."""
+    """Return a DOE as drawn on the raster of another, whose propagation is then compiled already."""
     parts = plate.grid.shape[0] // nominal.grid.shape[0]
     field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
     coverage = jnp.asarray(circle_coverage(plate.grid, aperture_m))
@@ -168,10 +155,10 @@ def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float)
 
 
 def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
-    """Predict the plate as drawn (its rows) and the one with mean errors."""
-    plate = process.expected()
-    expected = predict(design, process, plate)
-    if plate.nominal:
+    """Predict the DOE as drawn (its rows) and the one with mean errors."""
+    variation = process.expected()
+    expected = predict(design, process, variation)
+    if variation.nominal:
         return expected.rows, expected
     nominal = as_fabricated(design.level_map.level, design.camera, process, Variation())
     alike = _on_grid_of(expected.surface, nominal, design.camera.aperture_m)
@@ -185,33 +172,34 @@ def predict_sheet(
     probe_m: float = PROBE_M,
     edge_moves_m: Sequence[float] = (),
 ) -> SheetPrediction:
-    """Foretell what a lab should see, for one depth: the middle one of the near depths, or else the farthest.
+    """Predict what a lab should see at one depth: the middle one of the near depths, or else the farthest.
 
     Args:
         design: the design.
         process: what the lab does.
-        design_m: design wavelength.
-        probe_m: wavelength of the lab's test laser.
-        edge_moves_m: how far the edges of each mask were moved outward to make up for the process; empty for none.
+        design_m: design wavelength, metres.
+        probe_m: wavelength of the lab's test laser, metres.
+        edge_moves_m: how far the edges of each mask were moved outward to make up for the process, metres; empty for
+            none.
 
     Raises:
         InputError: a probe wavelength at which the glass is not known, or errors beyond what the model describes.
     """
     levels, material = design.levels, design.camera.material
     waves_per_m = (refractive_index(material, probe_m) - 1) / probe_m
-    seen = with_edge_moves(process, edge_moves_m)
+    moved = with_edge_moves(process, edge_moves_m)
     middle = len(design.near_m) // 2
     # All depths would take most of the time of a whole order, and say the same.
     near_m = design.near_m[middle : middle + 1]
     design = replace(design, near_m=near_m, far_m=() if near_m else design.far_m[-1:])
     with ThreadPoolExecutor(1) as pool:
-        ranking = pool.submit(matters_of, design, seen, design_m)
-        as_drawn, expected = _predictions(design, seen)
-        matters = ranking.result()
+        ranked = pool.submit(rank_importance, design, moved, design_m)
+        as_drawn, expected = _predictions(design, moved)
+        ranking = ranked.result()
     depths = np.array([levels.etch_depth_m(bit) for bit in range(levels.bits)])
-    outlook = Predictions(
-        drawn=seen_of(as_drawn),
-        expected=seen_of(expected.rows),
+    predictions = Predictions(
+        drawn=predicted_metrics(as_drawn),
+        expected=predicted_metrics(expected.rows),
         design_m=design_m,
         full_wave_m=_full_wave_m(levels, material),
         probe_m=probe_m,
@@ -219,6 +207,7 @@ def predict_sheet(
         gratings=tuple(
             Grating(error, *grating_orders(depths * (1 + error), material, probe_m)) for error in _DEPTH_ERRORS
         ),
-        matters=matters,
+        ranking=ranking,
     )
-    return SheetPrediction(outlook, png_bytes(plot_psfs(expected.bank, design.camera, design.near_m, design.far_m)))
+    picture = plot_psfs(expected.bank, design.camera, design.near_m, design.far_m)
+    return SheetPrediction(predictions, png_bytes(picture))

@@ -77,7 +77,7 @@ class Predictions:
         probe_m: wavelength of the laser that the lab tests with, metres.
         probe_waves: the full height in waves at the probe.
         gratings: what the test gratings show at the probe, against an empty window; a depth error of 0 among them.
-        matters: measured numbers, the most important first; empty if the process has no errors.
+        ranking: measured numbers, the most important first; empty if the process has no errors.
     """
 
     drawn: tuple[PredictedMetrics, ...]
@@ -87,7 +87,7 @@ class Predictions:
     probe_m: float
     probe_waves: float
     gratings: tuple[Grating, ...]
-    matters: tuple[Importance, ...] = ()
+    ranking: tuple[Importance, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class RunSheet:
         material: what the substrate is made of.
         chrome_m: thickness of the chrome, metres.
         deposition: how the chrome is laid down.
-        outlook: what the lab should see; None if nothing is known about the light.
+        predictions: what the lab should see; None if nothing is known about the light.
 
     Raises:
         InputError: a photomask without a file, or etches that are not those of the process, in its order.
@@ -127,7 +127,7 @@ class RunSheet:
     material: str = "fused silica"
     chrome_m: float = 100 * NM
     deposition: Literal["evaporated", "sputtered"] = "evaporated"
-    outlook: Predictions | None = None
+    predictions: Predictions | None = None
 
     def __post_init__(self) -> None:
         """Check that every photomask has its file, and every etch its photomask."""

@@ -198,17 +198,17 @@ def _row(values: NamedTuple) -> dict[str, Any]:
     return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in row.items()}
 
 
-def _outlook_record(outlook: Predictions) -> dict[str, Any]:
-    full = outlook.full_wave_m
+def _predicted_record(predictions: Predictions) -> dict[str, Any]:
+    full = predictions.full_wave_m
     return {
-        "as_drawn": [_row(seen) for seen in outlook.drawn],
-        "expected": [_row(seen) for seen in outlook.expected],
-        "design_wavelength_nm": _nm(outlook.design_m),
+        "as_drawn": [_row(seen) for seen in predictions.drawn],
+        "expected": [_row(seen) for seen in predictions.expected],
+        "design_wavelength_nm": _nm(predictions.design_m),
         "full_wave_wavelength_nm": None if full is None else round(full / NM, 1),
-        "probe_wavelength_nm": _nm(outlook.probe_m),
-        "waves_at_probe": round(outlook.probe_waves, 5),
-        "gratings": [_row(grating) for grating in outlook.gratings],
-        "matters": [_row(matter) for matter in outlook.matters],
+        "probe_wavelength_nm": _nm(predictions.probe_m),
+        "waves_at_probe": round(predictions.probe_waves, 5),
+        "gratings": [_row(grating) for grating in predictions.gratings],
+        "matters": [_row(one) for one in predictions.ranking],
     }
 
 
@@ -268,7 +268,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps, start=1)],
         "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
-        "predicted": None if sheet.outlook is None else _outlook_record(sheet.outlook),
+        "predicted": None if sheet.predictions is None else _predicted_record(sheet.predictions),
         "measured": _blanks(sheet),
     }
 

@@ -12,8 +12,8 @@ import pytest
 
 from doedesign.commands.asbuilt import as_built
 from doedesign.design.design import Design
-from doedesign.lab.as_built import compared, gratings_compared, plate_of
-from doedesign.lab.predictions import seen_of
+from doedesign.lab.as_built import as_built_doe, compare_gratings, compare_with_sheet
+from doedesign.lab.predictions import predicted_metrics
 from doedesign.prediction import predict
 from doedesign.runs.folder import open_run
 from doedesign.runs.level_maps import open_design
@@ -27,7 +27,7 @@ from fab.runsheet.write import record
 from fab.units import NM, UM
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
-from tests.fab.sheets import outlook, sheet, spreads_of
+from tests.fab.sheets import predictions, sheet, spreads_of
 
 LEVELS = Levels(4, 300 * NM)
 IDEAL = Process(LEVELS)
@@ -130,7 +130,7 @@ def design(run: Path) -> Design:
 
 
 def write_sheet(path: Path, design: Design, numbers: dict[str, Any], predicted: Any = None) -> Path:
-    data = record(sheet(LEVELS, zero_layer=True, level_map=design.level_map, outlook=outlook()))
+    data = record(sheet(LEVELS, zero_layer=True, level_map=design.level_map, predictions=predictions()))
     if predicted is not None:
         data["predicted"] |= predicted
     path.write_text(json.dumps(data | ({"measured": numbers} if numbers else {})))
@@ -145,7 +145,7 @@ def test_what_was_measured_comes_back_as_the_errors_of_the_plate():
         )
     ]
     chrome = ChromeMeasured(PLATE.chrome_x_m, PLATE.chrome_y_m, PLATE.chrome_diameter_m)
-    found = plate_of(
+    found = as_built_doe(
         measured(*masks, chrome=chrome, corner_radius_m=PLATE.corner_radius_m, sidewall_rad=PLATE.sidewall_rad), IDEAL
     )
     for name in ("depth_scale", "overlay_x_m", "overlay_y_m", "cd_bias_m"):
@@ -160,13 +160,13 @@ def test_what_was_measured_comes_back_as_the_errors_of_the_plate():
 
 
 def test_nothing_measured_is_the_plate_of_the_means():
-    assert plate_of(measured(), IDEAL).variation == Variation()
+    assert as_built_doe(measured(), IDEAL).variation == Variation()
     means = spreads_of(
         LEVELS, common_depth_scale=(0.02, 0.01), depth_scale=(0.01, 0.0), common_cd_bias_m=(50 * NM, 0.0),
         cd_bias_m=(-20 * NM, 0.0), etch_lag=(0.05, 0.02), chrome_x_m=(1 * UM, 0.0), rotation_rad=(1e-5, 0.0),
     )  # fmt: skip
     process = Process(LEVELS, spreads=means)
-    found = plate_of(measured(), process).variation
+    found = as_built_doe(measured(), process).variation
     # The common parts count with each mask's own; everything else is the mean as it is.
     assert found.depth_scale == pytest.approx((1.02 * 1.01 - 1,) * 2)
     assert found.cd_bias_m == pytest.approx((30 * NM,) * 2)
@@ -176,7 +176,7 @@ def test_nothing_measured_is_the_plate_of_the_means():
 
 def test_a_measured_mask_has_no_common_part_left_and_the_others_keep_it():
     process = Process(LEVELS, spreads=spreads_of(LEVELS, common_depth_scale=(0.04, 0.0), common_cd_bias_m=(50 * NM, 0)))
-    found = plate_of(measured(MaskMeasured(depths_m=((math.inf, 303 * NM),), edges_m=10 * NM), NOTHING), process)
+    found = as_built_doe(measured(MaskMeasured(depths_m=((math.inf, 303 * NM),), edges_m=10 * NM), NOTHING), process)
     assert found.variation.common_depth_scale == found.variation.common_cd_bias_m == 0
     assert found.variation.depth_scale == pytest.approx((0.01, 0.04))
     assert found.variation.cd_bias_m == pytest.approx((10 * NM, 50 * NM))
@@ -186,8 +186,8 @@ def test_a_measured_mask_has_no_common_part_left_and_the_others_keep_it():
 def test_edges_moved_on_the_mask_count_with_the_line_width():
     process = Process(LEVELS, spreads=spreads_of(LEVELS, cd_bias_m=(50 * NM, 0.0)))
     moved = MaskMeasured(edge_move_m=-50 * NM)
-    assert plate_of(measured(moved, moved), process).variation.nominal
-    found = plate_of(measured(moved._replace(edges_m=60 * NM), moved), process).variation
+    assert as_built_doe(measured(moved, moved), process).variation.nominal
+    found = as_built_doe(measured(moved._replace(edges_m=60 * NM), moved), process).variation
     assert found.cd_bias_m == pytest.approx((10 * NM, 0))
 
 
@@ -195,7 +195,7 @@ def test_depths_of_pads_with_scatter_are_a_least_squares_fit(rng):
     deep = [LEVELS.etch_depth_m(bit) for bit in range(2)]
     scatter = [[depth + rng.normal(0, 1 * NM) for _, depth in pads(d, 0.3)] for d in deep]
     masks = [MaskMeasured(depths_m=tuple(zip(PADS_M, depths, strict=True))) for depths in scatter]
-    found = plate_of(measured(*masks), IDEAL)
+    found = as_built_doe(measured(*masks), IDEAL)
 
     def squares(lag: float, *depths: float) -> float:
         return sum(
@@ -216,11 +216,11 @@ def test_depths_of_pads_with_scatter_are_a_least_squares_fit(rng):
 
 def test_lag_is_never_negative_and_one_pad_alone_takes_the_mean():
     rising = tuple(zip(PADS_M, (305 * NM, 302 * NM, 302 * NM), strict=True))
-    found = plate_of(measured(MaskMeasured(depths_m=rising), NOTHING), IDEAL)
+    found = as_built_doe(measured(MaskMeasured(depths_m=rising), NOTHING), IDEAL)
     assert found.variation.etch_lag == 0
     assert found.variation.depth_scale == pytest.approx((0.01, 0.0))
     process = Process(LEVELS, spreads={"etch_lag": Normal(0.5, 0.1)})
-    one = plate_of(measured(MaskMeasured(depths_m=pads(306 * NM, 0.5)[:1]), NOTHING), process)
+    one = as_built_doe(measured(MaskMeasured(depths_m=pads(306 * NM, 0.5)[:1]), NOTHING), process)
     assert one.variation.etch_lag == 0.5
     assert one.variation.depth_scale == pytest.approx((0.02, 0.0), abs=1e-6)
     assert one.lag_per_nm is None
@@ -228,10 +228,10 @@ def test_lag_is_never_negative_and_one_pad_alone_takes_the_mean():
 
 def test_missed_and_doubled_etches():
     doubled = MaskMeasured(times_etched=2, depths_m=((math.inf, 1224 * NM),))
-    found = plate_of(measured(MaskMeasured(times_etched=0, depths_m=((math.inf, 0.0),)), doubled), IDEAL).variation
+    found = as_built_doe(measured(MaskMeasured(times_etched=0, depths_m=((math.inf, 0.0),)), doubled), IDEAL).variation
     assert found.repeats == (-1, 1)
     assert found.depth_scale == pytest.approx((0.0, 0.02))
-    assert plate_of(measured(NOTHING, NOTHING._replace(times_etched=1)), IDEAL).variation.repeats == ()
+    assert as_built_doe(measured(NOTHING, NOTHING._replace(times_etched=1)), IDEAL).variation.repeats == ()
 
 
 def test_verniers_and_pads_tell_of_the_place_of_the_die():
@@ -240,7 +240,7 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
     process = Process(LEVELS, spreads=spreads, die_m=(20e-3, 10e-3))
     # At (y, x) = (20, 10) mm: toward +x 10e-3 * 1e-5 - 20e-3 * 2e-5, toward +y 20e-3 * 1e-5 + 10e-3 * 2e-5.
     there = MaskMeasured(-0.3 * UM, 0.4 * UM, depths_m=((math.inf, 300 * NM * (1 + 0.04 * 0.2)),))
-    found = plate_of(measured(there, NOTHING), process).variation
+    found = as_built_doe(measured(there, NOTHING), process).variation
     assert found.nominal is False
     assert found.value("overlay_x_m[0]") == pytest.approx(0, abs=1e-15)
     assert found.value("overlay_y_m[0]") == pytest.approx(0, abs=1e-15)
@@ -250,7 +250,7 @@ def test_verniers_and_pads_tell_of_the_place_of_the_die():
 @pytest.mark.slow
 def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run, design, tmp_path, caplog):
     wanted = predict(design, IDEAL, PLATE)
-    before = [seen._asdict() for seen in seen_of(predict(design, IDEAL, Variation()).rows)]
+    before = [seen._asdict() for seen in predicted_metrics(predict(design, IDEAL, Variation()).rows)]
     file = write_sheet(tmp_path / "s.json", design, numbers_of(PLATE, LEVELS), {"as_drawn": before, "expected": before})
     caplog.set_level(logging.INFO)
     folder = as_built(run, file)
@@ -297,19 +297,19 @@ def test_another_designs_sheet_and_errors_beyond_the_model_are_refused(run, desi
 
 def test_rows_that_the_sheet_does_not_have_are_compared_with_nothing(design):
     rows = predict(design, IDEAL, Variation()).rows
-    assert all(row["as_drawn"] is row["expected"] is None for row in compared(rows, None))
+    assert all(row["as_drawn"] is row["expected"] is None for row in compare_with_sheet(rows, None))
     odd = {"as_drawn": [{"colour": rows[0]["colour"], "depth_m": 9.0, "strehl": 0.5}, 3], "expected": "nothing"}
-    assert all(row["as_drawn"] is row["expected"] is None for row in compared(rows, odd))
+    assert all(row["as_drawn"] is row["expected"] is None for row in compare_with_sheet(rows, odd))
 
 
 def test_gratings_follow_the_measured_depths():
     predicted = {"probe_wavelength_nm": 550.0}
     shown = measured(predicted=predicted, grating_binary=0.1)
-    drawn_row, _ = gratings_compared(shown, IDEAL, Variation(), "fused_silica")
+    drawn_row, _ = compare_gratings(shown, IDEAL, Variation(), "fused_silica")
     assert drawn_row["as_drawn"] == drawn_row["as_built"]
     assert drawn_row["measured"] == 0.1
-    missed, blazed = gratings_compared(shown, IDEAL, Variation(repeats=(0, -1)), "fused_silica")
+    missed, blazed = compare_gratings(shown, IDEAL, Variation(repeats=(0, -1)), "fused_silica")
     # Without the deepest etch there is no binary grating: all light goes straight on.
     assert missed["as_built"] == pytest.approx(1.0)
     assert blazed["as_built"] > 0.3
-    assert gratings_compared(measured(), IDEAL, Variation(), "fused_silica") == []
+    assert compare_gratings(measured(), IDEAL, Variation(), "fused_silica") == []

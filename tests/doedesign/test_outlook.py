@@ -10,7 +10,7 @@ from PIL import Image
 
 from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
-from doedesign.lab.predictions import grating_orders, matters_of, predict_sheet
+from doedesign.lab.predictions import grating_orders, predict_sheet, rank_importance
 from doedesign.prediction import predict
 from fab.grid import Grid
 from fab.level_map import LevelMap
@@ -80,43 +80,46 @@ def test_no_other_etch_makes_up_for_a_wrong_depth():
 def test_the_outlook_is_the_prediction_of_one_depth(design):
     spreads = {"common_depth_scale": Normal(0.03, 0.01), "overlay_x_m[3]": Normal(0.1 * UM, 0.3 * UM)}
     process = Process(LEVELS, spreads=spreads)
-    outlook, picture = predict_sheet(design, process, 550e-9)
-    assert [(seen.depth_m, seen.far_spot) for seen in outlook.drawn] == [(6e-3, None)]
+    predictions, picture = predict_sheet(design, process, 550e-9)
+    assert [(seen.depth_m, seen.far_spot) for seen in predictions.drawn] == [(6e-3, None)]
     short = replace(design, near_m=(6e-3,), far_m=())
     # The plate as drawn is cut into the pieces of the other one, and added up again in single precision.
-    for seen, plate, within in ((outlook.drawn, Variation(), 1e-4), (outlook.expected, process.expected(), 1e-12)):
+    for seen, plate, within in (
+        (predictions.drawn, Variation(), 1e-4),
+        (predictions.expected, process.expected(), 1e-12),
+    ):
         for one, row in zip(seen, predict(short, process, plate).rows, strict=True):
             numbers = {key: value for key, value in one._asdict().items() if isinstance(value, float)}
             assert numbers == pytest.approx({key: row[key] for key in numbers}, rel=within)
             assert {"strehl", "zeroth_order", "throughput", "ring_to_disc"} < set(numbers)
-    assert outlook.expected[0].strehl < 0.99
+    assert predictions.expected[0].strehl < 0.99
     # 16 x 75 nm of fused silica is one wave at 552 nm, and 1.0645 waves at 520 nm.
-    assert outlook.full_wave_m == pytest.approx(552e-9, abs=0.5e-9)
-    assert outlook.probe_waves == pytest.approx(1.0645, abs=1e-4)
+    assert predictions.full_wave_m == pytest.approx(552e-9, abs=0.5e-9)
+    assert predictions.probe_waves == pytest.approx(1.0645, abs=1e-4)
     assert Image.open(BytesIO(picture)).format == "PNG"
 
 
 def test_a_design_without_near_depths_is_foretold_for_its_farthest(design):
-    far = predict_sheet(replace(design, near_m=()), Process(LEVELS), 550e-9).outlook
+    far = predict_sheet(replace(design, near_m=()), Process(LEVELS), 550e-9).predictions
     assert [(seen.depth_m, seen.ring_to_disc) for seen in far.drawn] == [(None, None)]
     assert far.drawn == far.expected
-    assert far.matters == ()
+    assert far.ranking == ()
 
 
 def test_a_height_without_a_full_wave_is_said_so(design):
     flat = replace(design, level_map=replace(design.level_map, levels=Levels(16, 20 * NM)), near_m=())
-    assert predict_sheet(flat, Process(flat.levels), 550e-9).outlook.full_wave_m is None
+    assert predict_sheet(flat, Process(flat.levels), 550e-9).predictions.full_wave_m is None
 
 
 def test_compensated_masks_bring_the_expected_plate_back(design):
     process = Process(LEVELS, spreads=spreads_of(LEVELS, common_cd_bias_m=(80 * NM, 0.0)))
     moved = with_edge_moves(process, (-80 * NM,) * 4)
-    outlook = predict_sheet(design, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).outlook
+    predictions = predict_sheet(design, process, 550e-9, edge_moves_m=(-80 * NM,) * 4).predictions
     assert moved.expected().common_cd_bias_m + moved.expected().cd_bias_m[0] == 0
     # Widened and narrowed by the same, the plate goes through the model of pieces, which rounds differently.
-    for a, b in zip(outlook.drawn, outlook.expected, strict=True):
+    for a, b in zip(predictions.drawn, predictions.expected, strict=True):
         assert b.strehl == pytest.approx(a.strehl, abs=1e-5)
-    assert predict_sheet(design, process, 550e-9).outlook.expected[0].strehl < 0.99
+    assert predict_sheet(design, process, 550e-9).predictions.expected[0].strehl < 0.99
 
 
 def test_the_largest_error_matters_most(design):
@@ -127,10 +130,10 @@ def test_the_largest_error_matters_most(design):
         "depth_scale[3]": Normal(0.0, 0.04),
         "chrome_x_m": Normal(0.0, 5 * UM),
     }
-    matters = matters_of(design, Process(LEVELS, spreads=spreads), 550e-9)
-    assert matters[0].measured == "overlay of mask 4"
-    assert max(matters, key=lambda one: one.zeroth_order).measured == "depth of mask 4"
-    assert {one.measured for one in matters} == {"overlay of mask 4", "overlay of mask 1", "depth of mask 4"}
-    assert sum(one.strehl for one in matters) == pytest.approx(1)
-    assert sum(one.zeroth_order for one in matters) == pytest.approx(1)
-    assert matters_of(design, Process(LEVELS), 550e-9) == ()
+    ranking = rank_importance(design, Process(LEVELS, spreads=spreads), 550e-9)
+    assert ranking[0].measured == "overlay of mask 4"
+    assert max(ranking, key=lambda one: one.zeroth_order).measured == "depth of mask 4"
+    assert {one.measured for one in ranking} == {"overlay of mask 4", "overlay of mask 1", "depth of mask 4"}
+    assert sum(one.strehl for one in ranking) == pytest.approx(1)
+    assert sum(one.zeroth_order for one in ranking) == pytest.approx(1)
+    assert rank_importance(design, Process(LEVELS), 550e-9) == ()

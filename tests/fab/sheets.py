@@ -74,10 +74,10 @@ def sheet(
     )  # fmt: skip
 
 
-def outlook() -> Predictions:
+def predictions() -> Predictions:
     """Numbers that no plate has."""
     near = PredictedMetrics("red", 0.05, 0.81, 0.0123, 0.86, ring_to_disc=3.21)
     far = PredictedMetrics("red", None, 0.81, 0.0123, 0.91, far_spot=0.654)
     gratings = tuple(Grating(error, 0.01 + error**2, 0.004 + error**2) for error in (-0.02, 0.0, 0.02))
-    matters = (Importance("overlay of mask 4", 0.61, 0.02), Importance("line width (CD bars) of every mask", 0.2, 0.7))
-    return Predictions((near, far), (near, far), 550 * NM, 552.06 * NM, 520 * NM, 1.0645, gratings, matters)
+    ranking = (Importance("overlay of mask 4", 0.61, 0.02), Importance("line width (CD bars) of every mask", 0.2, 0.7))
+    return Predictions((near, far), (near, far), 550 * NM, 552.06 * NM, 520 * NM, 1.0645, gratings, ranking)

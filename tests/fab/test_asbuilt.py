@@ -12,12 +12,12 @@ from fab.errors import InputError
 from fab.runsheet.as_built import AsBuilt, read_as_built
 from fab.runsheet.write import record
 from fab.units import NM, UM
-from tests.fab.sheets import doe, outlook, sheet
+from tests.fab.sheets import doe, predictions, sheet
 
 
 @cache
 def unfilled() -> str:
-    return json.dumps(record(sheet(outlook=outlook(), moves_m=(-30 * NM, 0.0, 0.0, 10 * NM))))
+    return json.dumps(record(sheet(predictions=predictions(), moves_m=(-30 * NM, 0.0, 0.0, 10 * NM))))
 
 
 def filled(path: Path, changes: Mapping[str, object], **about: object) -> Path:

@@ -12,7 +12,7 @@ from fab.levels import Levels
 from fab.runsheet.recipe import depths_m, etch_time_s, next_target_m, resist_thickness_m
 from fab.runsheet.write import BARS, PADS, html_page, record, write_run_sheet
 from fab.units import NM, UM
-from tests.fab.sheets import DIGEST, STEM, outlook, sheet, spreads_of
+from tests.fab.sheets import DIGEST, STEM, predictions, sheet, spreads_of
 
 VOID = {"meta", "img", "br"}
 PICTURE = b"\x89PNG not really"
@@ -73,7 +73,7 @@ def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, ze
 
 
 def test_the_page_needs_nothing_else_and_repeats_job_and_digest_on_every_printed_page():
-    text = html_page(record(sheet(outlook=outlook())), "x.json", PICTURE)
+    text = html_page(record(sheet(predictions=predictions())), "x.json", PICTURE)
     page = Page(text)
     assert not [tag for tag, _ in page.tags if tag in ("script", "link", "iframe")]
     sources = [attrs["src"] or "" for _, attrs in page.tags if "src" in attrs]
@@ -95,7 +95,7 @@ def test_words_from_outside_stay_words():
 
 def test_without_predictions_the_page_promises_none():
     assert "Strehl" not in page_of(record(sheet()), None).text
-    seen = page_of(record(sheet(outlook=outlook()))).text
+    seen = page_of(record(sheet(predictions=predictions()))).text
     for words in ("0.810 / 0.810", "3.21 / 3.21", "0.654", "infinity", "50 mm", "552.1 nm", "6.45 % over-etched"):
         assert words in seen, words
     assert "one measurement only: overlay of mask 4" in seen
@@ -106,11 +106,11 @@ def test_the_same_sheet_gives_the_same_bytes_and_is_json(tmp_path):
     bytes_of = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        names = write_run_sheet(tmp_path / name, sheet(outlook=outlook()), PICTURE)
+        names = write_run_sheet(tmp_path / name, sheet(predictions=predictions()), PICTURE)
         assert names == (f"{STEM}_RUNSHEET.html", f"{STEM}_RUNSHEET.json")
         bytes_of.append([(tmp_path / name / file).read_bytes() for file in names])
     assert bytes_of[0] == bytes_of[1]
-    assert json.loads(bytes_of[0][1]) == json.loads(json.dumps(record(sheet(outlook=outlook()))))
+    assert json.loads(bytes_of[0][1]) == json.loads(json.dumps(record(sheet(predictions=predictions()))))
 
 
 def test_steps_come_in_the_order_of_use_and_say_how_to_align():
