@@ -1,6 +1,6 @@
-"""The second opinion: mask files read by a library that had no part in writing them.
+"""Mask files read by gdstk, a library that had no part in writing them.
 
-Everything here rests on gdstk and numpy alone and shares no code with the writer, the reader or the
+Everything here relies on gdstk and numpy alone and shares no code with the writer, the reader or the
 painter of this package: a mistake in those cannot hide itself. Rectangles are counted into a winding
 number per pixel by a difference array and two running sums; a sound plane has 0 and 1 only.
 

@@ -144,7 +144,7 @@ class _Found:
         }
 
 
-def _refuse(path: str | Path, rule: str, offset: int, kind: int | None = None) -> NoReturn:
+def _fail(path: str | Path, rule: str, offset: int, kind: int | None = None) -> NoReturn:
     raise InputError(str(path), rule, f"{_FOREIGN.get(kind, 'something else')} at byte {offset}", _SPOILED)
 
 
@@ -174,7 +174,7 @@ class _Stream:
         length = self._ahead(4, rule)
         kind = int.from_bytes(self.buffer[2:4].tobytes(), "big")
         if kind not in kinds or length < 4:
-            _refuse(self.path, rule, self.offset, kind)
+            _fail(self.path, rule, self.offset, kind)
         self._ahead(length, rule)
         data = self.buffer[4:length].tobytes()
         self.drop(length)
@@ -184,7 +184,7 @@ class _Stream:
         """Have some bytes ready; return the length of the record at the front."""
         while self.kept < count:
             if not self.fill():
-                _refuse(self.path, rule, self.offset)
+                _fail(self.path, rule, self.offset)
         return int.from_bytes(self.buffer[:2].tobytes(), "big")
 
 
@@ -215,17 +215,17 @@ def _read_reference(stream: _Stream) -> Reference:
     counts = stream.record(rule, gds.COLROW)[1] if kind == gds.AREF else struct.pack(">2h", 1, 1)
     points = stream.record(rule, gds.XY)[1]
     if len(counts) != 4 or len(points) != (24 if kind == gds.AREF else 8):
-        _refuse(stream.path, rule, at)
+        _fail(stream.path, rule, at)
     stream.record(rule, gds.ENDEL)
     columns, rows = struct.unpack(">2h", counts)
     if columns < 1 or rows < 1:
-        _refuse(stream.path, rule, at)
+        _fail(stream.path, rule, at)
     x, y, *ends = struct.unpack(f">{len(points) // 4}i", points)
     if not ends:
         return Reference(name, x, y)
     width, height = ends[0] - x, ends[3] - y
     if ends[1] != y or ends[2] != x or width % columns or height % rows:
-        _refuse(stream.path, rule, at)
+        _fail(stream.path, rule, at)
     return Reference(name, x, y, columns, rows, width // columns, height // rows)
 
 
@@ -237,16 +237,16 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
         read, why = found.take(stream.buffer, stream.kept)
         stream.drop(read)
         if why == _OPEN:
-            _refuse(stream.path, "every boundary must end at its first point", stream.offset)
+            _fail(stream.path, "every boundary must end at its first point", stream.offset)
         if why == _UNEXPECTED:
             rule = "a cell must hold plain boundaries (layer, datatype, points) and references only"
-            _refuse(stream.path, rule, stream.offset, int.from_bytes(stream.buffer[2:4].tobytes(), "big"))
+            _fail(stream.path, rule, stream.offset, int.from_bytes(stream.buffer[2:4].tobytes(), "big"))
         if why == _DONE:
             return Cell(name, found.shapes(), tuple(references))
         if why == _REFERENCE:
             references.append(_read_reference(stream))
         elif not stream.fill():
-            _refuse(stream.path, "the file must be whole, up to its end record", stream.offset)
+            _fail(stream.path, "the file must be whole, up to its end record", stream.offset)
 
 
 def read_gds(path: str | Path) -> Layout:
@@ -269,7 +269,7 @@ def read_gds(path: str | Path) -> Layout:
         # Zeros may follow, since some programs fill the last block of a tape.
         while stream.kept or stream.fill():
             if stream.buffer[: stream.kept].any():
-                _refuse(path, "the file must end with its end record", stream.offset)
+                _fail(path, "the file must end with its end record", stream.offset)
             stream.drop(stream.kept)
     try:
         return Layout(dbu_m, in_order(cells))

@@ -27,7 +27,6 @@ from fab.units import MM, UM, format_length
 
 BLANK, WAFER = Layer(100, 0, "BLANK_OUTLINE"), Layer(101, 0, "WAFER_OUTLINE")
 APERTURE, DIE = Layer(102, 0, "CLEAR_APERTURE"), Layer(110, 0, "DIE_BOX")
-OUTLINES = (BLANK, WAFER, APERTURE, DIE)
 
 # The rim that is held, beaded or ground.
 _RIM_M = 4 * MM
@@ -93,7 +92,9 @@ def draw_frame(
     pitch = wafer.pitch_m or math.ceil(side_m / MM - 1e-6) * MM
     if pitch < side_m - dbu_m:
         rule = f"must be {format_length(side_m)} or more, what a die with its marks needs"
-        raise InputError("wafer.pitch", rule, format_length(pitch), "Leave it out, or choose a larger one.")
+        raise InputError(
+            "wafer: pitch of the dies", rule, format_length(pitch), "Leave it out, or choose a larger one."
+        )
     raster, site_m, monitor_m = _room(wafer, pitch, site, monitor)
     wafer.require_room(raster)
     dies = _raster(raster, pitch)
@@ -122,7 +123,7 @@ def draw_frame(
     labels = _labels(plates, wafer, stem, level_map.digest, dbu_m)
     top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
     sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
-    # Every die has its marks; the coordinates are told for the one in the middle.
+    # Every die has its marks; the places are those of the one in the middle.
     middle = dies[len(dies) // 2]
     beside = prefixed(moved(marks, *middle), "middle die: ")
     places = joined([*sites, beside, moved(monitor, 0, monitor_m), labels]).places

@@ -2,7 +2,7 @@
 
 Letters stand on a raster of 5 x 7 strokes, one stroke apart. They are drawn square, and a slope is a stair whose steps
 overlap, so that no two rectangles touch at a corner only. Every line and every gap is one stroke wide or more; a zero
-has a dot, to be told from an O.
+has a dot, unlike an O.
 """
 
 from collections.abc import Sequence

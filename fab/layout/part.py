@@ -1,6 +1,6 @@
 """Parts: what is drawn beside the DOE (marks, test structures, lettering), and the plates it is drawn for.
 
-A part is small, lies about its own origin and knows the points that people measure at. It is moved and joined with
+A part is small, lies about its own origin and lists the points that people measure at. It is moved and joined with
 others, never turned or mirrored, because a mirrored mark would say that a plate is the right way round when it is not.
 
 A plate is one mask: its layer, and what its polygons are on the plate. On an etch layer a polygon means "etched here",

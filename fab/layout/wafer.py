@@ -48,15 +48,15 @@ class Wafer:
         for name in ("diameter_m", "thickness_m", "blank_m"):
             if not 0 < getattr(self, name) < 1:
                 got = format_length(getattr(self, name))
-                raise InputError(f"wafer.{name}", "must be positive and below 1 m", got, "Mend it.")
+                raise InputError(f"wafer: {name}", "must be positive and below 1 m", got, "Check its unit.")
         if self.blank_m < self.diameter_m:
             rule = f"must hold the wafer of {format_length(self.diameter_m)}"
-            raise InputError("wafer.blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
+            raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
         if self.dies is not None and min(self.dies) < 1:
-            raise InputError("wafer.dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
+            raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
         if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
             got = ", ".join(format_length(move) for move in self.line_splits_m)
-            raise InputError("wafer.line_splits", "must lie from 1 nm to 100 um, out or in", got, "Mend them.")
+            raise InputError("wafer: line splits", "must lie from 1 nm to 100 um, out or in", got, "Check their unit.")
         if self.dies is not None:
             self.require_room(self.dies)
 
@@ -67,7 +67,7 @@ class Wafer:
         if split >= rows * columns:
             rule = "must leave one die or more as ordered"
             got = f"{split} of {rows * columns} dies"
-            raise InputError("wafer.line_splits", rule, got, "Take fewer splits, or more dies.")
+            raise InputError("wafer: line splits", rule, got, "Take fewer splits, or more dies.")
 
     @property
     def usual_flat_m(self) -> float:

@@ -124,7 +124,7 @@ def _freeze(task, side, origin, frozen, active):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _part(task, side, origin, frozen, active):  # pragma: no cover - compiled
-    # Frozen squares can only still touch at corners: give them another depth where that mends more than it breaks.
+    # Frozen squares can only still touch at corners: give them another depth where that repairs more than it breaks.
     # Every move leaves less broken, so this ends.
     moved = 0
     for j in range(frozen.shape[0]):

@@ -1,8 +1,8 @@
-"""Moves of a repair: rectangles of pixels that take another depth, and what they do to the rules and to the light.
+"""Moves of a repair: rectangles of pixels that take another depth, and their effect on rules and light.
 
 The energy of a map is the weighted sum of the pixels by which runs are too short and of the corners that touch, over
 all bit planes at once, and of the error of every pixel. A depth is a number whose bits are the masks that etch. The
-functions look at no more than the surroundings of a rectangle, so moves far apart know nothing of each other.
+functions look at no more than the surroundings of a rectangle, so moves far apart do not influence each other.
 """
 
 from typing import NamedTuple
@@ -164,7 +164,7 @@ def _improve(task, y, x, weight):  # pragma: no cover - compiled
                 for u in range(x0, x1):
                     etched[v, u] = depths[i]
             change = loss(task, y0, x0, y1, x1) - before
-            # A move that costs more light than it can mend needs no look at the rules.
+            # A move that costs more light than it can repair is not checked against the rules.
             if change < best:
                 change += weight * broken(task, y0, x0, y1, x1)
             if change < best:

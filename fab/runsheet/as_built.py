@@ -1,4 +1,4 @@
-"""What a lab measured: the run sheet's JSON, read back with the blanks filled in.
+"""Measurements of a lab: the run sheet's JSON, read back with the blanks filled in.
 
 Anything may stay null, which means that it was not measured. What is there has to be possible: a depth in micrometres
 where nanometres are asked for, a wall measured from the horizontal or a share in per cent is refused by its key.

@@ -1,4 +1,4 @@
-"""What an operator does with each plate, step by step, and the arithmetic of a run sheet.
+"""Recipe for each photomask, step by step, and the arithmetic of a run sheet.
 
 The recipes are ordinary ones for fused silica: positive resist, reactive ions through it, chrome by lift-off or wet
 etch. Doses, bakes and times belong to the lab and are left blank; what follows from the order is filled in.

@@ -1,6 +1,6 @@
-"""What stands on a run sheet, in SI units: the order, the wafer, the process, and what the lab should see.
+"""Content of a run sheet in SI units: the order, the wafer, the process, and what the lab should see.
 
-`fab` knows no light: what the finished plate should show comes as plain numbers (`Predictions`).
+Predictions of the light come as plain numbers from outside, since `fab` does not compute it.
 """
 
 from collections.abc import Mapping

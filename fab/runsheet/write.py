@@ -1,4 +1,4 @@
-"""The run sheet: what the cleanroom does to one wafer, with blanks for what it measures.
+"""The run sheet: the work of the cleanroom on one wafer, with blanks for measurements.
 
 The same sheet comes as a page to print and write on, and as JSON. What was written on paper goes into the JSON under
 "measured", and `fab.runsheet.as_built` reads it back; null stands for what was not measured.

@@ -1,4 +1,4 @@
-"""Cells: what a solid, a mesh or an optics program gets of a map, because none of them takes all of it.
+"""Columns: the part of a map that a solid, a mesh or an optics program gets, because none of them takes all of it.
 
 CAD programs, viewers and slicers choke on tens of millions of faces, so a map is either cut to a window at full
 resolution or reduced: blocks of pixels become one column of their mean height, which keeps the volume.

@@ -1,4 +1,4 @@
-"""What the solids, meshes and height maps of an order show, and what a kind of file is."""
+"""The DOE as the solids, meshes and height maps of an order show it, and the kinds of their files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field

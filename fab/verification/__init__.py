@@ -1,6 +1,6 @@
 """The proof of a mask order from its files alone.
 
 verify        every check of an order, and the report
-compare       what was read against what should be there
-shop_checks   what a mask shop looks at, whatever is drawn
+compare       content of the files against what should be there
+shop_checks   checks of a mask shop, whatever is drawn
 """

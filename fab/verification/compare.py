@@ -1,4 +1,4 @@
-"""What was read from a mask file against what it should hold; every difference becomes a sentence.
+"""Comparison of what was read from a mask file with what it should hold; every difference becomes a sentence.
 
 Pure comparisons, no files. The sentences name the layer, how many pixels or shapes differ, and the first.
 """

@@ -157,13 +157,13 @@ def number_problems(expected: Expected) -> dict[str, list[str]]:
         found = [None if n is None else round(n * pitch_m / UM, 6) for n in smallest_runs(expected.planes[mask.bit])]
         stated = [mask.smallest_width_um, mask.smallest_space_um]
         if found != stated:
-            told = f"narrowest line and space are {found} um and not {stated} um as the manifest says"
-            problems.setdefault(mask.file, []).append(told)
+            difference = f"narrowest line and space are {found} um and not {stated} um as the manifest says"
+            problems.setdefault(mask.file, []).append(difference)
     try:
         report = check(expected.level_map, Rules(**manifest.rules.get("rules", {})))
     except (TypeError, InputError) as error:
         return {**problems, "manifest.json": [f"the rules cannot be read: {error}"]}
     if canonical_json(report.as_record()) != canonical_json(manifest.rules):
-        said = "lines, spaces, corners and density are not those that the rules find in the level map"
-        problems["manifest.json"] = [said]
+        difference = "lines, spaces, corners and density are not those that the rules find in the level map"
+        problems["manifest.json"] = [difference]
     return problems
