@@ -200,6 +200,8 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     targets = [term.target for term in problem.terms if term.target is not None]
     if targets:
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
-        save(plot_pattern(targets[0], achieved, camera, **patterns[0]), run.path("pattern.png"))
+        efficiency, uniformity = (patterns[0][name] for name in ("efficiency", "uniformity"))
+        drawn = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)
+        save(drawn, run.path("pattern.png"))
         names.append("pattern.png")
     return names

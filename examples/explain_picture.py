@@ -47,7 +47,8 @@ def draw(path: Path, answer: Answer) -> None:
     near = [f"near {k}" for k in range(len(answer.shown))]
     title = "From 3:1 to 1:1: which errors of a 16-level plate would do it?"
     with panels(None, (11.0, 8.7), title, words) as figure:
-        at = figure.subplot_mosaic([["errors"] * 3 + ["lifts"] * 3, ["both"] * 3 + near], height_ratios=(3.1, 3.55))
+        mosaic: Any = [["errors"] * 3 + ["lifts"] * 3, ["both"] * 3 + near]
+        at = figure.subplot_mosaic(mosaic, height_ratios=(3.1, 3.55))
         _draw_errors(at["errors"], answer)
         _draw_lifts(at["lifts"], answer)
         _draw_both(at["both"], answer)

@@ -15,6 +15,7 @@ from doedesign.design.design import Design
 from doedesign.prediction import Prediction, predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import level_map_of_run
+from fab.level_map import LevelMap
 from fab.process import Normal, Process, Variation
 from fab.units import NM, UM
 from sim.camera import Camera, Colour

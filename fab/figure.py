@@ -28,30 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-__all__ = [
-    "CHROME",
-    "DPI",
-    "FAINT",
-    "HEIGHTS",
-    "INK",
-    "LIGHT",
-    "LINE",
-    "MARK",
-    "SERIES",
-    "SMALL",
-    "bare",
-    "evenly_spaced",
-    "extent_of",
-    "html_of",
-    "length_text",
-    "panels",
-    "png_bytes",
-    "save",
-    "scale_bar",
-    "shrunk",
-    "single",
-]
-
 INK, FAINT, CHROME, MARK, LINE = "#222222", "#9aa0a6", "#8c8f94", "#d1495b", "#14507a"
 HEIGHTS, LIGHT = "viridis", "inferno"
 # The hues of M. Okabe and K. Ito, which stay apart for colour-blind readers.
@@ -152,7 +128,8 @@ def panels(
         _head_and_foot(figure, size_in[0], title, textwrap.fill(note, max(20, int(15.5 * size_in[0]))))
         yield figure
         # One pass leaves texts some dots off, since panels of fixed aspect move; drawing makes the second.
-        figure.get_layout_engine().execute(figure)
+        engine: Any = figure.get_layout_engine()
+        engine.execute(figure)
 
 
 @contextmanager
@@ -252,7 +229,7 @@ def _mean_over_parts(values: NDArray[Any], count: int) -> NDArray[np.float32]:
     return ((sums - before[:-1] + before[1:]) * (count / size)).astype(np.float32)
 
 
-def shrunk(values: NDArray[np.floating], most: int, kind: Literal["mean", "smooth"] = "mean") -> NDArray[np.floating]:
+def shrunk(values: NDArray[Any], most: int, kind: Literal["mean", "smooth"] = "mean") -> NDArray[Any]:
     """Average a map so that neither side has more than `most` samples; a smaller map is returned as it is.
 
     Args:

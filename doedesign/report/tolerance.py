@@ -30,15 +30,6 @@ if TYPE_CHECKING:
     from doedesign.spec import LimitSpec
     from sim.camera import Camera
 
-__all__ = [
-    "limit_place",
-    "plot_budget",
-    "plot_changes",
-    "plot_histograms",
-    "plot_shares",
-    "plot_yield",
-]
-
 _MOST_BARS = 10
 _COLUMNS = 3
 _LOWER, _HIGHER = SERIES[5], LINE
@@ -175,7 +166,8 @@ def plot_yield(table: PlateTable, limits: Sequence["LimitSpec"] = (), ax: "Axes 
             axes.set_xlim(edges[0], edges[-1])
             _shade(axes, [one for one in limits if one.quantity == quantity], _scale(quantity))
             for hue, (where, values) in zip(SERIES, curves.items(), strict=False):
-                _plot_yield_curve(axes, values, quantity, hue, limit_place(*where) if len(places) > 1 else "")
+                words = ", ".join([where[0] or "", *([length_text(where[1])] if where[1] is not None else [])])
+                _plot_yield_curve(axes, values, quantity, hue, words.removeprefix(", ") or "all")
             axes.set_ylim(0, 103)
             axes.set_ylabel("yield (%)")
             axes.grid(True)
@@ -184,11 +176,6 @@ def plot_yield(table: PlateTable, limits: Sequence["LimitSpec"] = (), ax: "Axes 
             if len(places) > 1:
                 axes.legend(loc="best")
     return figure
-
-
-def limit_place(colour: str | None, depth_m: float | None) -> str:
-    """Rows that a limit concerns, in words."""
-    return ", ".join([*([colour] if colour else []), *([length_text(depth_m)] if depth_m is not None else [])]) or "all"
 
 
 def _plot_yield_curve(axes: "Axes", values: Float[np.ndarray, " plate"], quantity: str, hue: str, label: str) -> None:

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.figure import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, panels, scale_bar, shrunk
+from fab.figure import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, panels, shrunk
 from fab.height import HeightMap
 from fab.levels import Levels
-from fab.plots.maps import Window, box_mm, frame_window, window_around
+from fab.plots.maps import box_mm, frame_window, show_map, window_around
 from fab.units import MM, NM
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ def plot_height(
         right_m = height.aperture_m / 2 - _WINDOW / 2 * grid.pitch_m
         for name, x_m in (("centre", 0.0), ("edge", right_m)):
             window = window_around(grid, 0.0, x_m, _WINDOW)
-            _draw_window(at[name], height, inside, window, name, style)
+            cells = np.ma.array(height.height_m[window] / NM, mask=~inside[window])
+            show_map(at[name], cells, grid, window, f"{name}, {length_text(grid.pitch_m)} cells", **style)
             frame_window(at["whole"], grid, window, name)
         _draw_shares(figure, at["scale"], at["shares"], heights, levels, ends, style)
     return figure
@@ -91,19 +92,9 @@ def _draw_whole(axes: "Axes", height: HeightMap, inside: NDArray[np.bool_], styl
     axes.locator_params(nbins=6, steps=[1, 2, 5, 10])
 
 
-def _draw_window(
-    axes: "Axes", height: HeightMap, inside: NDArray[np.bool_], window: Window, name: str, style: dict[str, Any]
-) -> None:
-    cells = np.ma.array(height.height_m[window] / NM, mask=~inside[window])
-    box = box_mm(height.grid, window)
-    axes.imshow(cells, origin="lower", extent=box, interpolation="nearest", **style)
-    axes.set_title(f"{name}, {length_text(height.grid.pitch_m)} cells")
-    scale_bar(axes, (box[1] - box[0]) * MM)
-
-
 def height_shares(
     heights: NDArray[np.floating], levels: Levels | None, ends_m: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Share of the cells at every height.
 
     Args:

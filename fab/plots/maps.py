@@ -2,14 +2,17 @@
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fab.figure import MARK, SMALL
+from numpy.typing import NDArray
+
+from fab.figure import MARK, SMALL, scale_bar
 from fab.grid import Grid
 from fab.units import MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
 
-__all__ = ["Window", "box_mm", "frame_window", "window_around"]
+__all__ = ["Window", "box_mm", "frame_window", "show_map", "window_around"]
 
 
 class Window(NamedTuple):
@@ -38,6 +41,17 @@ def box_mm(grid: Grid, window: Window | None = None) -> tuple[float, float, floa
         for part, n in ((rows, grid.shape[0]), (columns, grid.shape[1]))
     )
     return x0, x1, y0, y1
+
+
+def show_map(
+    axes: "Axes", values: NDArray[Any], grid: Grid, window: Window | None = None, title: str = "", **style: Any
+) -> "AxesImage":
+    """Show a raster, or a window of it, with axes in millimetres but for their numbers, over a scale bar."""
+    box = box_mm(grid, window)
+    image = axes.imshow(values, origin="lower", extent=box, interpolation="nearest", **style)
+    axes.set_title(title)
+    scale_bar(axes, (box[1] - box[0]) * MM)
+    return image
 
 
 def frame_window(axes: "Axes", grid: Grid, window: Window, name: str = "") -> None:

@@ -8,11 +8,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
 from fab.level_map import LevelMap
-from fab.plots.maps import Window, box_mm, frame_window, window_around
+from fab.plots.maps import Window, box_mm, frame_window, show_map, window_around
 from fab.units import MM, NM, UM, format_length
 
 if TYPE_CHECKING:
@@ -46,7 +45,8 @@ def plot_masks(
     columns = max(3, levels.bits)
     upper_in, lower_in = _SIDE_IN * columns / 3 + 0.4, 2 * _SIDE_IN + 0.9
     with panels(ax, (_SIDE_IN * columns + 0.3, upper_in + lower_in + 0.4), title) as figure:
-        above, below = figure.subfigures(2, 1, height_ratios=(upper_in, lower_in))
+        parts: Any = figure.subfigures(2, 1, height_ratios=(upper_in, lower_in))
+        above, below = parts
         heights, detail, chrome = above.subplots(1, 3)
         _draw_heights(above, heights, detail, level_map, window)
         _draw_chrome(chrome, level_map, chrome_m)
@@ -55,18 +55,11 @@ def plot_masks(
         for bit, plane in enumerate(level_map.planes()):
             depth = format_length(levels.etch_depth_m(bit))
             words = f"mask {bit + 1}: etches {depth}\nwhere blue, {100 * np.count_nonzero(plane) / plane.size:.1f} %"
-            _show(panes[0, bit], shrunk(plane, _MOST), box_mm(grid), words, **style)
-            _show(panes[1, bit], plane[window], box_mm(grid, window), f"mask {bit + 1}, window", **style)
+            show_map(panes[0, bit], shrunk(plane, _MOST), grid, None, words, **style)
+            show_map(panes[1, bit], plane[window], grid, window, f"mask {bit + 1}, window", **style)
         for spare in panes[:, levels.bits :].flat:
             spare.set_axis_off()
     return figure
-
-
-def _show(axes: "Axes", values: NDArray[Any], box: tuple[float, float, float, float], title: str, **style: Any) -> Any:
-    image = axes.imshow(values, origin="lower", extent=box, interpolation="nearest", **style)
-    axes.set_title(title)
-    scale_bar(axes, (box[1] - box[0]) * MM)
-    return image
 
 
 def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map: LevelMap, window: Window) -> None:
@@ -78,9 +71,9 @@ def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map
     heights_nm = level_map.height_m / np.float32(NM)
     ny, nx = grid.shape
     words = f"height: {nx} × {ny} pixels of {grid.pitch_m / UM:.6g} µm"
-    _show(whole, shrunk(heights_nm, _MOST), box_mm(grid), words, **style)
+    show_map(whole, shrunk(heights_nm, _MOST), grid, None, words, **style)
     frame_window(whole, grid, window)
-    image = _show(detail, heights_nm[window], box_mm(grid, window), "height, the window framed in red", **style)
+    image = show_map(detail, heights_nm[window], grid, window, "height, the window framed in red", **style)
     bar = figure.colorbar(image, cax=detail.inset_axes((1.03, 0, 0.05, 1)))
     bar.set_ticks(stairs_nm[:: max(1, levels.count // 16)].tolist())
     bar.set_label("height above the deepest floor (nm)")

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.figure import MARK, length_text, panels, scale_bar, shrunk
+from fab.figure import MARK, length_text, panels, shrunk
 from fab.grid import Grid
 from fab.layout.polygons import run_lengths
-from fab.plots.maps import Window, box_mm, frame_window, window_around
+from fab.plots.maps import Window, box_mm, frame_window, show_map, window_around
 from fab.rules.check import PlaneRules, Rules, RulesReport, shortest_run
 from fab.units import MM
 
@@ -139,8 +139,7 @@ def _draw_whole(axes: "Axes", pane: _Pane) -> None:
     # From a colour that is seen on any ground to the full one where all of a block is broken.
     weight = np.where(broken > 0, 0.6 + 0.4 * np.minimum(broken, 1), 0.0)[..., None]
     x0, x1, y0, y1 = box_mm(grid)
-    shown = image + weight * (worst - image)
-    axes.imshow(shown, origin="lower", extent=(x0, x1, y0, y1), interpolation="nearest", aspect="equal")
+    show_map(axes, image + weight * (worst - image), grid)
     rows, columns = np.nonzero(broken)
     if len(rows) <= _MOST_RINGS:
         ny, nx = broken.shape
@@ -148,16 +147,13 @@ def _draw_whole(axes: "Axes", pane: _Pane) -> None:
         rings: Any = worst[rows, columns]
         axes.scatter(*middle, s=36, facecolors="none", edgecolors=rings, linewidths=1.2)
     frame_window(axes, grid, pane.window)
-    scale_bar(axes, grid.extent_m[1])
 
 
 def _draw_window(axes: "Axes", pane: _Pane) -> None:
     window, pitch_mm = pane.window, pane.grid.pitch_m / MM
     box = box_mm(pane.grid, window)
     image = _colours()[np.where(pane.inside[window], pane.codes[window], 5)]
-    axes.imshow(image, origin="lower", extent=box, interpolation="nearest")
+    show_map(axes, image, pane.grid, window)
     ys, xs = np.nonzero(pane.corners[window])
     axes.plot(box[0] + (xs + 1) * pitch_mm, box[2] + (ys + 1) * pitch_mm, "x", color=_KISSING, ms=3.5, mew=0.9)
-    axes.set(xlim=box[:2], ylim=box[2:])
     axes.spines[:].set_color(MARK)
-    scale_bar(axes, (box[1] - box[0]) * MM)

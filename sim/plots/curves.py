@@ -13,15 +13,15 @@ from jaxtyping import Float
 from fab.figure import FAINT, INK, evenly_spaced, length_text, panels
 from fab.units import MM, UM
 from sim.camera import Camera
+from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, line_colours
+from sim.psf_bank import PsfBank
+from sim.transfer import TransferBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
     from matplotlib.lines import Line2D
-
-    from sim.psf_bank import PsfBank
-    from sim.transfer import TransferBank
 
 __all__ = ["plot_encircled", "plot_mtf"]
 
@@ -37,11 +37,11 @@ _Finish = Callable[["Axes", int, str], None]
 
 
 def plot_mtf(
-    transfer: "TransferBank",
+    transfer: TransferBank,
     camera: Camera,
     near_m: Sequence[float],
     far_m: Sequence[float],
-    lens: "TransferBank | None" = None,
+    lens: TransferBank | None = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
     """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
@@ -75,11 +75,11 @@ def plot_mtf(
 
 
 def plot_encircled(
-    bank: "PsfBank",
+    bank: PsfBank,
     camera: Camera,
     near_m: Sequence[float],
     far_m: Sequence[float],
-    lens: "PsfBank | None" = None,
+    lens: PsfBank | None = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
     """Draw the share of the incident light inside centred circles of growing radius.
@@ -97,8 +97,6 @@ def plot_encircled(
     Raises:
         ValueError: no depth is given, or one is not in a bank.
     """
-    from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
-
     hues = line_colours(camera.colours)
     radii = bank.pixel_m * np.geomspace(1.0, bank.energy.shape[-1] / np.sqrt(2), _RADII)
     both = [

@@ -7,14 +7,13 @@ import numpy as np
 
 from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, scale_bar, shrunk
 from sim.camera import Camera
+from sim.leakage import SplitPsf
 from sim.plots.colours import colour_label
+from sim.psf_bank import PsfBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
-
-    from sim.leakage import SplitPsf
-    from sim.psf_bank import PsfBank
 
 __all__ = ["plot_split"]
 
@@ -22,8 +21,8 @@ _SIDE, _MOST_ROWS = 2.2, 4
 
 
 def plot_split(
-    nominal: "PsfBank",
-    splits: "Mapping[tuple[int, int], SplitPsf]",
+    nominal: PsfBank,
+    splits: Mapping[tuple[int, int], SplitPsf],
     camera: Camera,
     depth: int,
     orders: Sequence[tuple[float, float]],

@@ -53,15 +53,14 @@ def plot_pattern(
     titles = ("target", f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %")
     with panels(ax, (8.3, 3.95), layout="compressed") as figure:
         panes = figure.subplots(1, 2, sharex=True, sharey=True)
+        norm, box = PowerNorm(0.5, 0.0, top, clip=True), extent_of(target.shape, camera.pixel_m, UM)
         for axes, image, title in zip(panes, images, titles, strict=True):
-            norm = PowerNorm(0.5, 0.0, top, clip=True)
-            box = extent_of(target.shape, camera.pixel_m, UM)
-            shown = axes.imshow(image, origin="lower", extent=box, norm=norm, cmap=LIGHT, interpolation="auto")
+            axes.imshow(image, origin="lower", extent=box, norm=norm, cmap=LIGHT, interpolation="auto")
             axes.set_title(title)
             axes.set_xlabel("x (µm)")
         panes[0].set_ylabel("y (µm)")
         panes[0].locator_params(nbins=5, steps=[1, 2, 5, 10])
         above = "max" if float(images[1].max()) > top else "neither"
-        bar = figure.colorbar(shown, ax=list(panes), extend=above, format="{x:.2g}", ticks=MaxNLocator(4))
+        bar = figure.colorbar(panes[0].images[0], ax=list(panes), extend=above, format="{x:.2g}", ticks=MaxNLocator(4))
         bar.set_label("share of light per pixel")
     return figure

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from doedesign.report.history import plot_history, plot_training
 from fab.figure import png_bytes
@@ -11,13 +12,18 @@ RECORDS = [{"step": i, "loss": 1 / (i + 1), "terms": [0.3, 0.9 / (i + 1)], "name
 TRAINING = [{"step": i, "loss": 1 / (i + 1), "parts": {"l1": 0.5 / (i + 1), "masked": 0.0}} for i in range(130)]
 
 
+def legend_of(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    assert legend is not None
+    return [text.get_text() for text in legend.get_texts()]
+
+
 def test_a_long_history_is_drawn_under_its_mean():
     axes = plot_history(RECORDS)
     require_whole(axes)
     assert png_bytes(axes) == png_bytes(plot_history(RECORDS))
     require_place_of_axes(lambda ax: plot_history(RECORDS, ax))
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["loss", "a", "b"]
+    assert legend_of(axes) == ["loss", "a", "b"]
     assert "mean of 2" in axes.get_xlabel()
     faint, mean = axes.lines[:2]
     np.testing.assert_array_equal(faint.get_ydata(), [record["loss"] for record in RECORDS])
@@ -27,14 +33,14 @@ def test_a_long_history_is_drawn_under_its_mean():
 
 def test_an_only_term_is_the_loss():
     axes = plot_history([{"step": i, "loss": 0.5, "terms": [0.5], "names": ["a"]} for i in range(3)])
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["loss"]
+    assert legend_of(axes) == ["loss"]
 
 
 def test_a_training_shows_no_term_without_weight():
     figure = plot_training(TRAINING, "small")
     require_whole(figure)
     require_place_of_axes(lambda ax: plot_training(TRAINING, "small", ax))
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["loss", "l1"]
+    assert legend_of(figure.get_figure(root=True).axes[0]) == ["loss", "l1"]
 
 
 def test_no_steps_are_a_mistake():
