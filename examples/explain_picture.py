@@ -163,6 +163,7 @@ def _draw_near(axes: "Axes", bench: Bench, seen: Seen, prediction: "Prediction",
     axes.add_patch(Circle((0, 0), radius, fill=False, color="white", lw=0.7, ls="--"))
     axes.set(xticks=[], yticks=[])
     plate = seen.plate
-    titles = ("no errors\nlift 0", f"{plate.error}\n{plate.size}, lift {plate.lift}", f"the same\nat lift {plate.lift}")
+    sizes = plate.size.replace(", ", ",\n")
+    titles = ("no errors\nlift 0", f"{plate.error}\n{sizes}, lift {plate.lift}", f"the same\nat lift {plate.lift}")
     axes.set_title(titles[index].replace("um", "µm"), fontsize=SMALL)
     axes.set_xlabel(f"{seen.ratio:.2f}:1\nin the window {seen.throughput:.2f}", fontsize=SMALL)

@@ -111,25 +111,32 @@ def panels(
     Raises:
         ValueError: the axes are no subplot.
     """
-    if ax is not None:
-        place = ax.get_subplotspec()
-        parent = ax.get_figure()
-        if place is None or parent is None:
-            raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
-        ax.remove()
-        figure = parent.add_subfigure(place)
-        with _house_style():
-            _head_and_foot(figure, size_in[0], title, note)
-            yield figure
-        return
     with _house_style():
-        figure = _figure_class()(figsize=size_in, layout=layout)
-        # A right margin, which matplotlib's own wrapping of the note would leave out.
-        _head_and_foot(figure, size_in[0], title, textwrap.fill(note, max(20, int(15.5 * size_in[0]))))
+        if ax is None:
+            figure = _figure_class()(figsize=size_in, layout=layout)
+            # A right margin, which matplotlib's own wrapping would leave out.
+            note = textwrap.fill(note, max(20, int(15.5 * size_in[0])))
+        else:
+            figure = _sub_figure(ax)
+        if title:
+            line = textwrap.shorten(title, int(12 * size_in[0]), placeholder="…")
+            figure.suptitle(line, x=0.01, ha="left", fontsize=12, parse_math=False)
+        if note:
+            figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, wrap=True, linespacing=1.3, parse_math=False)
         yield figure
         # One pass leaves texts some dots off, since panels of fixed aspect move; drawing makes the second.
-        engine: Any = figure.get_layout_engine()
-        engine.execute(figure)
+        root: Any = figure.get_figure(root=True)
+        if engine := root.get_layout_engine():
+            engine.execute(root)
+
+
+def _sub_figure(ax: "Axes") -> "FigureBase":
+    """Replace axes by a sub-figure."""
+    place, parent = ax.get_subplotspec(), ax.get_figure()
+    if place is None or parent is None:
+        raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
+    ax.remove()
+    return parent.add_subfigure(place)
 
 
 @contextmanager
@@ -141,14 +148,6 @@ def single(ax: "Axes | None", size_in: tuple[float, float], title: str = "", not
     else:
         ax.set_title(title, parse_math=False)
         yield ax
-
-
-def _head_and_foot(figure: "FigureBase", width_in: float, title: str, note: str) -> None:
-    if title:
-        line = textwrap.shorten(title, int(12 * width_in), placeholder="…")
-        figure.suptitle(line, x=0.01, ha="left", fontsize=12, parse_math=False)
-    if note:
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, wrap=True, linespacing=1.3, parse_math=False)
 
 
 def png_bytes(drawn: "Axes | FigureBase") -> bytes:
