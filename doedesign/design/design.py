@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
+    from sim.optic import HeightOptic
     from sim.surface import FabricatedDoe
 
 
@@ -76,6 +77,12 @@ class Design:
     def depths_m(self) -> tuple[float, ...]:
         """All source distances, near ones first, metres."""
         return (*self.near_m, *self.far_m)
+
+    def as_optic(self) -> "HeightOptic":
+        """The optic of the design as drawn, which `sim.psf` asks for PSFs."""
+        from sim.optic import HeightOptic
+
+        return HeightOptic.of(self.camera, self.height_m)
 
     def bare(self) -> "Design":
         """The same without what only its optimisation knew: what other processes need to predict it."""
