@@ -82,22 +82,21 @@ def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, override
 
 
 def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Sequence[str]) -> Design:
-    inputs = input_digests(files)
-    with claim_run(folder, spec, inputs) as run:
+    with claim_run(folder, spec, input_digests(files), overrides) as run:
         if run.done:
             log.info(f"{folder} already holds the finished run of this spec")
             return open_design(open_run(folder), levels=spec.process.levels)
         log.info("preparing sources and propagation")
         problem, sources = problem_of(spec, files)
         state, history = _resume(run, problem, sources, files)
-        begin_run(run, inputs, overrides)
+        begin_run(run)
         state, history = _iterate(problem, sources, spec, state, history, _saving(run))
         log.info("evaluating the design")
         design = finished_design(spec, problem, state, history)
         if spec.process.chooses_depths:
             log.info(f"chosen: {design.levels}")
         results = _write_results(run, problem, design)
-        finish_run(run, inputs, overrides, results, design.levels.depths_m)
+        finish_run(run, results, design.levels.depths_m)
     return open_design(open_run(folder), levels=spec.process.levels)
 
 

@@ -1,8 +1,8 @@
-"""Run folders: one design from its spec to its results, named by what made it.
+"""Run folders: one design from its spec to its results.
 
     runs/NAME/
-        manifest.json           what this is: spec digest, inputs, version, digests of all results when done, and the
-                                depths of the etches if the run was to choose them
+        manifest.json           spec digest, inputs, version, digests of all results when done, and the depths of the
+                                etches if the run was to choose them
         spec.toml               the spec with every default and override filled in
         checkpoint.npz          parameters, Adam's moments and history; only while the run is unfinished
         level_map.npz           the design: level of every cell, staircase, grid and aperture (`fab.level_map`)
@@ -12,7 +12,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.design.metrics`
         *.png                   pictures
-        psf/, fabricated/, simulated/, trained/, tolerance/, calibrate/     what later commands found
+        psf/, fabricated/, simulated/, trained/, tolerance/, calibrate/     results of later commands
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
@@ -26,24 +26,25 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from doedesign import __version__
+from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
 from fab.archive import read_archive, write_archive
-from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_toml
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
 
 FORMAT = "doedesign run 1"
-TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a plate of its own
+TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of its own
 CHECKPOINT = "checkpoint.npz"
 LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
 _DEPTHS = "etch_depths_m"
-# Of the sensor, what a plate is designed for.
+# The part of the sensor that a DOE is designed for.
 _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
@@ -54,46 +55,79 @@ _UNFINISHED = re.compile(
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder and the spec it belongs to.
+    """Run folder and the spec it belongs to.
 
     Attributes:
         folder: the folder.
-        spec: what was asked for; of a finished run, with the depths of the etches that it chose.
+        spec: the spec; of a finished run, with the depths of the etches that it chose.
         done: whether the run is finished.
+        inputs: of a claimed run, the digests of the files that the spec names, by key.
+        overrides: of a claimed run, the changes that led to the spec, "table.key=value".
     """
 
     folder: Path
     spec: Spec
     done: bool
+    inputs: Mapping[str, str] = field(default_factory=dict, compare=False)
+    overrides: Sequence[str] = field(default=(), compare=False)
 
     def path(self, name: str) -> Path:
-        """A file of the run."""
+        """Path of a file of the run."""
         return self.folder / name
 
 
-def _manifest(spec: Spec, inputs: Mapping[str, str], overrides: Sequence[str], state: str) -> dict[str, Any]:
-    return {
+class _Manifest(BaseModel):
+    """Keys of a manifest that are relied upon."""
+
+    format: str
+    state: str
+    spec_sha256: str
+    inputs_sha256: dict[str, str] = {}
+    etch_depths_m: Any = None
+
+
+class _FinishedManifest(_Manifest):
+    results_sha256: dict[str, str]
+
+
+def _write_manifest(run: Run, state: str, results: Mapping[str, Any]) -> None:
+    manifest = {
         "format": FORMAT,
-        "name": spec.name,
+        "name": run.spec.name,
         "version": __version__,
         "state": state,
-        "spec_sha256": spec_digest(spec),
-        "inputs_sha256": dict(inputs),
-        "overrides": list(overrides),
+        "spec_sha256": spec_digest(run.spec),
+        "inputs_sha256": dict(run.inputs),
+        "overrides": list(run.overrides),
         "units": "SI; arrays [y, x], row 0 at the lowest y",
     }
+    write_atomic(run.path(MANIFEST_NAME), canonical_json({**manifest, **results}))
+
+
+def _read_manifest(folder: Path, formats: Sequence[str] = (FORMAT,)) -> _Manifest:
+    path = folder / MANIFEST_NAME
+    raw = read_json(path)
+    if raw.get("format") not in formats:
+        rule = "must say format " + " or ".join(f'"{name}"' for name in formats)
+        raise InputError(str(path), rule, repr(raw.get("format")), "Give a folder that this version wrote.")
+    try:
+        return (_FinishedManifest if raw.get("state") == "done" else _Manifest).model_validate(raw)
+    except ValidationError as error:
+        key = str(error.errors()[0]["loc"][0])
+        cure = f"Remove {folder} and optimise again."
+        raise InputError(str(path), f"must hold {key}", repr(raw.get(key)), cure) from error
 
 
 def input_digests(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 of every input file by its key in the spec."""
+    """Return the SHA-256 of every input file by its key in the spec."""
     return {key: sha256_file(path) for key, path in files.items()}
 
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a run folder, and clear away what a killed one was writing there.
+    """Keep other processes out of a run folder, and remove the temporary files of a killed one.
 
-    The system lets go of the folder when this process ends, however it ends.
+    The system unlocks the folder when this process ends, however it ends.
 
     Args:
         folder: the run folder; made if missing.
@@ -111,9 +145,8 @@ def alone_in(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise InputError(
-                    str(folder), "only one process may work in a run folder", "a second one", "Wait for the first."
-                ) from error
+                rule = "only one process may work in a run folder"
+                raise InputError(str(folder), rule, "a second one", "Wait for the first.") from error
         for path in folder.iterdir():
             if _UNFINISHED.fullmatch(path.name):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -123,13 +156,14 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> Iterator[Run]:
-    """Keep a folder for a spec: one for a new run, an unfinished run to resume, or a finished one.
+def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Sequence[str] = ()) -> Iterator[Run]:
+    """Lock the folder of a run: one for a new run, an unfinished run to resume, or a finished one.
 
     Args:
         folder: the run folder; made if missing.
         spec: the spec.
-        inputs: digests of the files the spec names.
+        inputs: digests of the files the spec names, by key.
+        overrides: changes that led to the spec, "table.key=value", for the record.
 
     Yields:
         the run. Nothing is written before `begin_run`.
@@ -138,76 +172,54 @@ def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> Iterator[R
         InputError: the folder belongs to another spec, to other inputs, or to something else altogether; its
             results changed since; or another process works in it.
     """
+    cure = "Choose another output folder."
     if folder.exists() and not folder.is_dir():
-        raise InputError(str(folder), "a run needs a folder", "a file", "Choose another --out.")
+        raise InputError(str(folder), "a run needs a folder", "a file", cure)
     with alone_in(folder):
-        if (folder / MANIFEST_NAME).is_file():
-            yield Run(folder, spec, _is_done(folder, spec, inputs))
-        elif any(folder.iterdir()):
-            raise InputError(
-                str(folder), "a run needs a new or empty folder, or its own", "other content", "Choose another --out."
-            )
-        else:
-            yield Run(folder, spec, done=False)
+        known = (folder / MANIFEST_NAME).is_file()
+        if not known and any(folder.iterdir()):
+            raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
+        yield Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
 
 
 def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
     """Whether a run is finished; refuse it if it is not that of a spec and its inputs."""
     found = _read_manifest(folder)
-    if found["state"] != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
+    if found.state != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
         return False  # begun and nothing more: there is nothing to lose, whatever the spec was
-    if found["spec_sha256"] != spec_digest(spec) or found["inputs_sha256"] != dict(inputs):
-        raise InputError(
-            str(folder),
-            f"the folder must belong to this spec (sha256 {spec_digest(spec)[:12]})",
-            f"the run of another spec or other input files ({found['spec_sha256'][:12]})",
-            "Choose another --out, or remove that run.",
-        )
-    return found["state"] == "done" and open_run(folder).done
+    digest = spec_digest(spec)
+    if (found.spec_sha256, found.inputs_sha256) != (digest, inputs):
+        rule = f"the folder must belong to this spec (sha256 {digest[:12]})"
+        got = f"the run of another spec or other input files ({found.spec_sha256[:12]})"
+        raise InputError(str(folder), rule, got, "Choose another output folder, or remove that run.")
+    return found.state == "done" and open_run(folder).done
 
 
-def begin_run(run: Run, inputs: Mapping[str, str], overrides: Sequence[str]) -> None:
-    """Record what is running here, and the spec.
-
-    Args:
-        run: a claimed run.
-        inputs: digests of the files the spec names.
-        overrides: `--set` overrides that led to the spec, for the record.
-    """
-    write_atomic(run.path(MANIFEST_NAME), canonical_json(_manifest(run.spec, inputs, overrides, "running")))
-    comments = ["every default filled in", *(f"--set {override}" for override in overrides)]
-    write_atomic(run.path("spec.toml"), spec_to_toml(run.spec, comments).encode())
+def begin_run(run: Run) -> None:
+    """Write the manifest of a claimed run that begins, and its spec."""
+    _write_manifest(run, "running", {})
+    write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
 
 
-def finish_run(
-    run: Run,
-    inputs: Mapping[str, str],
-    overrides: Sequence[str],
-    results: Sequence[str],
-    depths_m: Sequence[float] = (),
-) -> None:
-    """Record the digests of all results and mark the run done; the checkpoint is no longer needed.
+def finish_run(run: Run, results: Sequence[str], depths_m: Sequence[float] = ()) -> None:
+    """Record the digests of all results and mark a claimed run done; the checkpoint is no longer needed.
 
     Args:
-        run: a claimed run.
-        inputs: digests of the files the spec names.
-        overrides: `--set` overrides that led to the spec.
+        run: the run.
         results: names of all files.
         depths_m: depths of the etches, mask 0 first, where the run was to choose them.
     """
-    manifest = _manifest(run.spec, inputs, overrides, "done")
-    if run.spec.process.chooses_depths:
-        manifest[_DEPTHS] = list(depths_m)
-    manifest["results_sha256"] = {name: sha256_file(run.path(name)) for name in sorted(results)}
-    write_atomic(run.path(MANIFEST_NAME), canonical_json(manifest))
+    chosen = {_DEPTHS: list(depths_m)} if run.spec.process.chooses_depths else {}
+    digests = {name: sha256_file(run.path(name)) for name in sorted(results)}
+    _write_manifest(run, "done", {**chosen, "results_sha256": digests})
     run.path(CHECKPOINT).unlink(missing_ok=True)
 
 
 def open_run(folder: Path) -> Run:
-    """A finished run, or a finished training, whose plate has learnt beside its network.
+    """Open a finished run, or a finished training, whose DOE was trained beside its network.
 
     Raises:
-        InputError: no run, an unfinished one, one without a plate, or one whose spec or height map changed since it was
+        InputError: no run, an unfinished one, one without a DOE, or one whose spec or height map changed since it was
             made.
     """
     if not folder.is_dir():
@@ -215,39 +227,34 @@ def open_run(folder: Path) -> Run:
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
     manifest = _read_manifest(folder, (FORMAT, TRAINING))
-    spec = load_spec(folder / "spec.toml")
-    if spec_digest(spec) != manifest["spec_sha256"]:
-        raise InputError(
-            str(folder / "spec.toml"),
-            "must be the spec of this run",
-            "a file that was changed since",
-            "Restore it, or optimise the changed spec into a folder of its own.",
-        )
-    if manifest["state"] != "done":
-        raise InputError(
-            str(folder), "the run must be finished", "an unfinished run", "Resume it with the same command."
-        )
-    if manifest["format"] == TRAINING and LEVEL_MAP not in manifest["results_sha256"]:  # trained behind a plain lens
+    path = folder / "spec.toml"
+    spec = load_spec(path)
+    if spec_digest(spec) != manifest.spec_sha256:
+        cure = "Restore it, or optimise the changed spec into a folder of its own."
+        raise InputError(str(path), "must be the spec of this run", "a file that was changed since", cure)
+    if not isinstance(manifest, _FinishedManifest):
+        cure = "Resume it with the same command."
+        raise InputError(str(folder), "the run must be finished", "an unfinished run", cure)
+    if manifest.format == TRAINING and LEVEL_MAP not in manifest.results_sha256:  # trained behind a plain lens
         cure = "Give the run, or a training behind its plate."
         raise InputError(str(folder), f"must hold a plate, {LEVEL_MAP}", "none", cure)
-    for name, digest in manifest["results_sha256"].items():
+    for name, digest in manifest.results_sha256.items():
         if name.endswith((".exr", LEVEL_MAP)) and sha256_file(folder / name) != digest:
-            raise InputError(
-                str(folder / name),
-                "must be the file this run wrote",
-                "a changed file",
-                f"Restore it, or remove {folder} and optimise again.",
-            )
-    return Run(folder, _with_depths(spec, manifest, folder / MANIFEST_NAME), done=True)
+            cure = f"Restore it, or remove {folder} and optimise again."
+            raise InputError(str(folder / name), "must be the file this run wrote", "a changed file", cure)
+    if spec.process.chooses_depths:  # from now on as if the depths that it chose had been given
+        process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.etch_depths_m}
+        spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME))
+    return Run(folder, spec, done=True)
 
 
 def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:
-    """The spec of a finished run with overrides of what its plate does not depend on.
+    """Return the spec of a finished run with overrides of values that its DOE does not depend on.
 
     Args:
         run: a finished run.
         overrides: changes, "table.key=value".
-        free: tables that may be changed; of the sensor, only what it does with light.
+        free: tables that may be changed; of the sensor, only its response to light.
 
     Raises:
         InputError: an override that breaks a rule, or of something else.
@@ -262,45 +269,14 @@ def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:
     if changed:
         tables = ", ".join(f"[{table}]" for table in free if table != "sensor")
         rule = f"only {tables} and what the sensor does with light can be changed for a finished plate"
-        raise InputError("--set", rule, f"another {changed[0]}", "Optimise the changed spec into a run of its own.")
-    # The other tables stay those of the run, which knows the depths that it chose.
+        cure = "Optimise the changed spec into a run of its own."
+        raise InputError("overrides", rule, f"another {changed[0]}", cure)
+    # The other tables stay those of the run, which hold the depths that it chose.
     return run.spec.model_copy(update={table: getattr(spec, table) for table in free})
 
 
-def _with_depths(spec: Spec, manifest: Mapping[str, Any], path: Path) -> Spec:
-    """The spec of a finished run as if the depths that it chose had been given."""
-    if not spec.process.chooses_depths:
-        return spec
-    process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.get(_DEPTHS)}
-    return spec_from_json(spec_to_json(spec) | {"process": process}, str(path))
-
-
-def _read_manifest(folder: Path, formats: Sequence[str] = (FORMAT,)) -> dict[str, Any]:
-    """The manifest of a run, with everything in it that is relied upon."""
-    path = folder / MANIFEST_NAME
-    manifest = read_json(path)
-    if manifest.get("format") not in formats:
-        raise InputError(
-            str(path),
-            "must say format " + " or ".join(f'"{name}"' for name in formats),
-            repr(manifest.get("format")),
-            "Give a folder that this version wrote.",
-        )
-    kinds: dict[str, type] = {"state": str, "spec_sha256": str}
-    if manifest["format"] == FORMAT:
-        kinds["inputs_sha256"] = dict
-    if manifest.get("state") == "done":
-        kinds["results_sha256"] = dict
-    for key, kind in kinds.items():
-        if not isinstance(manifest.get(key), kind):
-            raise InputError(
-                str(path), f"must hold {key}", repr(manifest.get(key)), f"Remove {folder} and optimise again."
-            )
-    return manifest
-
-
 def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: Sequence[Mapping[str, Any]]) -> None:
-    """Store everything a run needs to go on: arrays in their order, the number of steps done, the history."""
+    """Store all that a run needs to go on: arrays in their order, the number of steps done, the history."""
     header = {"spec": spec_digest(run.spec), "step": step, "history": list(history)}
     write_archive(run.path(CHECKPOINT), header, {f"array{i}": array for i, array in enumerate(arrays)})
 
@@ -308,7 +284,7 @@ def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: 
 def load_checkpoint(
     run: Run, shapes: Sequence[tuple[int, ...]]
 ) -> tuple[list[np.ndarray], int, list[dict[str, Any]]] | None:
-    """What `save_checkpoint` stored, or None if there is no checkpoint yet.
+    """Return what `save_checkpoint` stored, or None if there is no checkpoint yet.
 
     Raises:
         InputError: the file is cut off, corrupt, or of another spec.
@@ -324,6 +300,6 @@ def load_checkpoint(
 
 
 def write_history(run: Run, history: Sequence[Mapping[str, Any]]) -> None:
-    """One JSON object per line and step."""
+    """Write the history, one JSON object per line and step."""
     lines = "".join(json.dumps(record, sort_keys=True) + "\n" for record in history)
     write_atomic(run.path("history.jsonl"), lines.encode())

@@ -1,4 +1,4 @@
-"""Level maps and designs from wherever they come: a run, its mask files, or a height map that the user brings."""
+"""Level maps and designs from a run, its mask files, or a height map of the user's own."""
 
 from collections.abc import Sequence
 from math import isclose
@@ -23,12 +23,12 @@ from fab.units import NM, format_length
 
 
 class Drawing(NamedTuple):
-    """A level map to order masks for, and where it comes from.
+    """Level map to order masks for, and its source.
 
     Attributes:
         level_map: the level map.
-        origin: what the manifest of an order says of its source.
-        design: the design of the run it belongs to, if it is one's.
+        origin: entry of an order's manifest on its source.
+        design: the design, if the source is a run.
     """
 
     level_map: LevelMap
@@ -57,18 +57,17 @@ def read_any_height(
     from sim.store import read_height as read_exr
 
     stored = read_exr(path)
-    pitch = stored.pitch_m if pitch_m is None else pitch_m
-    if pitch is None:
-        raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Add --pitch-um.")
+    pitch_m = stored.pitch_m if pitch_m is None else pitch_m
+    if pitch_m is None:
+        raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Give the pitch of a pixel.")
     ny, nx = stored.height_m.shape
-    grid = Grid((ny, nx), pitch)
-    if aperture_m is None:
-        aperture_m = stored.aperture_m or min(grid.extent_m)
+    grid = Grid((ny, nx), pitch_m)
+    aperture_m = stored.aperture_m or min(grid.extent_m) if aperture_m is None else aperture_m
     return HeightMap(stored.height_m, grid, aperture_m)
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
-    """The level map of a run, or its continuous design rounded to another number of levels over the same full height.
+    """Return the level map of a run, or its continuous design rounded to another `count` of levels of the same height.
 
     Raises:
         InputError: a file of the run cannot be read, or is not for the staircase that the run chose.
@@ -88,12 +87,12 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
 
 
 def open_design(source: "Path | Run", masks: Path | None = None, *, levels: int | None = None) -> Design:
-    """The design of a finished run, as its masks draw it.
+    """Return the design of a finished run, as its masks draw it.
 
     Args:
         source: the run, or its folder.
         masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map.
-        levels: another number of levels, which no mask order is looked for.
+        levels: another number of levels; mask orders are then left aside.
 
     Raises:
         InputError: a run or order that cannot be read, or an order of another run.
@@ -119,7 +118,7 @@ def open_design(source: "Path | Run", masks: Path | None = None, *, levels: int 
 
 
 def write_design(folder: Path, design: Design) -> list[str]:
-    """Write the level map of a design and the heights that follow from it, metres; return the names of the files."""
+    """Write the level map of a design and its heights, metres; return the names of the files."""
     from sim.store import write_height
 
     grid, aperture_m = design.level_map.grid, design.level_map.aperture_m
@@ -141,7 +140,7 @@ def drawing_from(
     scale_m: float | None = None,
     aperture_m: float | None = None,
 ) -> Drawing:
-    """The level map of a run folder or of a height map.
+    """Return the level map of a run folder or of a height map.
 
     Args:
         source: the run folder or height map.
@@ -158,38 +157,37 @@ def drawing_from(
     if not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
     if source.is_dir():
-        options = {"--step": step_m, "--etch-depths": depths_m or None, "--pitch-um": pitch_m, "--scale": scale_m}
-        options["--aperture"] = aperture_m
-        for option, value in options.items():
+        geometry = {"step_m": step_m, "depths_m": depths_m or None, "pitch_m": pitch_m, "scale_m": scale_m}
+        for name, value in {**geometry, "aperture_m": aperture_m}.items():
             if value is not None:
-                cure = "Leave the option out, or give a height map."
-                raise InputError(option, "a run brings its own geometry", "a value", cure)
+                cure = "Leave it out, or give a height map."
+                raise InputError(name, "a run brings its own geometry", "a value", cure)
         run = open_run(source)
         design = open_design(run, levels=run.spec.process.levels if count is None else count)
         origin = {"kind": "run", "name": run.spec.name, "level_map_sha256": level_map_of_run(run).digest}
         return Drawing(design.level_map, origin, design)
     if count is None or step_m is None:
-        missing, example = ("--levels", "--levels 16") if count is None else ("--step", '--step "75 nm"')
-        raise InputError(str(source), f"a bare height map needs {missing}", "none", f"Add {example}.")
+        missing, cure = ("number of levels", "Give `levels`.") if count is None else ("height of a level", "Give `step`.")
+        raise InputError(str(source), f"a bare height map needs the {missing}", "none", cure)
     levels = Levels(count, step_m, tuple(depths_m))
     height = read_any_height(source, pitch_m, scale_m, aperture_m)
-    # What a mask shop takes in a name; a name of other letters alone leaves nothing.
+    # Mask shops take ASCII names; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
     try:
         level_map = LevelMap.from_height(height, levels, name)
     except InputError as error:
-        what = "" if error.where == "level map" or error.where == "height map" else f": {error.where}"
-        raise InputError(f"{source}{what}", error.rule, error.got, error.cure) from error
+        part = "" if error.where in ("level map", "height map") else f": {error.where}"
+        raise InputError(f"{source}{part}", error.rule, error.got, error.cure) from error
     origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
     return Drawing(level_map, origin, None)
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
-    """Level numbers ``[y, x]`` that the combined GDS file of a mask order draws.
+    """Return the level numbers ``[y, x]`` that the combined GDS file of a mask order draws.
 
     Args:
         folder: the mask order.
-        level_map: what it should draw.
+        level_map: the level map that it should draw.
 
     Raises:
         InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
@@ -204,11 +202,8 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
     lengths += zip(levels.depths_m, level_map.levels.depths_m, strict=False)
     if not (alike and all(isclose(found, wanted, rel_tol=1e-6) for found, wanted in lengths)):
         ny, nx = grid.shape
-        raise InputError(
-            str(folder),
-            f"the masks must be those of this run, {level_map}",
-            f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}",
-            "Give the masks of this run (--masks).",
-        )
+        got = f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}"
+        rule = f"the masks must be those of this run, {level_map}"
+        raise InputError(str(folder), rule, got, "Give the masks of this run.")
     combined, moves = folder / manifest.combined_gds, manifest.edge_moves()
     return read_drawn_levels(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)

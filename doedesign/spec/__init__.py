@@ -34,7 +34,14 @@ from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSp
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
 from doedesign.spec.table import toml_key
-from doedesign.spec.text import process_to_toml, spec_digest, spec_to_json, spec_to_toml, variation_to_toml
+from doedesign.spec.text import (
+    process_to_toml,
+    spec_digest,
+    spec_to_json,
+    spec_to_resolved_toml,
+    spec_to_toml,
+    variation_to_toml,
+)
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import HEIGHT_FILES, STARTS, Options
 from doedesign.spec.variation import ProcessFile, VariationFile

@@ -38,6 +38,11 @@ def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
     return "\n".join(lines + _table_lines(spec, "")).strip() + "\n"
 
 
+def spec_to_resolved_toml(spec: Spec, overrides: Sequence[str]) -> str:
+    """Write the spec of a run; the head of the file tells the overrides, "table.key=value", that led to it."""
+    return spec_to_toml(spec, ["every default filled in", *(f"--set {override}" for override in overrides)])
+
+
 def process_to_toml(process: ProcessSpec, comments: Sequence[str] = ()) -> str:
     """Write a process as a TOML file of its own, which `load_process` reads back to the same process."""
     return spec_to_toml(ProcessFile(process=process), comments)

@@ -24,14 +24,14 @@ STEP_M = 75e-9
 def finished(folder: Path, continuous_m: np.ndarray, *overrides: str) -> Run:
     """A finished run of 16 x 16 cells around given heights."""
     spec = load_spec(QUICK, ["doe.samples=16", "doe.aperture=29.6 um", *overrides])
-    with claim_run(folder, spec, {}) as run:
-        begin_run(run, {}, overrides)
+    with claim_run(folder, spec, {}, overrides) as run:
+        begin_run(run)
         height = HeightMap(continuous_m, Grid((16, 16), 1.85e-6), 29.6e-6)
         level_map = LevelMap.from_height(height, Levels(16, STEP_M), "quick", wrapped=True)
         files = write_design(
             folder, Design(level_map, camera_from_spec(spec), (), (), continuous_m=continuous_m, spec=spec)
         )
-        finish_run(run, {}, overrides, files)
+        finish_run(run, files)
     return run
 
 

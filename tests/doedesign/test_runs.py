@@ -38,7 +38,7 @@ def spec() -> Spec:
 def run(spec: Spec, tmp_path: Path) -> Run:
     """A run that has begun."""
     with claim_run(tmp_path / "run", spec, {}) as claimed:
-        begin_run(claimed, {}, [])
+        begin_run(claimed)
     return claimed
 
 
@@ -46,30 +46,30 @@ def run(spec: Spec, tmp_path: Path) -> Run:
 def done(run: Run) -> Run:
     """A finished run with one result."""
     run.path("level_map.npz").write_bytes(b"levels")
-    finish_run(run, {}, [], ["level_map.npz", "spec.toml"])
+    finish_run(run, ["level_map.npz", "spec.toml"])
     return run
 
 
 def test_a_run_is_begun_resumed_and_finished(spec: Spec, tmp_path: Path):
     folder = tmp_path / "a" / "b"
-    with claim_run(folder, spec, {"image": "ab"}) as run:
+    with claim_run(folder, spec, {"image": "ab"}, ["optimize.seed=1"]) as run:
         assert not run.done
         assert list(folder.iterdir()) == []
-        begin_run(run, {"image": "ab"}, ["optimize.seed=1"])
+        begin_run(run)
     assert {path.name for path in folder.iterdir()} == {"manifest.json", "spec.toml"}
     assert load_spec(folder / "spec.toml") == spec
     assert "--set optimize.seed=1" in (folder / "spec.toml").read_text()
-    with claim_run(folder, spec, {"image": "ab"}) as run:
+    with claim_run(folder, spec, {"image": "ab"}, ["optimize.seed=1"]) as run:
         assert not run.done
         save_checkpoint(run, [np.zeros(3)], 1, [])
         write_history(run, [{"step": 0}, {"step": 1}])
-        finish_run(run, {"image": "ab"}, ["optimize.seed=1"], ["history.jsonl"])
+        finish_run(run, ["history.jsonl"])
     assert not (folder / CHECKPOINT).exists()
     assert (folder / "history.jsonl").read_text() == '{"step": 0}\n{"step": 1}\n'
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["results_sha256"] == {"history.jsonl": sha256_file(folder / "history.jsonl")}
     assert manifest["overrides"] == ["optimize.seed=1"]
-    with claim_run(folder, spec, {"image": "ab"}) as run:
+    with claim_run(folder, spec, {"image": "ab"}, ["optimize.seed=1"]) as run:
         assert run.done
     assert open_run(folder) == run
 
@@ -90,7 +90,7 @@ def test_a_run_that_got_nowhere_gives_way(run: Run):
     other = load_spec(QUICK, ["optimize.seed=2"])
     with claim_run(run.folder, other, {"image": "ab"}) as claimed:
         assert not claimed.done
-        begin_run(claimed, {"image": "ab"}, [])
+        begin_run(claimed)
     assert load_spec(run.path("spec.toml")) == other
 
 
