@@ -206,8 +206,7 @@ def write_pixels(
         import png
 
         stream = io.BytesIO()
-        writer = png.Writer(
-            rows.shape[1], rows.shape[0], greyscale=rows.ndim == 2, bitdepth=16, compression=compression
-        )
+        grey: Any = rows.ndim == 2
+        writer = png.Writer(rows.shape[1], rows.shape[0], greyscale=grey, bitdepth=16, compression=compression)
         writer.write_packed(stream, (row.tobytes() for row in rows.astype(">u2")))
         write_atomic(path, stream.getvalue())

@@ -6,10 +6,13 @@ map (`HeightOptic`) and a DOE as fabricated (`sim.surface.FabricatedDoe`) are ma
 of rings, and `sim.psf_bank.BankOptic` holds PSFs that are known already.
 """
 
+# Abstract fields become fields, or properties, of subclasses.
+# pyright: reportIncompatibleVariableOverride=false
+
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -24,6 +27,11 @@ from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, doe_field
 from sim.source import SeparableSource, SourceMap
+
+if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
 CellSource = SourceMap | SeparableSource
@@ -40,10 +48,10 @@ class Optic(eqx.Module):
         lines: wavelengths of all colours, colour by colour.
     """
 
-    camera: eqx.AbstractVar[Camera | None]
-    colours: eqx.AbstractVar[tuple[str, ...]]
-    pixel_m: eqx.AbstractVar[float]
-    lines: eqx.AbstractVar[tuple[SpectralLine, ...]]
+    camera: AbstractVar[Camera | None]
+    colours: AbstractVar[tuple[str, ...]]
+    pixel_m: AbstractVar[float]
+    lines: AbstractVar[tuple[SpectralLine, ...]]
 
     @abstractmethod
     def plan(
@@ -90,7 +98,7 @@ class HasOptic(Protocol):
 class CameraOptic(Optic):
     """An optic that is computed for a camera."""
 
-    camera: eqx.AbstractVar[Camera]
+    camera: AbstractVar[Camera]
 
     @property
     def colours(self) -> tuple[str, ...]:
@@ -117,9 +125,9 @@ class CellOptic(CameraOptic):
         source_kind: how sources are described (`sim.source`).
     """
 
-    camera: eqx.AbstractVar[Camera]
-    coverage: eqx.AbstractVar[Float[Array, "y x"]]
-    source_kind: eqx.AbstractVar[type[SourceMap] | type[SeparableSource]]
+    camera: AbstractVar[Camera]
+    coverage: AbstractVar[Float[Array, "y x"]]
+    source_kind: AbstractVar[type[SourceMap] | type[SeparableSource]]
 
     @abstractmethod
     def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:

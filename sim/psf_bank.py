@@ -1,7 +1,10 @@
 """PSFs: the image of a point source for every colour of an optic and every depth."""
 
+# Abstract fields become fields, or properties, of subclasses.
+# pyright: reportIncompatibleVariableOverride=false
+
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +18,10 @@ from sim.camera import Camera, SpectralLine
 from sim.optic import ON_AXIS, CellOptic, HasOptic, HeightOptic, Optic, Propagation
 
 Length = float | str
+if TYPE_CHECKING:  # numpy and jax arrays serve alike
+    Energies = Any
+else:
+    Energies = Float[np.ndarray, "w d y x"] | Float[Array, "w d y x"]
 
 
 class PsfBank(eqx.Module):
@@ -30,7 +37,7 @@ class PsfBank(eqx.Module):
         camera: the camera they were computed for, if it is known.
     """
 
-    energy: Float[np.ndarray, "w d y x"] | Float[Array, "w d y x"]
+    energy: Energies
     colours: tuple[str, ...] = eqx.field(static=True)
     depths_m: tuple[float, ...] = eqx.field(static=True)
     pixel_m: float = eqx.field(static=True)
@@ -170,7 +177,7 @@ def psf(
         InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
     """
     chosen = optic_of(optic, camera)
-    given = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
+    given: Any = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
     depths_m = tuple(depth_m(depth) for depth in given)
     rows = []
     for depth in depths_m:

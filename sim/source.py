@@ -110,13 +110,15 @@ class SeparableSource(NamedTuple):
         tangents = np.tan(np.asarray(field_rad, np.float64))
         curvature = 0.0 if np.isinf(depth_m) else 1 / (depth_m * np.sqrt(1 + np.sum(tangents**2)))
         bend = curvature + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
-        waves_y, waves_x = (wrapped_waves(bend / 2 * camera.grid.axis_m(axis) ** 2, wavelength_m) for axis in "yx")
+        waves_y, waves_x = (
+            wrapped_waves(bend / 2 * camera.grid.axis_m(axis) ** 2, wavelength_m) for axis in ("y", "x")
+        )
         sines = direction_sines(field_rad).astype(np.float32)
         per_metre = np.float32(camera.waves_per_metre(wavelength_m, field_rad))
         return cls(np.float32(curvature), sines, waves_y, waves_x, per_metre, np.float32(1 / wavelength_m))
 
     def over(self, grid: Grid) -> tuple[tuple[Array, Array], SeparableColumns]:
         """What `sim.propagation.pupil.doe_field` has to know: by row, and for all rows alike."""
-        y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in "yx")
+        y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in ("y", "x"))
         curvature, sines, waves_y, waves_x, *scales = (jnp.asarray(part) for part in self)
         return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)

@@ -120,8 +120,9 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSe
     """
     problem = plans_of(spec, files)
     camera, optic = problem.camera, problem.optic
+    sources: Any = optic.source
     near, far = (
-        tuple(tuple(optic.source(line, depth).source_waves for depth in depths_m) for line in optic.lines)
+        tuple(tuple(sources(line, depth).source_waves for depth in depths_m) for line in optic.lines)
         for depths_m in (spec.scene.near_m, spec.scene.far_m)
     )
     lens = lens_participation(camera, spec.scene.near_m)

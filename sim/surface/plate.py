@@ -1,5 +1,8 @@
 """From a level map and the errors of a process to a plate: `as_fabricated`."""
 
+# Abstract fields become fields, or properties, of subclasses.
+# pyright: reportIncompatibleVariableOverride=false
+
 from dataclasses import replace
 
 import equinox as eqx

@@ -15,6 +15,7 @@ from doedesign.spec import Spec, load_spec
 from fab.grid import Grid
 from fab.levels import Levels, height_of, quantise, quantise_wrapped
 from sim.camera import Camera, Colour
+from sim.optic import HeightOptic
 
 NM = 1e-9
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
@@ -229,6 +230,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
     state = run(spec)
     assert state.log_depth_ratio is None
     design = finished_design(spec, problem, state)
+    assert isinstance(problem.optic, HeightOptic)
     area = np.asarray(problem.optic.coverage)
     assert design.continuous_m is not None
     seen = height_histogram(design.continuous_m, area, design.levels.period_m, problem.camera)

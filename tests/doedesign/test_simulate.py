@@ -109,7 +109,8 @@ def test_what_a_capture_knows_of_itself(design: Design, picture: Path):
 
 def test_a_capture_draws_itself(design: Design, picture: Path):
     shot = simulate(picture, design, **ASKED)
-    assert len(shot.plot().axes) == 4
+    drawn: Any = shot.plot()
+    assert len(drawn.axes) == 4
     html = shot._repr_html_()
     assert "radiometric" in html
     assert "data:image/png;base64," in html
@@ -120,14 +121,14 @@ def test_without_a_spec_everything_is_named(design: Design, picture: Path):
     shot = simulate(picture, bare, **ASKED)
     np.testing.assert_array_equal(shot.doe, simulate(picture, design, **ASKED).doe)
     # A kind with parameters of its own keeps them.
-    near = simulate(picture, bare, **(ASKED | {"obstruction": Dirt(depth_m=(7e-3, 7e-3))}))
+    near = simulate(picture, bare, **{**ASKED, "obstruction": Dirt(depth_m=(7e-3, 7e-3))})
     assert near.depth_near_m == 7e-3
     for lacking, words in (
         ("occlusion", "occlusion model must be named"),
         ("obstruction", "obstruction must be named"),
     ):
         with pytest.raises(InputError, match=words):
-            simulate(picture, bare, **(ASKED | {lacking: None}))
+            simulate(picture, bare, **{**ASKED, lacking: None})
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,7 +86,8 @@ def test_another_camera_is_told(model: Model, light: np.ndarray, caplog: pytest.
 
 def test_a_reconstruction_draws_and_saves_itself(model: Model, light: np.ndarray, tmp_path: Path):
     found = model.reconstruct(light.transpose(1, 2, 0))
-    assert len(found.plot().axes) == 2
+    drawn: Any = found.plot()
+    assert len(drawn.axes) == 2
     assert "data:image/png;base64," in found._repr_html_()
     found.save(tmp_path / "a.png")
     again = srgb_from_linear(read_capture(tmp_path / "a.png").light)
