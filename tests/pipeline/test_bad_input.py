@@ -338,7 +338,7 @@ def test_a_pickle_is_never_loaded(cli, tmp_path):
         (("--levels", 16, "--step", "75 s", "--pitch-um", 2), ["--step", "unit"]),
         (("--levels", 16, "--step", "0 nm", "--pitch-um", 2), ["step", "positive"]),
         (("--levels", 16, "--step", "75 nm", "--pitch-um", 0), ["pitch", "positive"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", "nan"), ["pitch", "positive"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch-um", "nan"), ["pitch", "must be metres", "nan"]),
         (("--levels", 16, "--step", "75 nm", "--pitch-um", 1e-9), ["pixels"]),
         (("--levels", 16, "--step", "75 nm", "--pitch-um", 1e9), ["pixels"]),
         (("--levels", 16, "--step", "75 nm", "--pitch-um", 2, "--aperture", "1 km"), ["aperture"]),
@@ -360,7 +360,7 @@ def test_file_of_another_kind(cli, tmp_path, tiny):
     (tmp_path / "text.exr").write_text("not an EXR")
     refuse(cli("masks", tmp_path / "text.exr", *BARE), tmp_path / "text.exr", "OpenEXR")
     Image.new("RGB", (20, 15)).save(tmp_path / "colours.png")
-    refuse(cli("masks", tmp_path / "colours.png", *BARE, "--scale", "1 nm"), "colours.png", "RGB")
+    refuse(cli("masks", tmp_path / "colours.png", *BARE, "--scale", "1 nm"), "colours.png", "colours")
 
 
 def test_a_run_brings_its_own_geometry(finished, cli):
