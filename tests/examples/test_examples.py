@@ -11,6 +11,7 @@ import pytest
 import doedesign.commands.psf
 import doedesign.optimization
 from doedesign.cli import main
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec, spec_warnings
 from tests.pictures import leave_out_pictures
 
@@ -108,13 +109,13 @@ def test_demo_takes_no_other_order_for_its_own(
     runs, masks = tmp_path / "runs", tmp_path / "masks"
     demo.demo(small, runs, masks)
     run, order = runs / "quick", masks / "quick"
-    assert demo.run_is_drawn(run, order)
+    assert demo.is_drawn(open_design(run), order)
     assert main(["masks", str(run), "--levels", "8", "--out", str(order)]) == 0
-    assert not demo.run_is_drawn(run, order)
+    assert not demo.is_drawn(open_design(run), order)
     # PSFs that were computed without the masks are not those of what was drawn.
     monkeypatch.chdir(tmp_path / "runs")
     assert main(["psf", "quick"]) == 0
     assert not (run / "psf" / "from_masks.exr").exists()
     demo.demo(small, runs, masks)
-    assert demo.run_is_drawn(run, order)
+    assert demo.is_drawn(open_design(run), order)
     assert (run / "psf" / "from_masks.exr").exists()

@@ -69,7 +69,7 @@ def finished_files(finished, content):
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (doedesign.runs.folder, "spec_to_toml"),  # between the manifest and the spec
+        (doedesign.runs.folder, "spec_to_resolved_toml"),  # between the manifest and the spec
         (doedesign.optimization, "steps"),  # before the first step
         (doedesign.optimization, "save_checkpoint"),  # before the first checkpoint
         (doedesign.optimization, "write_history"),  # between the height maps and the rest
