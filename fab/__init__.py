@@ -1,4 +1,4 @@
-"""What is made: from a level map to the mask files that a fab lab writes, and back.
+"""Fabrication of DOEs: from a level map to the mask files for a fab lab, and back.
 
 The public names are those of `dir(fab)`; each is imported on its first use. The packages, in the order of the work:
 

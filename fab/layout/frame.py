@@ -19,7 +19,7 @@ from fab.layout.geometry import Cell, Layer, Reference, Shapes
 from fab.layout.lettering import label_block, mask_label, written
 from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, row
-from fab.layout.split import Split
+from fab.layout.split import DieSplit
 from fab.layout.structures import process_monitor
 from fab.layout.wafer import READING, Wafer
 from fab.level_map import LevelMap
@@ -64,7 +64,7 @@ def draw_frame(
     plates: Sequence[Photomask],
     level_map: LevelMap,
     *,
-    splits: Sequence[Split],
+    splits: Sequence[DieSplit],
     stem: str,
     minimum_line_m: float,
     chrome_m: float,
@@ -98,7 +98,7 @@ def draw_frame(
     raster, site_m, monitor_m = _room(wafer, pitch, site, monitor)
     wafer.require_room(raster)
     dies = _raster(raster, pitch)
-    unit = _Unit(dbu_m)
+    unit = _InUnits(dbu_m)
     aperture = unit.circle(level_map.aperture_m)
     names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
     die_cells = [
@@ -110,16 +110,10 @@ def draw_frame(
         for number, split in enumerate(splits)
     ]
     drawn = (*(0,) * (len(dies) - len(splits) + 1), *range(1, len(splits)))
-    wafer_cell = Cell(
-        names["WAFER"],
-        {WAFER: unit.circle(wafer.diameter_m)},
-        (
-            *_die_references(raster, dies, drawn, die_cells, unit, pitch),
-            Reference(names["SITE"], -unit(site_m), 0),
-            Reference(names["SITE"], unit(site_m), 0),
-            Reference(names["TEST"], 0, unit(monitor_m)),
-        ),
-    )
+    placed = [Reference(names["SITE"], -unit(site_m)), Reference(names["SITE"], unit(site_m))]
+    placed += [Reference(names["TEST"], 0, unit(monitor_m))]
+    on_wafer = (*_die_references(raster, dies, drawn, die_cells, unit, pitch), *placed)
+    wafer_cell = Cell(names["WAFER"], {WAFER: unit.circle(wafer.diameter_m)}, on_wafer)
     labels = _labels(plates, wafer, stem, level_map.digest, dbu_m)
     top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
     sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
@@ -131,7 +125,7 @@ def draw_frame(
     return Frame((*die_cells, *small, wafer_cell, top), places, raster, dies, drawn, pitch)
 
 
-def _titled(marks: Part, split: Split, plate: Photomask) -> Part:
+def _titled(marks: Part, split: DieSplit, plate: Photomask) -> Part:
     """Add what is special about a die above its DOE, where the marks are below."""
     if not split.lettering:
         return marks
@@ -145,7 +139,7 @@ def _die_references(
     dies: Sequence[tuple[float, float]],
     drawn: Sequence[int],
     cells: Sequence[Cell],
-    unit: "_Unit",
+    unit: "_InUnits",
     pitch_m: float,
 ) -> tuple[Reference, ...]:
     """Place the dies: as one raster where all are alike, else one by one."""
@@ -156,7 +150,7 @@ def _die_references(
     return (Reference(cells[0].name, *first, columns, rows, step * (columns > 1), step * (rows > 1)),)
 
 
-class _Unit:
+class _InUnits:
     """Lengths and outlines in database units."""
 
     def __init__(self, dbu_m: float) -> None:

@@ -15,7 +15,7 @@ from fab.units import format_length
 
 
 @dataclass(frozen=True)
-class Split:
+class DieSplit:
     """One way to draw a DOE.
 
     Attributes:
@@ -33,7 +33,7 @@ class Split:
     moves: tuple[int, ...]
 
 
-def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float) -> tuple[Split, ...]:
+def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float) -> tuple[DieSplit, ...]:
     """List the ways in which a wafer's dies are drawn.
 
     Args:
@@ -46,14 +46,14 @@ def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float
         The DOE as ordered, the line-width splits in the order of the wafer's list, the control of the etch order.
     """
     bits = tuple(range(levels.bits))
-    splits = [Split("DOE", "", "", bits, moves)]
+    splits = [DieSplit("DOE", "", "", bits, moves)]
     for number, move_m in enumerate(wafer.line_splits_m, 1):
         units = round(move_m / dbu_m)
         length, out = format_length(abs(units) * dbu_m), units > 0
         words = f"edges of etched areas drawn {length} further {'out' if out else 'in'} on every etch mask"
         lettering = f"EDGES {'+' if out else '-'}{length}".upper()
-        splits.append(Split(f"CD{number}", words, lettering, bits, tuple(m + units for m in moves)))
+        splits.append(DieSplit(f"CD{number}", words, lettering, bits, tuple(m + units for m in moves)))
     if wafer.order_control:
         words = "planes in the opposite order: right only if the depths were etched in the opposite order"
-        splits.append(Split("ORDER", words, "DEPTHS REVERSED", bits[::-1], moves))
+        splits.append(DieSplit("ORDER", words, "DEPTHS REVERSED", bits[::-1], moves))
     return tuple(splits)

@@ -7,7 +7,7 @@ from fab.layout.frame import Frame
 from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer
 from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
-from fab.layout.split import Split
+from fab.layout.split import DieSplit
 from fab.layout.wafer import READING
 from fab.manifest.cells import geometry, shapes_digest
 from fab.manifest.records import (
@@ -105,7 +105,7 @@ def split_entries(order: Order, drawn: Layout, frame: Frame) -> list[SplitEntry]
     ]
 
 
-def _drawn_entries(order: Order, split: Split, cell: Cell) -> list[DrawnEntry]:
+def _drawn_entries(order: Order, split: DieSplit, cell: Cell) -> list[DrawnEntry]:
     layers = [etch_layer(mask, order.level_map.levels) for mask in range(order.process.masks)]
     return [
         DrawnEntry(

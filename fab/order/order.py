@@ -11,7 +11,7 @@ from fab.errors import InputError
 from fab.layout.compensation import edge_moves
 from fab.layout.geometry import Chrome, pixel_edges
 from fab.layout.part import Photomask, photomasks_of
-from fab.layout.split import Split, splits_of
+from fab.layout.split import DieSplit, splits_of
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.process import Process
@@ -67,7 +67,7 @@ class Order:
         return photomasks_of(self.level_map.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
 
     def edge_moves(self) -> tuple[int, ...]:
-        """How far the edges of every mask are moved outward against the bias of the process, database units."""
+        """Return how far the edges of every mask are moved outward against the bias of the process, database units."""
         if not self.wafer.compensate:
             return (0,) * self.process.masks
         usual = self.process.expected()
@@ -80,7 +80,7 @@ class Order:
         return pixel_edges(self.level_map.grid).dbu_m
 
     @property
-    def splits(self) -> tuple[Split, ...]:
+    def splits(self) -> tuple[DieSplit, ...]:
         """The ways in which the dies draw the DOE, as ordered first."""
         return splits_of(self.wafer, self.level_map.levels, self.edge_moves(), self.dbu_m)
 

@@ -1,4 +1,4 @@
-"""What a process can print, and a level map changed until it can.
+"""Lithography rules: what a process can print, and a level map changed until it can.
 
 check         narrow lines and spaces, touching corners, density, address grid
 bitplanes     a plane as 64-pixel words, and runs of them (numba)

@@ -88,12 +88,8 @@ class Rules:
 class Violation(NamedTuple):
     """One place where a rule is broken.
 
-    Attributes:
-        what: "line", "space" or "kissing corner".
-        y_m: its middle along y from the centre of the aperture, metres.
-        x_m: the same along x.
-        size_m: width of the line or space, metres; 0 for a corner.
-        length_m: its length, metres; 0 for a corner.
+    `what` is "line", "space" or "kissing corner"; `y_m` and `x_m` are its middle from the centre of the aperture,
+    `size_m` and `length_m` width and length of the line or space (0 for a corner), all in metres.
     """
 
     what: Kind
@@ -159,8 +155,7 @@ class OffGrid:
 
     Attributes:
         address_m: its address unit, metres.
-        edges: how many of the raster's edges along x and y lie off it.
-        of: how many edges there are.
+        edges: how many of the raster's edges along x and y lie off it, of `of` in all.
         worst_m: the farthest that one has to move, metres.
     """
 

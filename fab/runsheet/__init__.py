@@ -1,4 +1,4 @@
-"""What the lab does step by step, as a page to print and as JSON that takes measured numbers back.
+"""Run sheet of a lab, step by step: a page to print, and JSON that takes measured numbers back.
 
 tables        RunSheet: everything the sheet is made from
 recipe        the steps in order

@@ -78,7 +78,7 @@ def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> Me
 
 @dataclass(frozen=True)
 class Stated:
-    """What a writer states of its file for the manifest (`fab.manifest.records.ModelEntry`)."""
+    """Content of a file as the manifest states it (`fab.manifest.records.ModelEntry`)."""
 
     content: str
     volumes_mm3: Mapping[str, float] = field(default_factory=dict)

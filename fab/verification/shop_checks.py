@@ -1,4 +1,4 @@
-"""What a mask shop looks at on receipt, whatever is drawn: every shape by itself, where all of them lie, their numbers.
+"""Checks of a mask shop on receipt, whatever is drawn: every shape by itself, where all of them lie, their numbers.
 
 A mask writer takes simple polygons of up to 199 vertices and of some area, whose edges neither cross nor meet at less
 than 45 degrees, and nothing beyond the blank. These questions are put to the drawing, not to the manifest, so that a
