@@ -58,6 +58,14 @@ def test_no_star_imports_and_no_empty_files():
         assert not stars, name
 
 
+def test_matplotlib_is_loaded_by_the_first_picture_and_pyplot_never():
+    for name, tree in TREES.items():
+        assert isinstance(tree, ast.Module)
+        at_import = set().union(*(imported_modules(n) for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)))
+        assert not any(module.split(".")[0] == "matplotlib" for module in at_import), name
+        assert not any("pyplot" in module for module in imported_modules(tree)), name
+
+
 @pytest.mark.parametrize(
     "statement",
     [
