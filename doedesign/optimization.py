@@ -47,7 +47,7 @@ from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, psf
-from sim.transfer import transfer_bank
+from sim.transfer import mtf
 
 log = logging.getLogger("doedesign")
 Save = Callable[[OptimizationState, Sequence[Mapping[str, Any]]], None]
@@ -180,7 +180,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     bank = design_bank(spec, problem, height)
     flat = np.zeros_like(height)
     lens = design_bank(spec, problem, flat)
-    metrics: dict[str, Any] = {"psf": design_metrics(camera, height, bank, near, lens)}
+    metrics: dict[str, Any] = {"psf": design_metrics(HeightOptic.of(camera, height), bank, near, lens)}
     patterns = pattern_metrics(spec, camera, bank, problem.terms)
     if patterns:
         metrics["patterns"] = patterns
@@ -189,7 +189,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, camera.aperture_m), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far), run.path("psf.png"))
-    transfers = [transfer_bank(HeightOptic.of(camera, each), (*near, *far)) for each in (height, flat)]
+    transfers = [mtf(each, camera, (*near, *far)) for each in (height, flat)]
     save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))
     save(plot_encircled(bank, camera, near, far, lens), run.path("encircled.png"))
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]

@@ -82,7 +82,7 @@ def summary(run_folder: Path, order: Path, light: Path, checks: int) -> str:
             ratio = row["ring_to_disc"]
             shown = "-" if ratio is None else f"{ratio:.2f}"
             near = f"{shown:>9}  {row['concentration']:.4f} ({row['concentration_bound']:.4f})"
-        lines.append(f"{row['colour']:<7} {depth:>7} {row['in_window']:10.3f}  {far}  {near}")
+        lines.append(f"{row['colour']:<7} {depth:>7} {row['throughput']:10.3f}  {far}  {near}")
     lines += ["", f"{checks} checks of the mask order passed: every pixel of every file is as designed.", ""]
     lines += [f"run       {run_folder}", f"masks     {order}", f"PSFs      {light}", "pictures"]
     lines += [f"  {path}" for folder in (run_folder, order, light) for path in sorted(folder.glob("*.png"))]

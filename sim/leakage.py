@@ -10,39 +10,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from sim.camera import Colour
+from sim.metrics import mean_transmission
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe
-
-
-def mean_transmission(surface: FabricatedDoe) -> Complex[np.ndarray, " w"]:
-    """Mean transmission c0 over the open aperture, weighted by every cell's open share, per wavelength."""
-    coverage = np.asarray(surface.coverage, np.float64)
-    return _over(np.asarray(surface.means), coverage) / coverage.sum()
-
-
-def _over(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    return np.einsum("wyx,yx->w", values, coverage, dtype=np.complex128)
-
-
-def zeroth_order(surface: FabricatedDoe) -> Float[np.ndarray, " w"]:
-    """Fraction |<t>|^2 of the light that passes as if the plate were flat, per wavelength."""
-    return np.abs(mean_transmission(surface)) ** 2
-
-
-def strehl(surface: FabricatedDoe, nominal: FabricatedDoe) -> Float[np.ndarray, " w"]:
-    """Overlap |<t conj(t_nominal)>|^2 with the field the design means to make, per wavelength.
-
-    Args:
-        surface: the plate.
-        nominal: the plate exactly as drawn, on the DOE's own grid; where the plate is finer, its cells are repeated.
-    """
-    parts = surface.grid.shape[0] // nominal.grid.shape[0]
-    meant = np.repeat(np.repeat(np.conj(np.asarray(nominal.means)), parts, axis=1), parts, axis=2)
-    coverage = np.asarray(surface.coverage, np.float64)
-    return np.abs(_over(np.asarray(surface.means) * meant, coverage) / coverage.sum()) ** 2
 
 
 class SplitPsf(NamedTuple):

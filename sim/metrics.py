@@ -1,7 +1,13 @@
-"""Numbers read off a PSF, each with its definition. All work on plain arrays; none changes a PSF's energy."""
+"""Numbers that a DOE and its PSFs are judged by, each with its definition, and the one table of them (`METRICS`).
 
-from dataclasses import replace
-from typing import NamedTuple
+None changes a PSF's energy. `jax.grad`, `jit` and `vmap` go through all but the energy budget.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +17,14 @@ from scipy.fft import fft2
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour, SpectralLine
-from sim.optic import HeightOptic
+from sim.optic import CellOptic
+from sim.tracing import is_traced, total
+
+if TYPE_CHECKING:
+    from sim.psf_bank import PsfBank
+
+Psf = Float[np.ndarray, "y x"] | Float[Array, "y x"]
+Number = float | Float[Array, ""]
 
 
 def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y x"]:
@@ -43,55 +56,103 @@ def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
     return airy_radius_m(camera, wavelength_m) + camera.pixel_m
 
 
-def energy_within(psf: Float[np.ndarray, "y x"], pixel_m: float, radius_m: float) -> float:
-    """Energy inside a centred disc, with partly covered pixels counted by area."""
-    return float(encircled_energy(psf, pixel_m, np.array([radius_m]))[0])
+def near_and_far(camera: Camera, depths_m: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Depths whose defocus disc is wider than the far spot, and the others."""
+    spot_m = spot_radius_m(camera, max(line.wavelength_m for line in camera.lines))
+    near = tuple(z for z in depths_m if camera.defocus_radius_m(z) > spot_m)
+    return near, tuple(z for z in depths_m if z not in near)
 
 
 def encircled_energy(
-    psfs: Float[np.ndarray, "*bank y x"], pixel_m: float, radii_m: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "*bank r"]:
-    """Energy of every PSF inside centred discs of growing radius (not divided by the total)."""
+    psfs: Float[np.ndarray, "*bank y x"] | Float[Array, "*bank y x"],
+    pixel_m: float,
+    radii_m: Sequence[float] | np.ndarray,
+) -> Float[np.ndarray, "*bank r"] | Float[Array, "*bank r"]:
+    """Energy of every PSF inside centred discs (not divided by the total), partly covered pixels counted by area.
+
+    Args:
+        psfs: `[..., y, x]` energies.
+        pixel_m: pixel pitch, metres.
+        radii_m: radii of the discs, metres.
+    """
     y, x = psfs.shape[-2:]
-    discs = (disc_weights((y, x), pixel_m, float(radius)) for radius in radii_m)
-    flat = psfs.reshape(-1, y * x).astype(np.float64)
+    discs = [disc_weights((y, x), pixel_m, float(radius)) for radius in radii_m]
+    if is_traced(psfs):
+        return jnp.einsum("...yx,ryx->...r", psfs, np.stack(discs), precision="highest")
+    flat = np.asarray(psfs).reshape(-1, y * x).astype(np.float64)
     energies = np.stack([flat @ disc.ravel() for disc in discs], axis=-1)
     return energies.reshape(*psfs.shape[:-2], len(radii_m))
 
 
-class RingToDisc(NamedTuple):
-    """Energy outside and inside the geometric defocus disc, within the window."""
+def energy_within(psf: Psf, pixel_m: float, radius_m: float) -> Number:
+    """Energy inside one centred disc (`encircled_energy`)."""
+    energy = encircled_energy(psf, pixel_m, [radius_m])[0]
+    return energy if is_traced(energy) else float(energy)
 
-    ratio: float
-    ring: float
-    disc: float
+
+class RingToDisc(NamedTuple):
+    """Energy outside and inside the geometric defocus disc, within the window; lengths in metres."""
+
+    ratio: Number
+    ring: Number
+    disc: Number
     disc_radius_m: float
     window_half_m: float
 
 
-def ring_to_disc(psf: Float[np.ndarray, "y x"], camera: Camera, depth_m: float) -> RingToDisc:
-    """Ring:disc ratio of a near PSF (the paper's simulation gives 3:1, its prototype 1:1).
+def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
+    """Ring:disc ratio of a near PSF (the paper's simulation gives 3:1, its prototype 1:1); infinite without a disc.
 
     The disc is the geometric defocus disc widened by one pixel, where light that the DOE does not diffract lands.
     """
     radius = camera.defocus_radius_m(depth_m) + camera.pixel_m
     disc = energy_within(psf, camera.pixel_m, radius)
-    ring = float(np.sum(psf, dtype=np.float64)) - disc
-    return RingToDisc(ring / disc if disc > 0 else np.inf, ring, disc, radius, camera.window * camera.pixel_m / 2)
+    ring = total(psf) - disc
+    if is_traced(disc):
+        ratio = jnp.where(disc > 0, ring / jnp.where(disc > 0, disc, 1.0), jnp.inf)
+    else:
+        ratio = ring / disc if disc > 0 else np.inf
+    return RingToDisc(ratio, ring, disc, radius, camera.window * camera.pixel_m / 2)
 
 
-def participation(psf: Array) -> Array:
-    """Sum of squared pixel energies, the concentration of a PSF: 1 for one bright pixel, 1/n for n equal ones."""
-    return jnp.sum(psf**2, axis=(-2, -1))
+def far_spot(psf: Psf, camera: Camera, colour: Colour) -> Number:
+    """Energy inside the far spot (`spot_radius_m`)."""
+    return energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
 
 
-def zeroth_order(camera: Camera, height_m: Float[np.ndarray, "y x"], wavelength_m: float) -> float:
-    """Fraction |<t>|^2 of the light that passes as if the plate were flat, t = exp(i phi) over the clear aperture."""
-    # A star in focus is a plane wave; out of focus, a phase that is not the plate's would be added.
-    optic = HeightOptic.of(replace(camera, defocus_m=0.0), height_m)
-    field = optic.field(SpectralLine(0, wavelength_m, 1.0))
-    cells = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
-    return float(np.abs(np.asarray(field, np.complex128).sum() / cells) ** 2)
+def participation(psf: Any) -> Array:
+    """Sum of squared pixel energies, the concentration of PSFs: 1 for one bright pixel, 1/n for n equal ones."""
+    return jnp.sum(jnp.asarray(psf) ** 2, axis=(-2, -1))
+
+
+def mean_transmission(doe: CellOptic) -> Complex[np.ndarray, " w"] | Complex[Array, " w"]:
+    """Mean transmission c0 over the open aperture, weighted by every cell's open share, for `doe.wavelengths_m`."""
+    return _mean_over_aperture(doe, doe.means)
+
+
+def _mean_over_aperture(doe: CellOptic, values: Any) -> Any:
+    if is_traced(values, doe.coverage):
+        return jnp.einsum("wyx,yx->w", values, doe.coverage, precision="highest") / jnp.sum(doe.coverage)
+    coverage = np.asarray(doe.coverage, np.float64)
+    return np.einsum("wyx,yx->w", np.asarray(values), coverage, dtype=np.complex128) / coverage.sum()
+
+
+def zeroth_order(doe: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
+    """Fraction |c0|^2 of the light that passes as if the DOE were flat, for `doe.wavelengths_m`."""
+    return abs(mean_transmission(doe)) ** 2
+
+
+def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
+    """Overlap |<t conj(t_nominal)>|^2 with the field the design means to make, for `doe.wavelengths_m`.
+
+    Args:
+        doe: the DOE.
+        nominal: the DOE exactly as drawn, on its own grid; where `doe` is finer, its cells are repeated.
+    """
+    parts = doe.camera.grid.shape[0] // nominal.camera.grid.shape[0]
+    xp = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np
+    meant = xp.repeat(xp.repeat(xp.conj(xp.asarray(nominal.means)), parts, axis=1), parts, axis=2)
+    return abs(_mean_over_aperture(doe, xp.asarray(doe.means) * meant)) ** 2
 
 
 class EnergyBudget(NamedTuple):
@@ -133,34 +194,203 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
     return float(np.sum(np.square(np.abs(total)), dtype=np.float64))
 
 
-def energy_budget(
-    camera: Camera,
-    height_m: Float[np.ndarray, "y x"],
-    psf: Float[np.ndarray, "v u"],
-    depth_m: float,
-    colour: Colour,
-) -> EnergyBudget:
+def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: float, colour: Colour) -> EnergyBudget:
     """Energy budget of one PSF of one colour.
 
     Args:
-        camera: optics.
-        height_m: `[y, x]` the map the PSF was made from.
+        optic: the DOE that made the PSF, on the axis.
         psf: `[y, x]` PSF on the sensor, Fresnel loss included.
-        depth_m: source depth.
+        depth_m: source depth, metres.
         colour: colour of this PSF.
 
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), not
     from the PSF, so `uncollected` near zero or below it would show a fault in either.
     """
+    camera = optic.camera
     curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
-    optic = HeightOptic.of(camera, height_m)
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
         field = np.asarray(optic.field(SpectralLine(0, wavelength, 1.0), depth_m))
         share = weight * camera.transmission(wavelength)
         passed += share
         band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength) / scale
-    total = float(np.sum(psf, dtype=np.float64))
-    spot = energy_within(psf, camera.pixel_m, spot_radius_m(camera, mean_wavelength_m(colour)))
-    return EnergyBudget(1 - passed, spot, total - spot, band - total, passed - band)
+    energy, spot = total(psf), far_spot(psf, camera, colour)
+    return EnergyBudget(1 - passed, spot, energy - spot, band - energy, passed - band)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A DOE and its PSFs, from which metrics are computed.
+
+    Attributes:
+        bank: the PSFs, with their camera.
+        near_m: which of their depths are obstructions, metres.
+        doe: the DOE.
+        nominal: the DOE exactly as drawn, to compare with.
+        lens: PSFs of the bare lens at the same depths, to compare with.
+    """
+
+    bank: "PsfBank"
+    near_m: Sequence[float] = ()
+    doe: CellOptic | None = None
+    nominal: CellOptic | None = None
+    lens: "PsfBank | None" = None
+
+    @property
+    def camera(self) -> Camera:
+        """Lens, sensor and substrate.
+
+        Raises:
+            ValueError: the bank has none.
+        """
+        if self.bank.camera is None:
+            raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
+        return self.bank.camera
+
+    def of_colours(self, values: Any) -> list[Any]:
+        """Values for `doe.wavelengths_m` as their weighted sums for every colour."""
+        assert self.doe is not None
+        found = dict(zip(self.doe.wavelengths_m, values, strict=True))
+        return [
+            sum(weight * found[w] for w, weight in zip(colour.wavelengths_m, colour.weights, strict=True))
+            for colour in self.camera.colours
+        ]
+
+    @cached_property
+    def orders(self) -> list[Any]:
+        """0th order of every colour."""
+        assert self.doe is not None
+        return self.of_colours(zeroth_order(self.doe))
+
+    @cached_property
+    def strehls(self) -> list[Any]:
+        """Strehl ratio of every colour."""
+        assert self.doe is not None
+        assert self.nominal is not None
+        return self.of_colours(strehl(self.doe, self.nominal))
+
+    @cached_property
+    def opening(self) -> Any:
+        """Open area over that of the nominal aperture."""
+        assert self.doe is not None
+        cells = np.pi * (self.camera.aperture_m / self.doe.camera.grid.pitch_m) ** 2 / 4
+        return total(self.doe.coverage) / cells
+
+    def passed(self, colour: int) -> float:
+        """Power of a colour that passes the substrate's faces."""
+        return sum(line.factor for line in self.camera.lines if line.colour == colour)
+
+    def far_spot(self, colour: int, depth: int) -> Any:
+        """Far-spot energy of one PSF."""
+        return far_spot(self.bank.energy[colour, depth], self.camera, self.camera.colours[colour])
+
+    @cached_property
+    def lens_participation(self) -> Any:
+        """Participation `[colour, depth]` of the bare lens."""
+        assert self.lens is not None
+        return participation(self.lens.energy)
+
+    def concentration(self, colour: int, depth: int) -> Any:
+        """Participation of one PSF over that of the bare lens."""
+        own, lens = participation(self.bank.energy[colour, depth]), self.lens_participation[colour, depth]
+        return own / lens if is_traced(own, lens) else float(own) / float(lens)
+
+    def concentration_bound(self, colour: int) -> Any:
+        """Square of the largest far-spot energy, or None without a far depth."""
+        far = [d for d, depth in enumerate(self.bank.depths_m) if depth not in self.near_m]
+        return max(self.far_spot(colour, d) for d in far) ** 2 if far else None
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number per colour and depth.
+
+    Attributes:
+        label: what it is called in pictures and tables.
+        of: value for (evaluation, colour, depth), the latter two as positions in the bank.
+        tables: which tables list it: that of a "design", that of a DOE as "fabricated".
+        depths: whether it is meant for near depths, far ones, or all.
+        worse: on which side a DOE is bad, for limits and yield; None for a number without limits.
+        unit: "1", or "m"; a share of something is shown in per cent.
+    """
+
+    label: str
+    of: Callable[[Evaluation, int, int], Any]
+    tables: tuple[Literal["design", "fabricated"], ...]
+    depths: Literal["all", "near", "far"] = "all"
+    worse: Literal["high", "low"] | None = None
+    unit: Literal["1", "%", "m"] = "1"
+
+    @property
+    def share(self) -> bool:
+        """Whether it is a share of something, shown in per cent."""
+        return self.unit == "%"
+
+
+_BOTH = ("design", "fabricated")
+
+METRICS: Mapping[str, Metric] = MappingProxyType(
+    {
+        "zeroth_order": Metric("0th order", lambda e, c, d: e.orders[c], _BOTH, worse="high", unit="%"),
+        "strehl": Metric("Strehl ratio", lambda e, c, d: e.strehls[c], ("fabricated",), worse="low"),
+        "throughput": Metric("throughput", lambda e, c, d: total(e.bank.energy[c, d]), _BOTH, worse="low", unit="%"),
+        "outside_window": Metric(
+            "light outside the window",
+            lambda e, c, d: e.passed(c) * e.opening - total(e.bank.energy[c, d]),
+            ("fabricated",),
+            worse="high",
+            unit="%",
+        ),
+        "chrome": Metric("light by chrome", lambda e, c, d: e.passed(c) * (e.opening - 1), ("fabricated",), unit="%"),
+        "ring_to_disc": Metric(
+            "ring:disc",
+            lambda e, c, d: ring_to_disc(e.bank.energy[c, d], e.camera, e.bank.depths_m[d]).ratio,
+            _BOTH,
+            "near",
+            worse="low",
+        ),
+        "disc_radius_m": Metric(
+            "radius of the defocus disc",
+            lambda e, c, d: e.camera.defocus_radius_m(e.bank.depths_m[d]) + e.camera.pixel_m,
+            ("design",),
+            "near",
+            unit="m",
+        ),
+        "concentration": Metric("concentration", lambda e, c, d: e.concentration(c, d), ("design",), "near"),
+        "concentration_bound": Metric(
+            "least concentration", lambda e, c, d: e.concentration_bound(c), ("design",), "near"
+        ),
+        "far_spot": Metric("far spot", lambda e, c, d: e.far_spot(c, d), _BOTH, "far", worse="low", unit="%"),
+        "spot_radius_m": Metric(
+            "radius of the far spot",
+            lambda e, c, d: spot_radius_m(e.camera, mean_wavelength_m(e.camera.colours[c])),
+            ("design",),
+            "far",
+            unit="m",
+        ),
+    }
+)
+
+
+def metric_rows(evaluation: Evaluation, table: Literal["design", "fabricated"]) -> list[dict[str, Any]]:
+    """One row per depth and colour: `colour`, `depth_m` (None for infinity) and the metrics of a table.
+
+    A ring:disc ratio without any light in the disc is infinite.
+    """
+    rows = []
+    for d, depth in enumerate(evaluation.bank.depths_m):
+        shown = ("all", "near" if depth in evaluation.near_m else "far")
+        for c, colour in enumerate(evaluation.camera.colours):
+            row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
+            for name, metric in METRICS.items():
+                if table in metric.tables and metric.depths in shown:
+                    value = metric.of(evaluation, c, d)
+                    row[name] = None if value is None else float(value)
+            rows.append(row)
+    return rows
+
+
+def without_infinities(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows for a JSON file, which has no infinity: None in its place."""
+    return [{name: None if value == np.inf else value for name, value in row.items()} for row in rows]

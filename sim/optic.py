@@ -25,7 +25,7 @@ from sim.camera import Camera, SpectralLine
 from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
-from sim.propagation.pupil import DoeRows, SourceColumns, doe_field
+from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
 from sim.source import SeparableSource, SourceMap
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
@@ -123,11 +123,15 @@ class CellOptic(CameraOptic):
         camera: lens, sensor and substrate; its grid is that of the cells.
         coverage: `[y, x]` open share of every cell.
         source_kind: how sources are described (`sim.source`).
+        wavelengths_m: different wavelengths.
+        means: `[wavelength, y, x]` mean transmission of every cell.
     """
 
     camera: AbstractVar[Camera]
     coverage: AbstractVar[Float[Array, "y x"]]
     source_kind: AbstractVar[type[SourceMap] | type[SeparableSource]]
+    wavelengths_m: AbstractVar[tuple[float, ...]]
+    means: AbstractVar[Complex[Array, "w y x"]]
 
     @abstractmethod
     def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
@@ -178,6 +182,12 @@ class CellOptic(CameraOptic):
 _whole_field = jax.jit(doe_field)
 
 
+@jax.jit
+def height_transmission(height_m: Float[Array, "y x"], waves_per_metre: Float[Array, ""]) -> Complex[Array, "y x"]:
+    """Transmission exp(2 pi i height * waves_per_metre) of a height map."""
+    return cis(height_m * waves_per_metre)
+
+
 class HeightOptic(CellOptic):
     """A DOE given by its height map.
 
@@ -216,6 +226,22 @@ class HeightOptic(CellOptic):
     def shape(self) -> tuple[int, ...]:
         """Shape of what `with_heights` takes."""
         return self.camera.grid.shape
+
+    @property
+    def wavelengths_m(self) -> tuple[float, ...]:
+        """Different wavelengths of the camera."""
+        return tuple(dict.fromkeys(line.wavelength_m for line in self.lines))
+
+    @property
+    def means(self) -> Complex[Array, "w y x"]:
+        """Transmission of every cell."""
+        found = []
+        for line in {line.wavelength_m: line for line in self.lines}.values():
+            height, deviation = self.cells(line)
+            rate = jnp.float32(self.camera.waves_per_metre(line.wavelength_m))
+            wave = jnp.ones(self.shape, jnp.complex64) if height is None else height_transmission(height, rate)
+            found.append(wave if deviation is None else wave * deviation)
+        return jnp.stack(found)
 
     def with_heights(self, height_m: Float[Array, "y x"]) -> "HeightOptic":
         """The same with other heights."""

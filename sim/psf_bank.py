@@ -4,18 +4,24 @@
 # pyright: reportIncompatibleVariableOverride=false
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from fab.errors import InputError
-from fab.units import parse_length
+from fab.units import metres
 from sim.camera import Camera, SpectralLine
+from sim.metrics import METRICS, Evaluation, encircled_energy, near_and_far, participation
 from sim.optic import ON_AXIS, CellOptic, HasOptic, HeightOptic, Optic, Propagation
+from sim.tracing import on_host, stacked
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 Length = float | str
 if TYPE_CHECKING:  # numpy and jax arrays serve alike
@@ -43,6 +49,69 @@ class PsfBank(eqx.Module):
     pixel_m: float = eqx.field(static=True)
     field_rad: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     camera: Camera | None = eqx.field(static=True, default=None)
+
+    def with_camera(self, camera: Camera) -> "PsfBank":
+        """The same PSFs with the camera they were computed for or measured with, which metrics and pictures need."""
+        return replace(self, camera=camera)
+
+    def metric(self, name: str) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs, `[wavelength, depth]`.
+
+        Raises:
+            ValueError: the camera is not known.
+        """
+        evaluation, of = Evaluation(self), METRICS[name].of
+        depths = range(len(self.depths_m))
+        return stacked([stacked([of(evaluation, c, d) for d in depths]) for c in range(len(self.colours))])
+
+    def throughput(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+        """Energy in the window, `[wavelength, depth]`."""
+        return self.metric("throughput")
+
+    def far_spot(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+        """Energy in the far spot (`sim.metrics.spot_radius_m`), `[wavelength, depth]`."""
+        return self.metric("far_spot")
+
+    def ring_to_disc(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+        """Energy outside over energy inside the geometric defocus disc, `[wavelength, depth]`."""
+        return self.metric("ring_to_disc")
+
+    def participation(self) -> Float[Array, "w d"]:
+        """Sum of squared pixel energies, `[wavelength, depth]`."""
+        return participation(self.energy)
+
+    def encircled_energy(self, radii_m: Sequence[float]) -> Float[np.ndarray, "w d r"] | Float[Array, "w d r"]:
+        """Energy within centred discs of some radii (metres), `[wavelength, depth, radius]`."""
+        return encircled_energy(self.energy, self.pixel_m, radii_m)
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the PSFs, near depths (a defocus disc beyond the far spot) and far ones each on a scale of their own.
+
+        Raises:
+            ValueError: the camera is not known.
+        """
+        from sim.plots.psfs import plot_psfs
+
+        camera = Evaluation(self).camera
+        near, far = near_and_far(camera, self.depths_m)
+        return plot_psfs(self, camera, near, far, ax)
+
+    def _repr_html_(self) -> str:
+        """Table and picture for notebooks."""
+        from fab.figure import html_of, length_text
+
+        y, x = self.energy.shape[-2:]
+        rows = {
+            "colours": ", ".join(self.colours),
+            "depths": ", ".join(length_text(z) for z in self.depths_m),
+            "pixels": f"{x} x {y} of {length_text(self.pixel_m)}",
+        }
+        if self.camera is None:
+            return html_of("PSFs", rows)
+        for name in ("throughput", "far_spot", "ring_to_disc"):
+            values = self.metric(name)
+            rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
+        return html_of("PSFs", rows, self.plot())
 
     def as_optic(self) -> "BankOptic":
         """An optic that mixes these PSFs linearly in 1/z."""
@@ -138,11 +207,10 @@ def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
     return HeightOptic.of(camera, optic)
 
 
-def depth_m(value: Length) -> float:
-    """A source depth in metres from a number or text with a unit, such as "5 mm" or "inf"."""
-    if isinstance(value, str):
-        return np.inf if value.strip() in ("inf", "infinity") else parse_length(value)
-    return float(value)
+def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
+    """One depth or several, in metres or with a unit ("5 mm", "inf"), in metres."""
+    given = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
+    return tuple(metres(depth, "depth", infinite=True) for depth in given)
 
 
 def psf(
@@ -176,31 +244,20 @@ def psf(
         ValueError: a height map that does not match its camera, or what the optic cannot do.
         InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
     """
-    chosen = optic_of(optic, camera)
-    given: Any = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
-    depths_m = tuple(depth_m(depth) for depth in given)
+    chosen, depths_m = optic_of(optic, camera), depths_from(depths)
     rows = []
     for depth in depths_m:
         images: list[Any] = [0.0] * len(chosen.colours)
         for line in chosen.lines:
             plan = chosen.plan(line, depth, propagation, sampling)
             image = _compiled(chosen, line, plan, chosen.source(line, depth, field_rad))
-            images[line.colour] = images[line.colour] + line.factor * _on_host(image)
+            images[line.colour] = images[line.colour] + line.factor * on_host(image)
             on_psf()
-        rows.append(_stack(images, 0))
-    return PsfBank(_stack(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
+        rows.append(stacked(images))
+    return PsfBank(stacked(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
 
 
 # Compiled once per wavelength and shape, whatever the depth.
 @eqx.filter_jit
 def _compiled(optic: Optic, line: SpectralLine, plan: Any, source: Any) -> Array:
     return optic.energy(line, plan, source)
-
-
-def _on_host(image: Array) -> Any:
-    """Numbers as numpy, which adds them up without the library's overhead; what is traced stays."""
-    return image if isinstance(image, Tracer) else np.asarray(image)
-
-
-def _stack(images: list[Any], axis: int) -> Any:
-    return (jnp if any(isinstance(image, Tracer) for image in images) else np).stack(images, axis)

@@ -9,29 +9,53 @@ seem to resolve nothing at the sensor's own limit.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim.camera import Camera
+from sim.metrics import near_and_far
 from sim.optic import CellOptic
 from sim.propagation.pupil import DoeRows, SourceColumns, block_size, doe_field, in_blocks
+from sim.psf_bank import Length, depths_from, optic_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
 
-class TransferBank(NamedTuple):
-    """MTF along x for every colour and depth, and where it was taken.
+@dataclass(frozen=True, eq=False)
+class TransferBank:
+    """MTF along x for every colour and depth.
 
     Attributes:
         transfer: `[wavelength, depth, frequency]` |OTF|, 1 at frequency 0.
         frequencies_per_m: spatial frequencies on the sensor, cycles per metre.
         depths_m: source depths, metres.
+        camera: lens, sensor and substrate.
     """
 
     transfer: Float[np.ndarray, "w d f"]
     frequencies_per_m: Float[np.ndarray, " f"]
     depths_m: tuple[float, ...]
+    camera: Camera
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the curves, near depths (a defocus disc beyond the far spot) and far ones apart."""
+        from sim.plots.curves import plot_mtf
+
+        near, far = near_and_far(self.camera, self.depths_m)
+        return plot_mtf(self, self.camera, near, far, ax=ax)
+
+    def _repr_html_(self) -> str:
+        """Picture for notebooks."""
+        from fab.figure import html_of
+
+        return html_of("MTF", {"colours": ", ".join(colour.name for colour in self.camera.colours)}, self.plot())
 
 
 @jax.jit
@@ -46,25 +70,34 @@ def _row_spectra(rows: DoeRows, columns: SourceColumns) -> Array:
     return jax.lax.scan(add, jnp.zeros(2 * cells), in_blocks(rows, block_size(count)))[0]
 
 
-def transfer_bank(optic: CellOptic, depths_m: Sequence[float], count: int = 160) -> TransferBank:
+def mtf(
+    optic: Any, camera: Camera | None = None, depths: Length | Sequence[Length] = np.inf, count: int = 160
+) -> TransferBank:
     """MTF of a DOE along x, from zero to the sensor's Nyquist frequency.
 
     Args:
-        optic: the DOE.
-        depths_m: source depths on the axis, metres.
+        optic: a DOE of cells, anything that carries one, or a height map `[y, x]` in metres on `camera.grid`.
+        camera: lens, sensor, substrate and DOE grid of a bare height map.
+        depths: one source depth on the axis or several, in metres or with a unit; "inf" for a star.
         count: number of frequencies.
+
+    Raises:
+        TypeError: an optic that is not made of cells.
     """
-    camera = optic.camera
+    doe, depths_m = optic_of(optic, camera), depths_from(depths)
+    if not isinstance(doe, CellOptic):
+        raise TypeError(f"`optic` must be made of cells for an MTF, but got {type(doe).__name__}")
+    camera = doe.camera
     frequencies = np.linspace(0.0, 0.5 / camera.pixel_m, count)
     otf = np.zeros((len(camera.colours), len(depths_m), count), np.complex128)
     lags = np.arange(camera.grid.shape[1])
     weights = [weight for colour in camera.colours for weight in colour.weights]
     for d, depth in enumerate(depths_m):
         for line, weight in zip(camera.lines, weights, strict=True):
-            power = np.asarray(_row_spectra(*optic.rows(line, optic.source(line, depth))), np.float64)
+            power = np.asarray(_row_spectra(*doe.rows(line, doe.source(line, depth))), np.float64)
             correlation = np.fft.ifft(power)[: len(lags)] / power.mean()
             lag = line.wavelength_m * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
             otf[line.colour, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
             otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)
     pixel = np.sinc(camera.pixel_m * camera.fill * frequencies)
-    return TransferBank(np.abs(otf * pixel), frequencies, tuple(depths_m))
+    return TransferBank(np.abs(otf * pixel), frequencies, depths_m, camera)

@@ -18,6 +18,7 @@ from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.process import Process, Variation
 from sim.leakage import SplitPsf, split_psf
+from sim.metrics import without_infinities
 from sim.plots.leakage import plot_split
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, psf
@@ -115,6 +116,7 @@ def _write(folder: Path, design: Design, process: Process, plate: Variation, sou
     bank = _bank(design, splits)
     say("writing bank and pictures")
     rows = {"nominal": plate_rows(design, meant, nominal), "fabricated": plate_rows(design, surface, bank)}
+    rows = {name: without_infinities(found) for name, found in rows.items()}
     for row in rows["fabricated"]:
         d = bank.depths_m.index(float("inf") if row["depth_m"] is None else row["depth_m"])
         row["split"] = _sums(splits[bank.colours.index(row["colour"]), d])

@@ -28,7 +28,7 @@ from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank
 from sim.psf_bank import psf as psf_of
 from sim.store import write_bank
-from sim.transfer import transfer_bank
+from sim.transfer import mtf
 
 Say = Callable[[str], None]
 
@@ -154,16 +154,16 @@ def _write(
 ) -> None:
     flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
     lens = psf_of(flat, depths=depths, field_rad=field)
-    lens_transfer = transfer_bank(flat, depths)
+    lens_transfer = mtf(flat, depths=depths)
     metrics: dict[str, Any] = {}
     for name in ("continuous", "quantised"):
         bank, height = banks[name], designs[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
         save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
-        transfer = transfer_bank(HeightOptic.of(camera, height), depths)
+        transfer = mtf(height, camera, depths)
         save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
         save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
-        metrics[name] = design_metrics(camera, height, bank, near, lens)
+        metrics[name] = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
     if _takes_hankel(run, "continuous", field):
         # The budget's band is that of a raster of cells, which rings are not.
         metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -12,64 +11,33 @@ from doedesign.spec import Spec
 from fab.units import parse_length
 from sim.camera import Camera
 from sim.metrics import (
+    Evaluation,
     airy_radius_m,
     energy_budget,
-    energy_within,
     mean_wavelength_m,
-    participation,
+    metric_rows,
     radius_map_m,
-    ring_to_disc,
     spot_radius_m,
-    zeroth_order,
+    without_infinities,
 )
+from sim.optic import CellOptic
 from sim.psf_bank import PsfBank
 
 
-def design_metrics(
-    camera: Camera, height_m: Float[np.ndarray, "y x"], bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank
-) -> list[dict[str, Any]]:
-    """Return one row per depth and colour of a bank.
+def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank) -> list[dict[str, Any]]:
+    """Return one row per depth and colour of a bank: the metrics of a design (`sim.metrics`) and its energy budget.
 
     Args:
-        camera: optics.
-        height_m: `[y, x]` heights the bank was computed from, metres.
+        optic: the DOE.
         bank: its PSFs on the axis.
         near_m: which of the bank's depths are obstructions.
         lens: PSFs of the plain lens at the same depths.
-
-    Returns:
-        rows with the energy budget; for far depths the far-spot energy; for near depths ring:disc, the
-        concentration relative to the plain lens and its lower bound, the square of the far-spot energy (design.md §4).
     """
-    far_m = [z for z in bank.depths_m if z not in near_m]
-    plain = participation(jnp.asarray(lens.energy))
-    wavelengths = [mean_wavelength_m(colour) for colour in camera.colours]
-    spots = [spot_radius_m(camera, wavelength) for wavelength in wavelengths]
-    far_spot = {
-        (c, z): energy_within(bank.energy[c, bank.depths_m.index(z)], camera.pixel_m, spots[c])
-        for c in range(len(camera.colours))
-        for z in far_m
-    }
-    orders = [
-        sum(w * zeroth_order(camera, height_m, line) for line, w in zip(c.wavelengths_m, c.weights, strict=True))
-        for c in camera.colours
-    ]
-    rows = []
-    for d, depth in enumerate(bank.depths_m):
-        for c, colour in enumerate(camera.colours):
-            psf = bank.energy[c, d]
-            budget = energy_budget(camera, height_m, psf, depth, colour)._asdict()
-            row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
-            row |= {"in_window": float(psf.sum(dtype=np.float64)), "zeroth_order": orders[c], "budget": budget}
-            if depth in near_m:
-                ring = ring_to_disc(psf, camera, depth)
-                row |= {"ring_to_disc": ring.ratio if np.isfinite(ring.ratio) else None}
-                row |= {"disc_radius_m": ring.disc_radius_m}
-                row |= {"concentration": float(participation(jnp.asarray(psf))) / float(plain[c, d])}
-                row |= {"concentration_bound": max(far_spot[c, z] for z in far_m) ** 2 if far_m else None}
-            else:
-                row |= {"far_spot": far_spot[c, depth], "spot_radius_m": spots[c]}
-            rows.append(row)
+    rows = without_infinities(metric_rows(Evaluation(bank, near_m, optic, lens=lens), "design"))
+    places = ((d, c) for d in range(len(bank.depths_m)) for c in range(len(bank.colours)))
+    for row, (d, c) in zip(rows, places, strict=True):
+        colour = optic.camera.colours[c]
+        row["budget"] = energy_budget(optic, bank.energy[c, d], bank.depths_m[d], colour)._asdict()
     return rows
 
 

@@ -31,8 +31,8 @@ from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictio
 from fab.sampling import varying
 from sim.aperture import circle_coverage
 from sim.camera import Camera
-from sim.leakage import strehl, zeroth_order
 from sim.material import full_wave_wavelength_m, refractive_index
+from sim.metrics import strehl, zeroth_order
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,32 +13,13 @@ from doedesign.spec import LimitSpec
 from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
 from fab.units import format_length, parse_length
+from sim.metrics import METRICS, Metric
 
 CONFIDENCE = 0.95
 
 
-class Quantity(NamedTuple):
-    """A number that every plate has per colour and depth.
-
-    Attributes:
-        label: what it is called.
-        worse: on which side a plate is bad.
-        share: whether it is a share of something, shown in per cent.
-    """
-
-    label: str
-    worse: Literal["high", "low"]
-    share: bool = True
-
-
-QUANTITIES: Mapping[str, Quantity] = {
-    "zeroth_order": Quantity("0th order", "high"),
-    "strehl": Quantity("Strehl ratio", "low", False),
-    "throughput": Quantity("throughput", "low"),
-    "outside_window": Quantity("light outside the window", "high"),
-    "ring_to_disc": Quantity("ring:disc", "low", False),
-    "far_spot": Quantity("far spot", "low"),
-}
+# The metrics that limits can be set for.
+QUANTITIES: Mapping[str, Metric] = {name: metric for name, metric in METRICS.items() if metric.worse is not None}
 
 
 _WORST = {"high": math.inf, "low": -math.inf}

@@ -19,8 +19,7 @@ from fab.masks import planes
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
-from sim.optic import CellOptic
-from sim.propagation.pupil import cis
+from sim.optic import CellOptic, height_transmission
 from sim.source import SourceMap
 from sim.surface.relief import plan_of, relief_of, require_possible
 from sim.surface.roughness import cell_roughness, cell_share
@@ -93,7 +92,7 @@ def as_fabricated(
     rates = jnp.asarray([camera.waves_per_metre(w) for w in lines], jnp.float32)
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
-        flat = jnp.stack([jax.jit(_flat)(height, rate) for rate in rates])
+        flat = jnp.stack([height_transmission(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
         return FabricatedDoe(camera, coverage, flat, flat, lines, height)
     if not traced:
@@ -114,10 +113,6 @@ def as_fabricated(
     grid = _refined(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, means, lines)
-
-
-def _flat(height_m: Array, rate: Array) -> Array:
-    return cis(height_m * rate)
 
 
 def _refined(grid: Grid, parts: int) -> Grid:

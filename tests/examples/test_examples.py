@@ -53,7 +53,7 @@ def test_small_specs_run(name: str, changes: list[str], tmp_path: Path, capsys: 
     assert ("patterns" in metrics) == (name != "quick")
     assert (run / "pattern.png").exists() == (name != "quick")
     for row in metrics["psf"]:
-        assert 0 < row["in_window"] < 1
+        assert 0 < row["throughput"] < 1
         assert np.isfinite([value for value in row.values() if isinstance(value, float)]).all()
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from bench.reference import YELLOW_M, make_camera, wrapped_map
 from sim.metrics import energy_budget
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 
 
@@ -41,7 +42,7 @@ def test_no_period_of_the_spectrum_counts_twice():
         image = psf(wrapped_map(cells), camera, [np.inf]).energy[0, 0]
         sums.append(float(image.sum(dtype=np.float64)))
         if periods == 1:
-            budget = energy_budget(camera, wrapped_map(cells), image, np.inf, camera.colours[0])
+            budget = energy_budget(HeightOptic.of(camera, wrapped_map(cells)), image, np.inf, camera.colours[0])
             # The window is the band itself, so nothing of it is left over but the last row's rounding of pixels.
             assert budget.uncollected == pytest.approx(0, abs=2e-3)
     assert all(np.diff(sums) > 0)

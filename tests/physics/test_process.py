@@ -13,7 +13,7 @@ from fab.levels import Levels, height_of
 from fab.masks import planes
 from fab.process import Process, Variation, variation_of
 from sim.camera import Camera, Colour
-from sim.leakage import mean_transmission, strehl, zeroth_order
+from sim.metrics import mean_transmission, strehl, zeroth_order
 from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera, wrapped_map
-from sim.optic import HeightOptic
 from sim.propagation.pixel import disc_autocorrelation
 from sim.psf_bank import psf
-from sim.transfer import transfer_bank
+from sim.transfer import mtf
 
 
 @pytest.mark.parametrize("pixel_m", [3.7e-6, 0.4e-6])
 def test_flat_plate_has_the_transfer_of_a_circular_aperture(pixel_m: float):
     camera = make_camera(600, 1.2e-3, 2.16e-3, pixel_m, 16)
-    found = transfer_bank(HeightOptic.of(camera, np.zeros(camera.grid.shape)), [np.inf])
+    found = mtf(np.zeros(camera.grid.shape), camera, [np.inf])
     nu = found.frequencies_per_m
     cutoff = camera.aperture_m / (YELLOW_M * camera.focal_length_m)
     wanted = disc_autocorrelation(nu / cutoff) * np.abs(np.sinc(nu * pixel_m))
@@ -27,7 +26,7 @@ def test_rough_plate_agrees_with_its_finely_sampled_psf():
     # Cells of 5 um: the band is 0.47 mm wide, the window 1.5 mm, so little light is missing from the PSF.
     camera = make_camera(64, 0.32e-3, 4e-3, 1.5e-6, 1000)
     height = wrapped_map(64)
-    found = transfer_bank(HeightOptic.of(camera, height), [0.08], count=40)
+    found = mtf(height, camera, [0.08], count=40)
     image = psf(height, camera, [0.08]).energy[0, 0].astype(np.float64)
     x = camera.axis_m()
     spectrum = np.abs(np.exp(-2j * np.pi * np.outer(found.frequencies_per_m, x)) @ image.sum(axis=0)) / image.sum()
@@ -38,5 +37,5 @@ def test_rough_plate_agrees_with_its_finely_sampled_psf():
 def test_light_does_not_depend_on_the_window():
     narrow, wide = (make_camera(200, 0.4e-3, 2e-3, 2e-6, window) for window in (8, 64))
     height = wrapped_map(200)
-    first, second = (transfer_bank(HeightOptic.of(camera, height), [0.05, np.inf]) for camera in (narrow, wide))
+    first, second = (mtf(height, camera, [0.05, np.inf]) for camera in (narrow, wide))
     assert np.array_equal(first.transfer, second.transfer)

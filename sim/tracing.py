@@ -1,0 +1,28 @@
+"""Arrays that may be traced by jax: sums run in double precision on the host, and in single precision under a trace."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether any array in some pytrees is traced."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def on_host(array: Any) -> Any:
+    """The array as numpy, or as it is where it is traced."""
+    return array if isinstance(array, Tracer) else np.asarray(array)
+
+
+def total(array: Any) -> Any:
+    """Sum of an array: a float, or a traced scalar."""
+    return jnp.sum(array) if is_traced(array) else float(np.sum(array, dtype=np.float64))
+
+
+def stacked(arrays: list[Any], axis: int = 0) -> Any:
+    """`stack` of arrays or numbers that may be traced."""
+    return (jnp if is_traced(arrays) else np).stack(arrays, axis)
