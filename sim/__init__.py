@@ -39,3 +39,7 @@ Conventions (pinned by tests/sim/test_conventions.py):
 * A PSF carries energy: its sum over an unbounded sensor is the power transmitted per unit power
   incident on the clear aperture. Nothing is renormalised.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
