@@ -215,7 +215,7 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
         share = weight * camera.transmission(wavelength)
         passed += share
         band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength) / scale
-    energy, spot = total(psf), far_spot(psf, camera, colour)
+    energy, spot = float(total(psf)), float(far_spot(psf, camera, colour))
     return EnergyBudget(1 - passed, spot, energy - spot, band - energy, passed - band)
 
 

@@ -209,7 +209,7 @@ def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
 
 def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
     """One depth or several, in metres or with a unit ("5 mm", "inf"), in metres."""
-    given = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
+    given: Any = [depths] if isinstance(depths, str) or np.ndim(depths) == 0 else depths
     return tuple(metres(depth, "depth", infinite=True) for depth in given)
 
 

@@ -64,7 +64,7 @@ class PlateTable:
         """Which plates could be evaluated."""
         beyond = np.zeros(len(self.keys), dtype=bool)
         for name, values in self.values.items():
-            beyond |= np.any(values == _WORST[QUANTITIES[name].worse], axis=1)
+            beyond |= np.any(values == _WORST[str(QUANTITIES[name].worse)], axis=1)
         return ~beyond
 
     def of(self, keys: Sequence[str]) -> "PlateTable":
@@ -92,7 +92,7 @@ def table_of(plates: Mapping[str, Rows | OutOfModel]) -> PlateTable:
         if isinstance(rows, OutOfModel):
             for name in present:
                 has = [name in row for row in first]
-                values[name][i, has] = _WORST[QUANTITIES[name].worse]
+                values[name][i, has] = _WORST[str(QUANTITIES[name].worse)]
             continue
         if [(row["colour"], _depth(row["depth_m"])) for row in rows] != list(places):
             raise ValueError(f"all plates must have the same rows, but {key} has others")

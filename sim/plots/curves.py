@@ -31,7 +31,7 @@ _RADII = 96
 _LENS: dict[str, Any] = {"ls": "--", "lw": 0.9}
 
 # Values of every colour and depth, `[w, d, x]`, and the depths.
-_Curves = tuple[Float[np.ndarray, "w d x"], Sequence[float]]
+_Curves = tuple[Any, Sequence[float]]  # `[w, d, x]`, and its depths
 # Draws the marks of (panel, position of a depth in the bank, "near" or "far").
 _Finish = Callable[["Axes", int, str], None]
 

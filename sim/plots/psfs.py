@@ -162,7 +162,7 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: PsfBank, group: _Group, colu
         _circle(inset, radius_m, ":")
         bare(inset)
         inset.spines[:].set_color("white")
-        shares["spot"] = energy_within(middle[0], bank.pixel_m, radius_m)
+        shares["spot"] = float(energy_within(middle[0], bank.pixel_m, radius_m))
     if len(picked) == 1:
         _write(axes, "\n".join(f"{name} {100 * share:.1f} %" for name, share in shares.items()))
 

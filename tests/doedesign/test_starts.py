@@ -67,7 +67,7 @@ def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
 
     def loss(height: np.ndarray) -> float:
         image = psf(height, CAMERA, [depth], sampling=1.0).energy[0, 0]
-        return -energy_within(image, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN))
+        return -float(energy_within(image, CAMERA.pixel_m, spot_radius_m(CAMERA, GREEN)))
 
     found = start_heights("fresnel", {"evaluations": 45}, SETUP._replace(loss=loss))
     ideal = lens(SETUP, 1 / depth)

@@ -41,7 +41,7 @@ def random_transfer(
     rng: np.random.Generator, camera: Camera = CAMERA, depths: tuple[float, ...] = (*NEAR, *FAR)
 ) -> TransferBank:
     transfer = rng.uniform(0, 1, (len(camera.colours), len(depths), 40))
-    return TransferBank(transfer, np.linspace(0, 0.5 / camera.pixel_m, 40), depths)
+    return TransferBank(transfer, np.linspace(0, 0.5 / camera.pixel_m, 40), depths, camera)
 
 
 def plot(name: str, **more) -> FigureBase:
