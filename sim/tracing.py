@@ -20,7 +20,7 @@ def on_host(array: Any) -> Any:
 
 def total(array: Any) -> Any:
     """Sum of an array: a float, or a traced scalar."""
-    return jnp.sum(array) if is_traced(array) else float(np.sum(array, dtype=np.float64))
+    return jnp.sum(array) if is_traced(array) else float(np.sum(np.asarray(array), dtype=np.float64))
 
 
 def stacked(arrays: list[Any], axis: int = 0) -> Any:
