@@ -150,12 +150,12 @@ def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Normal]]:
                 yield name, spread
 
 
-def process_spec_of(process: Process, like: ProcessSpec) -> ProcessSpec:
+def process_spec_of(process: Process, like: ProcessSpec | None = None) -> ProcessSpec:
     """The spec of a process, every number said and none left to a stock process.
 
     Args:
         process: the process, for example one fitted to measurements.
-        like: the spec it came from, for what a process does not know (the chrome's overlap).
+        like: the spec it came from, for what a process does not know (the chrome's overlap); the usual one by default.
 
     Raises:
         InputError: a number that no spec may hold.
@@ -173,7 +173,7 @@ def process_spec_of(process: Process, like: ProcessSpec) -> ProcessSpec:
         "levels": process.levels.count,
         "level_step_m": process.levels.step_m,
         **({} if process.levels.is_binary else {"etch_depths_m": process.levels.depths_m}),
-        "chrome_overlap_m": like.chrome_overlap_m,
+        **({} if like is None else {"chrome_overlap_m": like.chrome_overlap_m}),
         "etches": [] if in_order else [{"mask": k, "depth_m": process.depths_m()[k]} for k in process.order],
         "errors": errors,
         "defects": DefectsSpec.from_si(vars(process.defects)),

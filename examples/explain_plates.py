@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from doedesign.build import camera_from_spec
-from doedesign.calibration import Family, Targets, explanations
+from doedesign.calibration import ExplanationSet, Targets, explain_ratio
 from doedesign.design.design import Design
 from doedesign.prediction import Prediction, predict
 from doedesign.runs.folder import Run
@@ -260,12 +260,12 @@ def draws(group: str, count: int, lifts: Sequence[int], seed: int) -> list[Plate
 BEYOND = {"common_depth_scale": 0.05, "common_cd_bias_m": 0.3 * UM}
 
 
-def needed(bench: Bench, lift: int) -> Family:
+def needed(bench: Bench, lift: int) -> ExplanationSet:
     """How large single errors must be for 1:1 at the probe, within their ranges or not."""
     say(f"how large would single errors have to be at lift {lift}?")
     process = replace(bench.process, spreads={name: Normal(0.0, step) for name, step in BEYOND.items()})
     targets = Targets(LINES[1].wavelengths_m[0], bench.near_m, MEASURED_RATIO, MEASURED_THROUGHPUT, CLOSE / 2)
-    return explanations(lifted(bench, lift), process, targets, tuple(BEYOND), pairs=False, reach=8.0)
+    return explain_ratio(lifted(bench, lift), targets, tuple(BEYOND), process=process, pairs=False, reach=8.0)
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ class Answer:
     bench: Bench
     seen: list[Seen]
     frail: int
-    needed: dict[int, Family]
+    needed: dict[int, ExplanationSet]
     shown: list[tuple[Seen, Prediction]]
     relayed: list[float]
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.report.tolerance import plot_budget
 from doedesign.tolerancing import Budget, study
+from doedesign.tolerancing.plots import plot_budget
 from fab.figure import save
 from fab.units import format_length
 
@@ -66,7 +66,7 @@ def budgets(
     asked = study(run, errors=PROCESS, limits=limits, workers=workers)
     # Asked for at once, all plates are shared out among the workers in one go.
     factors = (0.0, 0.5, 1.0, 2.0)
-    asked.plates([k for source in sources for some in asked.budget_keys(source, wanted, draws, factors) for k in some])
+    asked.sample([k for source in sources for some in asked.budget_keys(source, wanted, draws, factors) for k in some])
     found = [asked.budget(source, wanted, draws, factors) for source in sources]
 
     lines = [f"yield as the process is: {asked.monte_carlo(draws).yield_}", ""]

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.report.tolerance import plot_changes, plot_histograms
-from doedesign.tolerancing import Change, Plates, Study, study
+from doedesign.tolerancing import Effect, Sample, Study, study
+from doedesign.tolerancing.plots import plot_effects, plot_histograms
 from fab.figure import save
 
 HERE = Path(__file__).parent
@@ -50,7 +50,7 @@ def overlay(run: Path, draws: int = 40, sigma: str = "0.25 um", workers: int | N
     plates = asked.monte_carlo(draws)
     changes = asked.one_at_a_time()
 
-    drawn = asked.plates(["expected"])  # without a mean error, the plate as drawn
+    drawn = asked.sample(["expected"])  # without a mean error, the plate as drawn
     pictures = draw(run / "overlay", asked, plates, drawn, changes)
     lines = [f"yield of {draws} plates: {plates.yield_}", "", "quantity        as drawn     mean    worst plate"]
     for quantity in plates.table.values:
@@ -62,17 +62,17 @@ def overlay(run: Path, draws: int = 40, sigma: str = "0.25 um", workers: int | N
     return "\n".join([*lines, "", *map(str, pictures)])
 
 
-def strehl_by_mask(changes: list[Change]) -> list[tuple[float, float]]:
+def strehl_by_mask(changes: list[Effect]) -> list[tuple[float, float]]:
     """The Strehl ratio with each mask one sigma to the left and to the right, the worst colour."""
     chosen = [c for c in changes if c.quantity == "strehl" and c.colour is None and c.error.startswith("overlay_x_m")]
     return [(c.low if c.low is not None else c.expected, c.high) for c in chosen]
 
 
-def draw(folder: Path, asked: Study, plates: Plates, drawn: Plates, changes: list[Change]) -> list[Path]:
+def draw(folder: Path, asked: Study, plates: Sample, drawn: Sample, changes: list[Effect]) -> list[Path]:
     """Histograms of the plates, and what every mask does alone."""
     files = [folder / "histograms.png", folder / "masks.png"]
     save(plot_histograms(plates.table, drawn.table, asked.design.camera, asked.limits), files[0])
-    save(plot_changes(changes), files[1])
+    save(plot_effects(changes), files[1])
     return files
 
 

@@ -1,4 +1,4 @@
-"""What two numbers can mean: the process errors, one alone or two together, that would give a measured ring:disc ratio.
+"""`explain_ratio`: the process errors, one alone or two together, that would give a measured ring:disc ratio.
 
 A lab that has measured the ring:disc ratio of a near PSF and a throughput cannot tell which errors made them. This
 lists those that could: for every error the value, counted in standard deviations of the process, at which the model
@@ -8,25 +8,40 @@ plausible pair. "None within reach" is an answer, too.
 Throughput here is the energy in the sensor window per unit incident on the clear aperture, Fresnel loss included
 (`doedesign.prediction`). A published throughput may be another one: the paper gives 86 % and does not say of what.
 
-Errors are walked along rays from the process's means. Along a ray the ratio is looked at every standard deviation (and
-at half of one), and the first crossing is closed in on by Brent's method. Two errors are mixed in the proportion that
-would be most plausible if their effects added; where along it the ratio is met is then found with the model itself.
+The ratio is followed along rays from the process's means, every standard deviation (and at half of one), and the first
+crossing is closed in on by Brent's method. Two errors are mixed in the proportion that would be most plausible if their
+effects added; where along it the ratio is met is then found with the model itself.
 """
 
+import contextlib
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
+from doedesign.calibration.estimate import models_meter
 from doedesign.calibration.unknowns import chosen_names, definite_means, prior_sigma
 from doedesign.design.design import Design
 from doedesign.prediction import predict
+from doedesign.report.labels import error_label, value_text
+from doedesign.runs.folder import Run
+from doedesign.runs.level_maps import open_design
+from doedesign.runs.results import results_folder
 from fab.errors import InputError
+from fab.figure import html_of
 from fab.process import Process, deviation_of, variation_of
 from sim.camera import Colour
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+log = logging.getLogger("doedesign")
 
 _DEFAULT = (
     "common_depth_scale",
@@ -45,7 +60,7 @@ _LEAST_SHARE = 0.2  # of a pair's length that each of its errors has at least
 
 
 class Targets(NamedTuple):
-    """What was measured.
+    """Measured numbers.
 
     Attributes:
         wavelength_m: of the probe.
@@ -100,8 +115,8 @@ class Curve(NamedTuple):
     throughput: tuple[float, ...]
 
 
-class Family(NamedTuple):
-    """All explanations.
+class ExplanationSet(NamedTuple):
+    """All explanations of some measured numbers.
 
     Attributes:
         targets: what was measured.
@@ -123,10 +138,62 @@ class Family(NamedTuple):
     assumed: dict[str, float]
     reach: float
 
+    def __str__(self) -> str:
+        """The explanations as a table."""
+        targets, nominal = self.targets, self.nominal
+        throughput = "" if targets.throughput is None else f", throughput {100 * targets.throughput:.3g} %"
+        lines = [
+            f"measured: ring:disc {targets.ring_to_disc:.3g}{throughput}",
+            f"model at the process's means: ring:disc {nominal['ring_to_disc']:.3g}, "
+            f"throughput {100 * nominal['throughput']:.3g} %, zeroth order {100 * nominal['zeroth_order']:.2g} %",
+            "",
+            "sigmas  throughput  0th order  what would give the measured ratio"
+            + ("" if targets.throughput is None else " (*: and the throughput, to two sigmas)"),
+        ]
+        for title, rows in (("one error", self.singles), ("two errors", self.pairs)):
+            if rows:
+                lines += [f"{title}:", *map(_line, rows)]
+        alone = [names[0] for names in self.none if len(names) == 1]
+        if alone:
+            lines.append(f"none within {self.reach:g} sigmas, where the ratio stays within:")
+        for name in alone:
+            ratios = self.curves[name].ring_to_disc
+            lines.append(f"  {min(ratios):5.3g} to {max(ratios):5.3g}  {error_label(name)}")
+        if self.assumed:
+            lines.append(f"sigmas that the process does not give were assumed: {', '.join(self.assumed)}")
+        lines.append(
+            "Throughput is the light in the sensor window per light on the clear aperture, Fresnel loss included; "
+            "a published one may be another."
+        )
+        return "\n".join(lines)
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the ratio along every error, and the explanations in order.
+
+        Args:
+            ax: axes whose place the picture takes; a new figure by default.
+        """
+        from doedesign.calibration.explanation_plots import plot_explanations
+
+        return plot_explanations(self, ax)
+
+    def _repr_html_(self) -> str:
+        rows = {
+            " and ".join(map(error_label, each.values)): f"{each.distance:.2f} standard deviations"
+            for each in [*self.singles, *self.pairs]
+        }
+        return html_of(f"ring:disc {self.targets.ring_to_disc:.3g}", rows or {"none": "within reach"}, self.plot())
+
+
+def _line(each: Explanation) -> str:
+    values = ", ".join(f"{error_label(name)} {value_text(name, value)}" for name, value in each.values.items())
+    mark = "*" if each.fits else " "  # the throughput fits, too
+    return f"{each.distance:6.2f}  {100 * each.throughput:8.1f} %{mark} {100 * each.zeroth_order:8.2f} %  {values}"
+
 
 @dataclass(frozen=True, eq=False)
-class _Walk:
-    """The model as a function of scores, remembered."""
+class _ScoredModel:
+    """The model's metrics as a function of the errors' scores, each computed once."""
 
     design: Design
     process: Process
@@ -134,19 +201,19 @@ class _Walk:
     targets: Targets
     reach: float
     on_model: Callable[[str], None]
-    seen: dict[tuple[tuple[str, float], ...], dict[str, Any] | None] = field(default_factory=dict)
+    computed: dict[tuple[tuple[str, float], ...], dict[str, Any] | None] = field(default_factory=dict)
 
     def values(self, scores: Mapping[str, float]) -> dict[str, float]:
         spreads = self.process.spreads
         return {n: (spreads[n].mean if n in spreads else 0.0) + z * self.sigma[n] for n, z in scores.items()}
 
     def row(self, scores: Mapping[str, float]) -> dict[str, Any] | None:
-        """The model's numbers; None where an error is beyond what can be."""
+        """The model's metrics; None where it does not describe an error."""
         key = tuple(sorted((name, round(z, 9)) for name, z in scores.items() if z))
-        if key not in self.seen:
-            self.seen[key] = self._row(scores)
-            self.on_model(" and ".join(scores) or "as believed")
-        return self.seen[key]
+        if key not in self.computed:
+            self.computed[key] = self._row(scores)
+            self.on_model(" and ".join(scores) or "means")
+        return self.computed[key]
 
     def _row(self, scores: Mapping[str, float]) -> dict[str, Any] | None:
         values = self.values(scores)
@@ -154,32 +221,30 @@ class _Walk:
             return None
         means = definite_means(self.process)
         try:
-            rows = predict(self.design, self.process, variation_of(self.process.masks, {**means, **values})).rows
+            return predict(self.design, self.process, variation_of(self.process.masks, {**means, **values})).rows[0]
         except InputError:
             if not scores:
                 raise
             return None  # such as edges that move by more than half a cell
-        return rows[0]
 
     def excess(self, scores: Mapping[str, float]) -> float:
-        """Logarithm of the model's ratio over the measured one; NaN beyond what can be."""
+        """Logarithm of the model's ratio over the measured one; NaN where the model does not describe an error."""
         row = self.row(scores)
         return np.nan if row is None else float(np.log(max(row["ring_to_disc"], 1e-9) / self.targets.ring_to_disc))
 
-    def crossing(self, way: Mapping[str, float], start: float = 0.5) -> Mapping[str, float] | None:
+    def crossing(self, direction: Mapping[str, float], start: float = 0.5) -> Mapping[str, float] | None:
         """First scores along a ray at which the ratio is the measured one.
 
         Args:
-            way: direction, of length 1.
+            direction: of length 1.
             start: where to look first; beyond it every standard deviation.
         """
 
         def at(length: float) -> dict[str, float]:
-            return {name: length * share for name, share in way.items()}
+            return {name: length * share for name, share in direction.items()}
 
         last, below = 0.0, self.excess({})
-        stops = [start, *np.arange(np.floor(start) + 1, self.reach + 1e-9)]
-        for stop in stops:
+        for stop in [start, *np.arange(np.floor(start) + 1, self.reach + 1e-9)]:
             above = self.excess(at(stop))
             if np.isnan(above):
                 return None
@@ -189,98 +254,105 @@ class _Walk:
             last, below = stop, above
         return None
 
+    def explanation(self, scores: Mapping[str, float]) -> Explanation:
+        """What scores at which the ratio is met amount to."""
+        row, wanted = self.row(scores), self.targets.throughput
+        assert row is not None  # it is one that was computed
+        return Explanation(
+            values=self.values(scores),
+            scores={name: float(z) for name, z in scores.items()},
+            distance=float(np.sqrt(sum(z * z for z in scores.values()))),
+            **{name: row[name] for name in ("ring_to_disc", "throughput", "zeroth_order", "strehl")},
+            fits=None if wanted is None else abs(row["throughput"] - wanted) <= 2 * self.targets.throughput_sigma,
+        )
 
-def explanations(
-    design: Design,
-    process: Process,
+    def curve(self, name: str) -> Curve:
+        """All that was computed along one error."""
+        points = [(0.0, self.row({}))] + [
+            (key[0][1], row) for key, row in self.computed.items() if [n for n, _ in key] == [name]
+        ]
+        known = sorted((score, row) for score, row in points if row is not None)
+        columns = (tuple(row[quantity] for _, row in known) for quantity in ("ring_to_disc", "throughput"))
+        return Curve(tuple(score for score, _ in known), *columns)
+
+
+def explain_ratio(
+    design: Design | Run | str | Path,
     targets: Targets,
     errors: Sequence[str] = (),
     *,
+    process: Process | str | Path | None = None,
+    masks: str | Path | None = None,
     pairs: bool = True,
     reach: float = 4.0,
-    on_model: Callable[[str], None] = lambda _: None,
-) -> Family:
-    """Find what would explain a measured ring:disc ratio.
+    out: str | Path | None = None,
+) -> ExplanationSet:
+    """Find the process errors that would give a measured ring:disc ratio.
 
     Args:
-        design: the design as drawn.
-        process: the process, whose means and standard deviations say what is plausible.
+        design: a design, a finished run or its folder.
         targets: what was measured.
-        errors: errors to consider, as in `unknowns_of`; by default every kind that a plate has in a definite way.
+        errors: errors to consider, as in `calibrate`; by default every kind that a DOE has in a definite way.
+        process: the process, whose means and standard deviations say what is plausible; that of the design's spec by
+            default. Errors on which it is silent are judged by `prior_sigma` of `fab.process.DEVIATIONS`.
+        masks: mask order of the run; `masks/NAME` if there is one.
         pairs: whether to look at two errors together: of every kind of error the one that explains most easily.
         reach: standard deviations to look at.
-        on_model: told of every plate that is computed.
-
-    Returns:
-        the family; errors on which the process is silent are judged by `prior_sigma` of `fab.process.DEVIATIONS`.
+        out: folder for the explanations and their picture; without one they stay in memory.
 
     Raises:
         InputError: an unknown error, a ratio that is not positive, or a depth at which there is no disc.
     """
-    probe = Colour("probe", (targets.wavelength_m,), (1.0,))
-    design = replace(design, camera=replace(design.camera, colours=(probe,)), near_m=(targets.depth_m,), far_m=())
+    design = open_design(design, masks)
+    prior = design.process(process)
     if not 0 < targets.ring_to_disc < np.inf:
-        raise InputError("ring_to_disc", "must be positive", targets.ring_to_disc, "Give ring energy over disc energy.")
+        cure = "Give ring energy over disc energy."
+        raise InputError("ring_to_disc", "must be positive", targets.ring_to_disc, cure)
     if design.camera.defocus_radius_m(targets.depth_m) < design.camera.pixel_m:
         rule = "the source must be near enough to be blurred by more than a pixel"
         raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
-    names = chosen_names(process.masks, errors or _DEFAULT)
-    sigma = {name: prior_sigma(process, name) for name in names}
-    assumed = {name: sigma[name] for name in names if not (name in process.spreads and process.spreads[name].sigma)}
-    walk = _Walk(design, process, sigma, targets, reach, on_model)
-    nominal = walk.row({})
+    names = chosen_names(prior.masks, errors or _DEFAULT)
+    writing = contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder)
+    # About ten models for every error and six for a pair.
+    with writing as fresh, models_meter("explanations", 200) as on_model:
+        camera = replace(design.camera, colours=(Colour("probe", (targets.wavelength_m,), (1.0,)),))
+        probed = replace(design, camera=camera, near_m=(targets.depth_m,), far_m=())
+        sigma = {name: prior_sigma(prior, name) for name in names}
+        found = _explained(_ScoredModel(probed, prior, sigma, targets, reach, on_model), pairs)
+        if fresh is not None:
+            from doedesign.calibration.files import write_explanations
+
+            write_explanations(fresh, design.name, found)
+    log.info(str(found))
+    return found
+
+
+def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:
+    nominal = model.row({})
     assert nominal is not None  # otherwise the model has refused it
     singles, none = [], []
-    for name in names:
-        found = [walk.crossing({name: sign}) for sign in (1.0, -1.0)]
-        met = [_explanation(walk, scores) for scores in found if scores is not None]
+    for name in model.sigma:
+        crossings = [model.crossing({name: sign}) for sign in (1.0, -1.0)]
+        met = [model.explanation(scores) for scores in crossings if scores is not None]
         singles += met
         none += [] if met else [(name,)]
-    curves = {name: _curve(walk, name) for name in names}
-    both, apart = _pairs(walk, curves, singles) if pairs else ([], [])
-    return Family(
-        targets,
+    curves = {name: model.curve(name) for name in model.sigma}
+    both, apart = _pairs(model, curves, singles) if pairs else ([], [])
+    stated = {name for name, spread in model.process.spreads.items() if spread.sigma}
+    return ExplanationSet(
+        model.targets,
         nominal,
         sorted(singles, key=lambda e: e.distance),
         sorted(both, key=lambda e: e.distance),
         none + apart,
         curves,
-        assumed,
-        reach,
-    )
-
-
-def _explanation(walk: _Walk, scores: Mapping[str, float]) -> Explanation:
-    row = walk.row(scores)
-    assert row is not None  # it is one that was looked at
-    wanted, sigma = walk.targets.throughput, walk.targets.throughput_sigma
-    return Explanation(
-        values=walk.values(scores),
-        scores={name: float(z) for name, z in scores.items()},
-        distance=float(np.sqrt(sum(z * z for z in scores.values()))),
-        ring_to_disc=row["ring_to_disc"],
-        throughput=row["throughput"],
-        zeroth_order=row["zeroth_order"],
-        strehl=row["strehl"],
-        fits=None if wanted is None else abs(row["throughput"] - wanted) <= 2 * sigma,
-    )
-
-
-def _curve(walk: _Walk, name: str) -> Curve:
-    """All that was seen along one error."""
-    points = [(0.0, walk.row({}))] + [
-        (key[0][1], row) for key, row in walk.seen.items() if [n for n, _ in key] == [name]
-    ]
-    known = sorted((score, row) for score, row in points if row is not None)
-    return Curve(
-        tuple(score for score, _ in known),
-        tuple(row["ring_to_disc"] for _, row in known),
-        tuple(row["throughput"] for _, row in known),
+        {name: sigma for name, sigma in model.sigma.items() if name not in stated},
+        model.reach,
     )
 
 
 def _pairs(
-    walk: _Walk, curves: Mapping[str, Curve], singles: Sequence[Explanation]
+    model: _ScoredModel, curves: Mapping[str, Curve], singles: Sequence[Explanation]
 ) -> tuple[list[Explanation], list[tuple[str, ...]]]:
     """Most plausible pairs of errors of different kinds."""
     alone: dict[str, float] = {}
@@ -294,16 +366,15 @@ def _pairs(
             best[kind] = name
     met, apart = [], []
     for one, other in combinations(best.values(), 2):
-        ways = list(_ways(walk, curves[one], curves[other]))
+        mixtures = list(_mixtures(model, curves[one], curves[other]))
         found = None
-        if ways:
-            length, angle = min(ways)[1:]
-            way = {one: float(np.cos(angle)), other: float(np.sin(angle))}
-            found = walk.crossing(way, length)
+        if mixtures:
+            length, angle = min(mixtures)[1:]
+            found = model.crossing({one: float(np.cos(angle)), other: float(np.sin(angle))}, length)
         if found is None:
             apart.append((one, other))
         else:
-            met.append(_explanation(walk, found))
+            met.append(model.explanation(found))
     return met, apart
 
 
@@ -313,11 +384,11 @@ def _promise(curves: Mapping[str, Curve], alone: Mapping[str, float], name: str)
     return alone.get(name, np.inf), -float(np.ptp(ratios))
 
 
-def _ways(walk: _Walk, one: Curve, other: Curve) -> Iterator[tuple[float, float, float]]:
+def _mixtures(model: _ScoredModel, one: Curve, other: Curve) -> Iterator[tuple[float, float, float]]:
     """Cost, length and angle of mixtures that would reach the ratio if effects added."""
-    lengths = np.linspace(0, walk.reach, 81)[1:]
-    row = walk.row({})
-    assert row is not None  # the model has not refused what is believed
+    lengths = np.linspace(0, model.reach, 81)[1:]
+    row = model.row({})
+    assert row is not None  # the model has not refused the means
     base = {"ring_to_disc": np.log(row["ring_to_disc"]), "throughput": row["throughput"]}
 
     def effect(curve: Curve, scores: np.ndarray, quantity: str) -> np.ndarray:
@@ -335,12 +406,12 @@ def _ways(walk: _Walk, one: Curve, other: Curve) -> Iterator[tuple[float, float,
             + effect(other, shares[1] * lengths, quantity)
             for quantity in base
         }
-        excess = sums["ring_to_disc"] - np.log(walk.targets.ring_to_disc)
-        start = base["ring_to_disc"] - np.log(walk.targets.ring_to_disc)
+        excess = sums["ring_to_disc"] - np.log(model.targets.ring_to_disc)
+        start = base["ring_to_disc"] - np.log(model.targets.ring_to_disc)
         crossed = np.flatnonzero(excess * start <= 0)
         if crossed.size:
             length, throughput = float(lengths[crossed[0]]), float(sums["throughput"][crossed[0]])
             cost = length**2
-            if walk.targets.throughput is not None:
-                cost += ((throughput - walk.targets.throughput) / walk.targets.throughput_sigma) ** 2
+            if model.targets.throughput is not None:
+                cost += ((throughput - model.targets.throughput) / model.targets.throughput_sigma) ** 2
             yield cost, length, float(angle)

@@ -16,9 +16,10 @@
     files = ["far.exr"]
 
 Files are found relative to the folder of the TOML file. What a lab may say besides is in `MeasurementSpec` and
-`ImageSpec`. `load_shots` reads the files, merges the exposures and looks for the light.
+`ImageSpec`. `read_measurement` reads the files, merges the exposures and looks for the light.
 """
 
+import logging
 import math
 import re
 from collections.abc import Callable
@@ -46,6 +47,8 @@ from sim.measured import (
     merge_exposures,
     without_background,
 )
+
+log = logging.getLogger("doedesign")
 
 _TIME = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*(s|ms|us|µs|ns)\s*")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
@@ -141,14 +144,14 @@ class Measurement(NamedTuple):
 
     Attributes:
         spec: how it was taken.
-        shots: the images.
+        images: the images.
         window: pixels per side to compare.
         digests: SHA-256 of every file by its name in the TOML file, and of that.
-        full: pixels that say nothing, by image: full in every exposure, or of another colour.
+        full: unusable pixels, by image: full in every exposure, or of another colour.
     """
 
     spec: MeasurementSpec
-    shots: tuple[MeasuredImage, ...]
+    images: tuple[MeasuredImage, ...]
     window: int
     digests: dict[str, str]
     full: dict[str, int]
@@ -190,13 +193,12 @@ def _problems(spec: MeasurementSpec) -> list[InputError]:
     return found
 
 
-def load_shots(path: Path, camera: Camera, on_file: Callable[[str], None] = lambda _: None) -> Measurement:
+def read_measurement(path: Path, camera: Camera) -> Measurement:
     """Read a measurement with all its images.
 
     Args:
         path: the TOML file.
         camera: the design's, for the window.
-        on_file: told of every file that is read.
 
     Raises:
         InputError: a mistake in the file, or an image that cannot be used.
@@ -205,7 +207,7 @@ def load_shots(path: Path, camera: Camera, on_file: Callable[[str], None] = lamb
     digests = {path.name: sha256_file(path)}
 
     def read(name: str) -> CameraFrame:
-        on_file(name)
+        log.info(f"reading {name}")
         file = path.parent / name
         digests[name] = sha256_file(file)
         frame = read_frame(file, channel=spec.channel, pixel_m=spec.pixel_m, allow_8bit=spec.allow_8bit)
@@ -214,14 +216,17 @@ def load_shots(path: Path, camera: Camera, on_file: Callable[[str], None] = lamb
     merged = [_merged(spec, image, read) for image in spec.image]
     smallest = min(min(psf.rate.shape) for psf in merged)
     window = spec.window or min(round(camera.window * camera.pixel_m / spec.pixel_m), smallest)
-    shots = []
+    images = []
     for image, psf in zip(spec.image, merged, strict=True):
         try:
-            shots.append(_shot(spec, image, psf, camera, window))
+            images.append(_measured_image(spec, image, psf, camera, window))
         except InputError as error:
             raise InputError(f"{path}: image {image.called}", error.rule, error.got, error.cure) from error
     full = {image.called: int((~psf.valid).sum()) for image, psf in zip(spec.image, merged, strict=True)}
-    return Measurement(spec, tuple(shots), window, digests, full)
+    for name, pixels in full.items():
+        if pixels and spec.channel is None:
+            log.info(f"{name}: {pixels} pixels are full in every exposure and left out")
+    return Measurement(spec, tuple(images), window, digests, full)
 
 
 def _turned(spec: MeasurementSpec, picture: np.ndarray) -> np.ndarray:
@@ -245,7 +250,9 @@ def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], Camer
     )
 
 
-def _shot(spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int) -> MeasuredImage:
+def _measured_image(
+    spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int
+) -> MeasuredImage:
     if min(psf.rate.shape) < window:
         rule = f"an image must have at least the window's {window} pixels per side"
         raise InputError(image.called, rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")

@@ -80,43 +80,45 @@ class Match(NamedTuple):
     chi2: float
 
 
-def target_of(shot: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
-    """Cut a shot to the window and find its centre by comparison with a model.
+def target_of(measured: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
+    """Cut an image to the window and find its centre by comparison with a model.
 
     Args:
-        shot: the image.
+        measured: the image.
         window: pixels per side.
         model: `[y, x]` what the image should look like, centred.
 
     Raises:
         InputError: the image is smaller than the window, or its middle is no light at all.
     """
-    psf, rest = _window(shot, shot.centre, window)
+    psf, rest = _window(measured, measured.centre, window)
     shift = _shift_px(smoothed(psf), model)
     for _ in range(2):
         if max(map(abs, shift)) <= 1:
             break
         # From here on the place in the window is the model's word.
-        low_y, low_x = (c - r for c, r in zip(shot.centre, rest, strict=True))
-        shot = shot._replace(centre=(low_y + shift[0], low_x + shift[1]))
-        psf, rest = _window(shot, shot.centre, window)
+        low_y, low_x = (c - r for c, r in zip(measured.centre, rest, strict=True))
+        measured = measured._replace(centre=(low_y + shift[0], low_x + shift[1]))
+        psf, rest = _window(measured, measured.centre, window)
         shift = _shift_px(smoothed(psf), model)
-    scale = shot.brightness[0] if shot.brightness else float(psf.rate[psf.valid].sum())
+    scale = measured.brightness[0] if measured.brightness else float(psf.rate[psf.valid].sum())
     if not scale > 0:
-        raise InputError(shot.name, "the light above the background must add up", f"{scale:.4g}", "Expose longer.")
+        raise InputError(measured.name, "the light above the background must add up", f"{scale:.4g}", "Expose longer.")
     unit = MeasuredPsf(psf.rate / scale, psf.floor / scale**2, psf.slope / scale, psf.valid)
-    gain = (1.0, shot.brightness[1]) if shot.brightness else None
-    return Target(shot.name, shot.depth_m, unit, scale, shift, gain, shot.defocus_sigma)
+    gain = (1.0, measured.brightness[1]) if measured.brightness else None
+    return Target(measured.name, measured.depth_m, unit, scale, shift, gain, measured.defocus_sigma)
 
 
-def _window(shot: MeasuredImage, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
+def _window(
+    measured: MeasuredImage, centre: tuple[float, float], window: int
+) -> tuple[MeasuredPsf, tuple[float, float]]:
     try:
-        psf, rest = cut_window(shot.psf, centre, window)
+        psf, rest = cut_window(measured.psf, centre, window)
     except InputError as error:
-        raise InputError(shot.name, error.rule, error.got, error.cure) from error
+        raise InputError(measured.name, error.rule, error.got, error.cure) from error
     if not psf.valid.any():
         got = f"a centre at row {centre[0]:.0f}, column {centre[1]:.0f}"
-        raise InputError(shot.name, "its light must lie within the frame", got, "Check `centre`.")
+        raise InputError(measured.name, "its light must lie within the frame", got, "Check `centre`.")
     return psf, rest
 
 

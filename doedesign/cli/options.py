@@ -54,6 +54,13 @@ _OPTIONS = {
     "or give `obstruction`": "or give --obstruction",
     "or give `occlusion`": "or give --occlusion",
     "leave `images` out": "leave --images out",
+    "Choose another folder": "Choose another --out",
+    "take fewer workers.": "take fewer workers (--workers).",
+    "or evaluate it alone.": "or see what it is with --draw.",
+    "Give limits, such as": "Add [[limit]] to the spec, or --limit, such as",
+    'Give a process with errors, such as "contact_aligner".': (
+        'Add stock = "contact_aligner" to [process], or give a file with such a table (--process).'
+    ),
 }
 
 

@@ -1,11 +1,11 @@
 """Tolerances and calibration: tolerance, calibrate."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from doedesign.cli.console import print_paths, print_text, say
+from doedesign.cli.console import print_paths, print_text
 from doedesign.cli.options import AsJson, length_of
 from fab.errors import InputError
 
@@ -48,15 +48,30 @@ def tolerance(
         scheduler: Address of a Dask scheduler whose workers are taken instead.
         out: Folder; RUN/tolerance by default. The same command resumes a stopped study.
     """
-    from doedesign.commands.tolerance import StudyPlan, one_draw
-    from doedesign.commands.tolerance import tolerance as work
-
-    settings = {"process": process, "limits": limit or None, "seed": seed, "masks": masks, "scheduler": scheduler}
+    settings: dict[str, Any] = {"process": process, "limits": limit or None, "seed": seed, "masks": masks}
     if draw is not None:
-        print_text(one_draw(run, draw, json_, **settings).rstrip())
+        from doedesign.commands.tolerance import one_draw
+
+        print_text(one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
-    plan = StudyPlan(draws, sensitivity, sobol, corners, budget, yield_)
-    folder = work(run, plan, out, say, workers=workers, **settings)
+    from doedesign.runs.folder import open_run
+    from doedesign.tolerancing import tolerance as study
+
+    opened = open_run(run)
+    folder = out or opened.path("tolerance")
+    study(
+        opened,
+        **settings,
+        draws=draws,
+        sensitivity=sensitivity,
+        sobol=sobol,
+        corners=corners,
+        budget=budget,
+        wanted=yield_,
+        out=folder,
+        workers=workers,
+        scheduler=scheduler,
+    )
     print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
 
 
@@ -89,10 +104,10 @@ def calibrate(
         run: Run folder.
         measurement: TOML file that names the images and says how they were taken.
         errors: Errors to look for, such as depth, overlay_x or cd_bias[3]; by default depth, line width and overlay.
-        process: TOML file with a [process] table, for what is believed beforehand; the run's own by default.
+        process: TOML file with a [process] table, whose errors are the prior; the run's own by default.
         masks: The run's mask order; masks/NAME by default.
         evaluations: Plates of the global search, which begins only if it is needed.
-        polish: Exact gradients to follow at the end.
+        polish: Steps along the exact gradient at the end.
         seed: Seed of the global search.
         ring_to_disc: Measured ratio of the energy outside the geometric defocus disc to that inside.
         throughput: Measured share of the light that arrives in the sensor window, 0-1.
@@ -107,16 +122,19 @@ def calibrate(
         got = "neither" if measurement is None else "both"
         cure = "Give the measurement's TOML file, or --ring-to-disc with --probe and --depth."
         raise InputError("calibrate", "must be given a measurement or a ring:disc ratio", got, cure)
-    if measurement is not None:
-        from doedesign.commands.calibrate import calibrate as fit
+    from doedesign.runs.folder import open_run
 
+    opened = open_run(run)
+    if measurement is not None:
+        from doedesign.calibration import calibrate as fit
+
+        folder = out or opened.path("calibration")
         settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
-        folder, result = fit(run, measurement, errors, **settings, out=out, say=say)
+        result = fit(opened, measurement, errors, **settings, out=folder)
         estimate = str(folder / "process-estimate.toml")
         print_paths([folder, *sorted(folder.iterdir())], json_, estimate=estimate, explained=result.explained)
         return
-    from doedesign.calibration import Targets
-    from doedesign.commands.calibrate import explain
+    from doedesign.calibration import Targets, explain_ratio
 
     lengths = {}
     for option, text, example in (("--probe", probe, "520 nm"), ("--depth", depth, "10 cm")):
@@ -132,5 +150,6 @@ def calibrate(
     if not (throughput_sigma > 0 and reach > 0):
         raise InputError("--throughput-sigma, --reach", "must be positive", (throughput_sigma, reach), "Correct them.")
     targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
-    folder, _ = explain(run, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=out, say=say)
+    folder = out or opened.path("explanations")
+    explain_ratio(opened, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
     print_paths([folder, *sorted(folder.iterdir())], json_)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from doedesign.build import resolve_process
-from doedesign.commands.psf import require_own
 from doedesign.design.design import Design
 from doedesign.lab.as_built import AsBuiltDoe, as_built_doe, compare_gratings, compare_with_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.runs.level_maps import open_design
+from doedesign.runs.results import require_own
 from doedesign.spec import variation_to_toml
 from fab.errors import InputError
 from fab.figure import save

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.commands.psf import Say, require_own
+from doedesign.commands.psf import Say
 from doedesign.design.design import Design
 from doedesign.prediction import plate_rows
 from doedesign.runs.folder import alone_in, open_run
 from doedesign.runs.level_maps import open_design
+from doedesign.runs.results import require_own
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_variation, variation_to_toml
 from fab.draws import EXPECTED, variation_at

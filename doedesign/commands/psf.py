@@ -13,11 +13,12 @@ from doedesign.build import camera_from_spec
 from doedesign.design.metrics import design_metrics
 from doedesign.runs.folder import CONTINUOUS, Run, alone_in, open_run
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
+from doedesign.runs.results import require_own
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
-from fab.errors import CheckFailed, InputError
+from fab.errors import CheckFailed
 from fab.figure import save
-from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, sha256_file
 from fab.height import HeightMap
 from fab.plots.height import plot_height
 from sim.camera import Camera
@@ -109,16 +110,6 @@ def _near_and_far(spec: Spec, depths_m: Sequence[float]) -> tuple[tuple[float, .
     scene = {"near_m": near or spec.scene.near_m, "far_m": far or spec.scene.far_m}
     spec_from_json(spec_to_json(spec) | {"scene": scene}, "--depths")
     return near, far
-
-
-def require_own(folder: Path) -> None:
-    """Refuse to replace a folder that holds more than an earlier call wrote."""
-    if (folder / MANIFEST_NAME).is_file():
-        listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}
-        for path in sorted(folder.iterdir()):
-            if path.name not in listed:
-                rule = "a folder of results that is replaced must hold nothing else"
-                raise InputError(str(folder), rule, f"also {path.name!r}", "Move that file.")
 
 
 def _takes_hankel(run: Run, name: str, field_rad: tuple[float, float]) -> bool:

@@ -1,9 +1,6 @@
 """Pictures of designs and of what became of them; those of the DOE are in `fab.plots`, of its light in `sim.plots`.
 
     history       loss curves of an optimisation and of a training
-    tolerance     effect of a process on a design: histograms, yield, which errors matter and how large they may be
-    calibration   measured images beside the model's, errors with their uncertainty
-    explanations  errors that would explain a measured ring:disc ratio
     sheet         rows of images below each other: simulated captures, scenes that were not trained on
     labels        errors and their values in words
 

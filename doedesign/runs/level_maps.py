@@ -86,20 +86,24 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
-def open_design(source: "Path | Run", masks: Path | None = None, *, levels: int | None = None) -> Design:
+def open_design(
+    source: "Design | Run | str | Path", masks: str | Path | None = None, *, levels: int | None = None
+) -> Design:
     """Return the design of a finished run, as its masks draw it.
 
     Args:
-        source: the run, or its folder.
+        source: the run, or its folder; a design is returned as it is.
         masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map.
         levels: another number of levels; mask orders are then left aside.
 
     Raises:
         InputError: a run or order that cannot be read, or an order of another run.
     """
-    run = source if isinstance(source, Run) else open_run(source)
+    if isinstance(source, Design):
+        return source
+    run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
-    folder = masks or Path("masks") / run.spec.name
+    folder = Path("masks") / run.spec.name if masks is None else Path(masks)
     moves_m: tuple[float, ...] = ()
     if levels is None and (masks is not None or (folder / MANIFEST_NAME).is_file()):
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))

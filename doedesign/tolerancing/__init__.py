@@ -1,39 +1,45 @@
-"""Tolerance analysis: what a process that strays makes of a design, and how far it may stray.
+"""Tolerance analysis: yield of a design under process errors, sensitivities, and how large errors may be.
 
-    from doedesign.tolerancing import study
+    from doedesign.tolerancing import study, tolerance
 
-    plates = study("runs/automotive", errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"])
-    print(plates.monte_carlo(64).yield_)
-    print(plates.budget("overlay_x", 0.9, draws=64))
+    result = tolerance(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"], draws=64)
+    result.yield_, result.plot()
+    asked = study(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"])    # one question at a time
+    print(asked.budget("overlay_x", 0.9, draws=64))
 
-Reading order:
+Reading order (`fab.draws` says which draws there are; each has a key from which it can be made again alone):
 
-    pool          plates on all cores of this machine
-    cluster       plates on a Dask cluster
-    journal       finished plates on the disk
+    pool          draws on all cores of this machine
+    cluster       draws on a Dask cluster
+    journal       finished draws on the disk
     analysis      statistics, limits, yield
     sensitivity   which errors matter
     budget        how large an error may be
-    studies       all of it behind one function
+    studies       questions to one design and one process
+    results       the usual questions behind one function
+    result_files  its files; plots draws its pictures
 """
 
-from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, Yield, limit_from_text, limit_text
+from doedesign.tolerancing.analysis import QUANTITIES, SampleTable, Yield, limit_from_text, limit_text
 from doedesign.tolerancing.budget import Budget
-from doedesign.tolerancing.sensitivity import Change, Index, Share, source_shares
-from doedesign.tolerancing.studies import Plates, Study, study
+from doedesign.tolerancing.results import ToleranceResult, tolerance
+from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, VarianceShare, source_shares
+from doedesign.tolerancing.studies import Sample, Study, study
 
 __all__ = [
     "QUANTITIES",
     "Budget",
-    "Change",
-    "Index",
-    "PlateTable",
-    "Plates",
-    "Share",
+    "Effect",
+    "Sample",
+    "SampleTable",
+    "SensitivityIndex",
     "Study",
+    "ToleranceResult",
+    "VarianceShare",
     "Yield",
     "limit_from_text",
     "limit_text",
     "source_shares",
     "study",
+    "tolerance",
 ]

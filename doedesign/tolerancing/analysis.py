@@ -1,4 +1,4 @@
-"""What the plates of a study say together: a table of their numbers, statistics, and yield."""
+"""Statistics of a sample of fabricated DOEs: a table of their metrics, moments, limits and yield."""
 
 import math
 import re
@@ -26,19 +26,19 @@ _WORST = {"high": math.inf, "low": -math.inf}
 
 
 @dataclass(frozen=True)
-class PlateTable:
-    """The numbers of some plates.
+class SampleTable:
+    """Metrics of some draws.
 
     Attributes:
-        keys: the plates.
+        keys: the draws.
         places: colour and depth of every row; depths in metres, `inf` for a star.
-        values: `[plate, row]` of every quantity; NaN where a row has no such number, and infinitely bad for a plate
-            beyond what could be evaluated.
+        values: `[draw, row]` of every quantity; NaN where a row has no such metric, and infinitely bad for a draw
+            beyond the model.
     """
 
     keys: tuple[str, ...]
     places: tuple[tuple[str, float], ...]
-    values: Mapping[str, Float[np.ndarray, "plate row"]]
+    values: Mapping[str, Float[np.ndarray, "draw row"]]
 
     @property
     def colours(self) -> tuple[str, ...]:
@@ -46,7 +46,7 @@ class PlateTable:
         return tuple(dict.fromkeys(colour for colour, _ in self.places))
 
     def rows_of(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> list[int]:
-        """Rows with a number of this quantity, of one colour and depth or of all."""
+        """Rows that have this quantity, of one colour and depth or of all."""
         has = np.any(~np.isnan(self.values[quantity]), axis=0)
         return [
             i
@@ -54,63 +54,63 @@ class PlateTable:
             if has[i] and colour in (None, name) and (depth_m is None or math.isclose(depth, depth_m, rel_tol=1e-6))
         ]
 
-    def worst(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> Float[np.ndarray, " p"]:
-        """The worst number of every plate over the rows of a colour and depth, or over all of them."""
+    def worst(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> Float[np.ndarray, " d"]:
+        """The worst value of every draw over the rows of a colour and depth, or over all of them."""
         chosen = self.values[quantity][:, self.rows_of(quantity, colour, depth_m)]
         return chosen.max(axis=1) if QUANTITIES[quantity].worse == "high" else chosen.min(axis=1)
 
     @property
-    def within(self) -> Bool[np.ndarray, " plate"]:
-        """Which plates could be evaluated."""
+    def within(self) -> Bool[np.ndarray, " draw"]:
+        """Draws that the model describes."""
         beyond = np.zeros(len(self.keys), dtype=bool)
         for name, values in self.values.items():
             beyond |= np.any(values == _WORST[str(QUANTITIES[name].worse)], axis=1)
         return ~beyond
 
-    def of(self, keys: Sequence[str]) -> "PlateTable":
-        """The same of some of the plates."""
+    def of(self, keys: Sequence[str]) -> "SampleTable":
+        """Subset of the draws."""
         positions = {key: i for i, key in enumerate(self.keys)}
         chosen = [positions[key] for key in keys]
-        return PlateTable(tuple(keys), self.places, {name: values[chosen] for name, values in self.values.items()})
+        return SampleTable(tuple(keys), self.places, {name: values[chosen] for name, values in self.values.items()})
 
 
-def table_of(plates: Mapping[str, Rows | OutOfModel]) -> PlateTable:
-    """The table of what was found of some plates.
+def table_of(draws: Mapping[str, Rows | OutOfModel]) -> SampleTable:
+    """Table of the results of some draws.
 
-    A ring:disc ratio of None, as a plate without any light in the disc has, counts as infinite.
+    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
 
     Raises:
-        ValueError: no plates with rows, or plates with different rows.
+        ValueError: no draws with rows, or draws with different rows.
     """
-    first = next((found for found in plates.values() if not isinstance(found, OutOfModel)), None)
+    first = next((found for found in draws.values() if not isinstance(found, OutOfModel)), None)
     if first is None:
-        raise ValueError("`plates` must hold at least one plate with rows, but there is none")
+        raise ValueError("`draws` must hold at least one draw with rows, but there is none")
     places = tuple((str(row["colour"]), _depth(row["depth_m"])) for row in first)
     present = [name for name in QUANTITIES if any(name in row for row in first)]
-    values = {name: np.full((len(plates), len(places)), np.nan) for name in present}
-    for i, (key, rows) in enumerate(plates.items()):
+    values = {name: np.full((len(draws), len(places)), np.nan) for name in present}
+    for i, (key, rows) in enumerate(draws.items()):
         if isinstance(rows, OutOfModel):
             for name in present:
                 has = [name in row for row in first]
                 values[name][i, has] = _WORST[str(QUANTITIES[name].worse)]
             continue
         if [(row["colour"], _depth(row["depth_m"])) for row in rows] != list(places):
-            raise ValueError(f"all plates must have the same rows, but {key} has others")
+            raise ValueError(f"all draws must have the same rows, but {key} has others")
         for j, row in enumerate(rows):
             for name in present:
                 if name in row:
                     values[name][i, j] = math.inf if row[name] is None else row[name]
-    return PlateTable(tuple(plates), places, values)
+    return SampleTable(tuple(draws), places, values)
 
 
 def _depth(depth_m: float | None) -> float:
     return math.inf if depth_m is None else float(depth_m)
 
 
-def statistics(table: PlateTable) -> list[dict[str, Any]]:
-    """Mean, spread and percentiles of every quantity: the worst row of every plate, and every row by itself.
+def statistics(table: SampleTable) -> list[dict[str, Any]]:
+    """Mean, spread and percentiles of every quantity: of the worst row of every draw, and of every row by itself.
 
-    Plates beyond what could be evaluated have no part in it.
+    Draws beyond the model are left out.
 
     Returns:
         rows with quantity, colour and depth_m (both None for the worst row), mean, std, min, p05, median, p95, max.
@@ -126,24 +126,27 @@ def statistics(table: PlateTable) -> list[dict[str, Any]]:
     return out
 
 
-def _moments(values: Float[np.ndarray, " plate"]) -> dict[str, float]:
+def _moments(values: Float[np.ndarray, " draw"]) -> dict[str, float]:
     with np.errstate(invalid="ignore"):  # an infinite ratio has no mean
         p05, median, p95 = np.percentile(values, [5, 50, 95])
         mean, std = values.mean(), values.std(ddof=1) if len(values) > 1 else 0.0
     found = {
-        "mean": mean,
-        "std": std,
-        "min": values.min(),
-        "p05": p05,
-        "median": median,
-        "p95": p95,
-        "max": values.max(),
+        **{"mean": mean, "std": std, "min": values.min()},
+        **{"p05": p05, "median": median, "p95": p95, "max": values.max()},
     }
     return {name: float(value) for name, value in found.items()}
 
 
 class Yield(NamedTuple):
-    """Share of good plates, with the interval in which it lies with 95 % confidence (Wilson)."""
+    """Share of good DOEs, with its 95 % confidence interval (Wilson).
+
+    Attributes:
+        share: good ones over all, 0-1.
+        low: lower end of the interval.
+        high: upper end.
+        good: number of good ones.
+        plates: number of all.
+    """
 
     share: float
     low: float
@@ -156,26 +159,26 @@ class Yield(NamedTuple):
         return f"{100 * self.share:.1f} % ({100 * self.low:.1f} to {100 * self.high:.1f} %)"
 
 
-def yield_of(good: Bool[np.ndarray, " plate"]) -> Yield:
-    """The yield of plates that are good or not.
+def yield_of(good: Bool[np.ndarray, " draw"]) -> Yield:
+    """Yield of draws that are good or not.
 
     Raises:
-        ValueError: no plates.
+        ValueError: no draws.
     """
     from scipy.stats import binomtest
 
     if not len(good):
-        raise ValueError("a yield needs at least one plate, but got none")
+        raise ValueError("a yield needs at least one draw, but got none")
     count = int(good.sum())
     interval = binomtest(count, len(good)).proportion_ci(CONFIDENCE, "wilson")
     return Yield(count / len(good), float(interval.low), float(interval.high), count, len(good))
 
 
-def obeys(table: PlateTable, limit: LimitSpec) -> Bool[np.ndarray, " plate"]:
-    """Whether every row of a plate that a limit speaks of obeys it.
+def obeys(table: SampleTable, limit: LimitSpec) -> Bool[np.ndarray, " draw"]:
+    """Whether every row of a draw that a limit concerns obeys it.
 
     Raises:
-        InputError: the limit speaks of no row of this study.
+        InputError: the limit concerns no row.
     """
     rows = table.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in table.values else []
     if not rows:
@@ -188,18 +191,18 @@ def obeys(table: PlateTable, limit: LimitSpec) -> Bool[np.ndarray, " plate"]:
     return np.all((values >= low) & (values <= high), axis=1)
 
 
-def good_plates(table: PlateTable, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, " plate"]:
-    """Whether a plate obeys every limit; one beyond what could be evaluated does not."""
+def good_draws(table: SampleTable, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, " draw"]:
+    """Whether a draw obeys every limit; one beyond the model does not."""
     good = table.within
     for limit in limits:
         good &= obeys(table, limit)
     return good
 
 
-def worst_plate(table: PlateTable, limits: Sequence[LimitSpec]) -> str:
-    """Key of the plate that is farthest beyond a limit, or nearest to one; of the lowest Strehl without limits.
+def worst_draw(table: SampleTable, limits: Sequence[LimitSpec]) -> str:
+    """Key of the draw farthest beyond a limit, or nearest to one; of the lowest Strehl ratio without limits.
 
-    Plates beyond what could be evaluated are passed over.
+    Draws beyond the model are passed over.
     """
     if not limits:
         quantity = "strehl" if "strehl" in table.values else next(iter(table.values))
@@ -225,7 +228,7 @@ def limit_from_text(text: str) -> LimitSpec:
     """A limit from words such as "zeroth_order <= 5 %", "ring_to_disc >= 2 for 656nm" or "far_spot >= 0.3 at 5 m".
 
     Raises:
-        InputError: no limit, or on something that plates do not have.
+        InputError: no limit, or on something that is no metric.
     """
     found = _LIMIT.fullmatch(text)
     cure = f'For example "zeroth_order <= 5 %" or "far_spot >= 0.3 for 656nm at 5 m". Of: {", ".join(QUANTITIES)}.'

@@ -1,17 +1,18 @@
-"""Plates evaluated by the workers of a Dask cluster, wherever they run.
+"""Draws evaluated by the workers of a Dask cluster, wherever they run.
 
     dask scheduler                                   # prints ADDRESS
     dask worker ADDRESS --nthreads 1                 # on as many machines as there are, with doedesign installed
-    doedesign tolerance RUN --scheduler ADDRESS
+    tolerance(design, scheduler=ADDRESS)
 
-Dask hands out the plates and hands those of a lost worker to another; this module only asks and listens.
+Dask hands out the draws and hands those of a lost worker to another; this module only asks and listens.
 """
 
 import gc
+import logging
 import os
 import queue
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -23,27 +24,26 @@ from fab.process import Variation
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+log = logging.getLogger("doedesign")
+
 _PATIENCE_S = 30.0
 _KEPT = "Finished draws are kept."
 
 
-def evaluate_there(
-    model: DrawModel, draws: Mapping[str, Variation], address: str, say: Callable[[str], None] = lambda _: None
-) -> Iterator[tuple[str, Any]]:
-    """Evaluate plates by the workers of a Dask cluster.
+def evaluate_there(model: DrawModel, draws: Mapping[str, Variation], address: str) -> Iterator[tuple[str, Any]]:
+    """Evaluate draws by the workers of a Dask cluster.
 
     Args:
         model: how, and of what design and process.
         draws: variations by key.
         address: of the scheduler, such as "tcp://10.0.0.1:8786".
-        say: told when there is nobody to work.
 
     Yields:
-        key and what was found of every plate, as they are finished.
+        key and result of every draw, as they are finished.
 
     Raises:
         InputError: no Dask here, no scheduler or no workers there, workers without this version of doedesign, or a
-            plate that ended its worker again and again.
+            draw that ended its worker again and again.
     """
     finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
     with _client(address) as client:
@@ -56,7 +56,7 @@ def evaluate_there(
             waiting[future] = key
             future.add_done_callback(finished.put)
         while waiting:
-            future = _next(finished, client, address, say)
+            future = _next(finished, client, address)
             key = waiting.pop(future)
             yield key, _rows(future, key, address)
 
@@ -68,7 +68,7 @@ def _client(address: str) -> "Iterator[Client]":
         from distributed import Client
     except ImportError as error:
         cure = 'Install it with: pip install "doedesign[cluster]"'
-        raise InputError("--scheduler", "a cluster is reached through Dask", "no Dask here", cure) from error
+        raise InputError("scheduler", "a cluster is reached through Dask", "no Dask here", cure) from error
     client, refusal = None, ""
     try:
         client = Client(address, timeout=_PATIENCE_S, set_as_default=False)  # pyright: ignore[reportArgumentType]
@@ -90,9 +90,7 @@ def _client(address: str) -> "Iterator[Client]":
         yield client
 
 
-def _next(
-    finished: "queue.SimpleQueue[Future]", client: "Client", address: str, say: Callable[[str], None]
-) -> "Future":
+def _next(finished: "queue.SimpleQueue[Future]", client: "Client", address: str) -> "Future":
     """The next future that is done, however long it takes."""
     told = False
     while True:
@@ -104,7 +102,7 @@ def _next(
             except OSError as error:
                 raise _lost(address) from error
             if not working and not told:
-                say(f"no worker is left at {address}; waiting for new ones")
+                log.warning(f"no worker is left at {address}; waiting for new ones")
                 told = True
 
 
@@ -116,7 +114,7 @@ def _rows(future: "Future", key: str, address: str) -> Any:
         return named(key, future.result)
     except KilledWorker as error:
         got = f"several that ended while they computed it, the last one {error.last_worker.address}"
-        cure = f"Give workers more memory, or see what it is with --draw. {_KEPT}"
+        cure = f"Give workers more memory, or evaluate it alone. {_KEPT}"
         raise InputError(f"draw {key}", "a worker must live through a draw", got, cure) from error
     except FutureCancelledError as error:
         raise _lost(address) from error
@@ -126,7 +124,7 @@ def _rows(future: "Future", key: str, address: str) -> Any:
 
 
 def _lost(address: str) -> InputError:
-    cure = f"Start it again and repeat the command. {_KEPT}"
+    cure = f"Start it again and repeat the study. {_KEPT}"
     return InputError(address, "the scheduler must stay reachable", "a lost connection", cure)
 
 

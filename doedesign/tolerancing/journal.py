@@ -1,9 +1,9 @@
-"""The finished plates of a study, in memory and, where a folder is given, on disk.
+"""The finished draws of a study, in memory and, where a folder is given, on disk.
 
-    study.json     what was studied: design, process, seed; only plates of the same study are kept together
-    draws.jsonl    one line per finished plate, in the order in which they were finished
+    study.json     what was studied: design, process, seed; only draws of the same study are kept together
+    draws.jsonl    one line per finished draw, in the order in which they were finished
 
-A line is on the disk before the next plate is taken, so a run that is killed at any moment loses no finished plate; the
+A line is on the disk before the next draw is taken, so a run that is killed at any moment loses no finished draw; the
 half of a line that a killed run left behind is cut off.
 """
 
@@ -24,12 +24,12 @@ STUDY_NAME, DRAWS_NAME = "study.json", "draws.jsonl"
 
 
 class Journal:
-    """What was found of finished plates.
+    """Results of finished draws.
 
     Attributes:
         folder: where they are kept, or None for memory alone.
         study: what was studied, as JSON.
-        finished: what was found by key. Only `add` changes it.
+        finished: results by key. Only `add` changes it.
     """
 
     def __init__(self, folder: Path | None, study: Mapping[str, Any]) -> None:
@@ -62,7 +62,7 @@ class Journal:
                 self._file = None
 
     def add(self, key: str, found: Rows | OutOfModel) -> None:
-        """Keep one plate; returns when it is on the disk. An infinite number is kept as None, for JSON has none.
+        """Keep one draw; returns when it is on the disk. An infinite number is kept as None, for JSON has none.
 
         Raises:
             InputError: the disk is full, or refuses otherwise.
@@ -77,7 +77,7 @@ class Journal:
             except OSError as error:
                 raise explain_os_error(error, (self.folder or Path()) / DRAWS_NAME) from error
         # As it would be read again.
-        self.finished |= dict([_plate(json.loads(line))])
+        self.finished |= dict([_draw(json.loads(line))])
 
     def _claim(self, folder: Path) -> None:
         path = folder / STUDY_NAME
@@ -86,7 +86,7 @@ class Journal:
         if not path.exists():
             foreign = [p.name for p in sorted(folder.iterdir())]
             if foreign:
-                rule, cure = "a study needs a new or empty folder, or its own", "Choose another --out."
+                rule, cure = "a study needs a new or empty folder, or its own", "Choose another folder."
                 raise InputError(str(folder), rule, f"other content, such as {foreign[0]!r}", cure)
             write_atomic(path, canonical_json(study))
             return
@@ -97,12 +97,12 @@ class Journal:
                 str(folder),
                 "the folder must belong to this study",
                 f"one with another {', '.join(different)}",
-                "Choose another --out, or remove that study.",
+                "Choose another folder, or remove that study.",
             )
 
 
 def _read(path: Path) -> dict[str, Rows | OutOfModel]:
-    """What was found by key; half a line at the end is cut off the file."""
+    """Results by key; half a line at the end is cut off the file."""
     try:
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
@@ -115,11 +115,11 @@ def _read(path: Path) -> dict[str, Rows | OutOfModel]:
     finished: dict[str, Rows | OutOfModel] = {}
     for number, line in enumerate(data[:whole].splitlines(), 1):
         try:
-            key, found = _plate(json.loads(line))
+            key, found = _draw(json.loads(line))
         # What a damaged line lacks shows in different ways.
         except (ValueError, KeyError, TypeError) as error:
-            cure = f"Remove {path} to compute all plates again."
-            raise InputError(f"{path}, line {number}", "must be one finished plate", f'"{error}"', cure) from error
+            cure = f"Remove {path} to compute all draws again."
+            raise InputError(f"{path}, line {number}", "must be one finished draw", f'"{error}"', cure) from error
         finished[key] = found
     return finished
 
@@ -130,7 +130,7 @@ def _record(found: Rows | OutOfModel) -> dict[str, Any]:
     return {"rows": [{name: None if value == math.inf else value for name, value in row.items()} for row in found]}
 
 
-def _plate(record: dict[str, Any]) -> tuple[str, Rows | OutOfModel]:
+def _draw(record: dict[str, Any]) -> tuple[str, Rows | OutOfModel]:
     if "beyond" in record:
         return record["key"], OutOfModel(record["beyond"])
     return record["key"], [dict(row) for row in record["rows"]]

@@ -19,7 +19,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fab.errors import InputError
@@ -120,12 +120,12 @@ def _free_gib() -> float:
 
 
 def evaluate_here(model: DrawModel, draws: Mapping[str, Variation], workers: int) -> Iterator[tuple[str, Any]]:
-    """Evaluate draws by worker processes on this machine.
+    """Evaluate draws on this machine.
 
     Args:
         model: how, and of what design and process.
         draws: variations by key.
-        workers: number of processes.
+        workers: number of worker processes; 0 to evaluate in this process, with all its threads.
 
     Yields:
         key and result of every draw, as they are finished.
@@ -133,6 +133,10 @@ def evaluate_here(model: DrawModel, draws: Mapping[str, Variation], workers: int
     Raises:
         InputError: a draw that ended its worker three times.
     """
+    if workers == 0:
+        for key, variation in draws.items():
+            yield key, named(key, partial(model, variation))
+        return
     strikes: Counter[str] = Counter()
     fresh, suspects = deque(draws), deque[str]()
     while fresh or suspects:
@@ -143,7 +147,7 @@ def evaluate_here(model: DrawModel, draws: Mapping[str, Variation], workers: int
         for key in lost:
             if strikes[key] >= _STRIKES:
                 got = f"{_STRIKES} workers that ended while they computed it, as when memory runs out"
-                cure = "Free memory, or take fewer workers (--workers). Finished draws are kept."
+                cure = "Free memory, or take fewer workers. Finished draws are kept."
                 raise InputError(f"draw {key}", "a worker must live through a draw", got, cure)
         suspects.extend(lost)
 

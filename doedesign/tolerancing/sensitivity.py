@@ -1,28 +1,27 @@
-"""Which errors matter: each alone, and shares of variance over all errors at once.
+"""Sensitivity analysis: the effect of each error alone, and Sobol indices of all errors at once.
 
-One at a time needs two plates per error and shows what each does around the mean, but not what errors do together.
-Sobol indices need many plates and share out the variance of every quantity over the sources of error: the first index
+One at a time needs two draws per error and shows what each does around the mean, but not what errors do together.
+Sobol indices need many draws and share out the variance of every quantity over the sources of error: the first index
 of a source is the variance that it causes by itself, the total index also what it causes together with others.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.tolerancing.analysis import CONFIDENCE, PlateTable
+from doedesign.tolerancing.analysis import CONFIDENCE, SampleTable
 from fab.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
 from fab.process import DEVIATIONS, Process
 from fab.sampling import source_of, varying
 
-# What a normal deviate's absolute value varies by.
-_FOLDED = 1 - 2 / np.pi
+_FOLDED = 1 - 2 / np.pi  # variance of a normal deviate's absolute value
 _RESAMPLES = 500
 
 
-class Change(NamedTuple):
-    """What one error does to one quantity, in the worst row or the worst row of one colour.
+class Effect(NamedTuple):
+    """Effect of one error alone on one quantity, in the worst row or the worst row of one colour.
 
     Attributes:
         error: flat name.
@@ -45,12 +44,12 @@ class Change(NamedTuple):
     variance: float
 
 
-def one_at_a_time(process: Process, table: PlateTable) -> list[Change]:
-    """What every error does alone.
+def one_at_a_time(process: Process, table: SampleTable) -> list[Effect]:
+    """Effect of every error alone.
 
     Args:
         process: the process.
-        table: plates of `one_at_a_time_keys` and the expected plate.
+        table: draws of `one_at_a_time_keys` and the expected one.
     """
     keys = set(one_at_a_time_keys(process))
     out = []
@@ -61,9 +60,8 @@ def one_at_a_time(process: Process, table: PlateTable) -> list[Change]:
             for name in varying(process):
                 below, above = (f"one_at_a_time/{name}/{reach}" for reach in ("-1", "+1"))
                 low, high = values[below] if below in keys else None, values[above]
-                out.append(
-                    Change(name, source_of(name), quantity, colour, low, expected, high, _variance(low, expected, high))
-                )
+                variance = _variance(low, expected, high)
+                out.append(Effect(name, source_of(name), quantity, colour, low, expected, high, variance))
     return out
 
 
@@ -75,27 +73,27 @@ def _variance(low: float | None, expected: float, high: float) -> float:
     return slope**2 + 2 * curvature**2
 
 
-def source_shares(changes: Sequence[Change], quantity: str, colour: str | None = None) -> dict[str, float]:
-    """About which share of a quantity's variance each source causes, if errors do not act together; largest first."""
+def source_shares(effects: Sequence[Effect], quantity: str, colour: str | None = None) -> dict[str, float]:
+    """Approximate share of each source in a quantity's variance, if errors do not act together; largest first."""
     variances = dict.fromkeys((error.source for error in DEVIATIONS.values()), 0.0)
-    for change in changes:
-        if (change.quantity, change.colour) == (quantity, colour) and np.isfinite(change.variance):
-            variances[change.source] += change.variance
+    for effect in effects:
+        if (effect.quantity, effect.colour) == (quantity, colour) and np.isfinite(effect.variance):
+            variances[effect.source] += effect.variance
     total = sum(variances.values())
     shares = {source: value / total for source, value in variances.items() if value > 0}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-class Index(NamedTuple):
-    """A Sobol index and the interval in which it lies with 95 % confidence (bootstrap)."""
+class SensitivityIndex(NamedTuple):
+    """A Sobol index and its 95 % confidence interval (bootstrap)."""
 
     value: float
     low: float
     high: float
 
 
-class Share(NamedTuple):
-    """Which share of the variance of a quantity a source causes.
+class VarianceShare(NamedTuple):
+    """Share of the variance of a quantity that a source causes.
 
     Attributes:
         source: the source of error.
@@ -108,16 +106,16 @@ class Share(NamedTuple):
     source: str
     quantity: str
     colour: str | None
-    first: Index
-    total: Index
+    first: SensitivityIndex
+    total: SensitivityIndex
 
 
-def sobol(process: Process, table: PlateTable, count: int, seed: int = 0) -> list[Share]:
+def sobol(process: Process, table: SampleTable, count: int, seed: int = 0) -> list[VarianceShare]:
     """Sobol indices of every source (estimators of Saltelli et al. 2010).
 
     Args:
         process: the process.
-        table: plates of `sobol_keys(process, count)`.
+        table: draws of `sobol_keys(process, count)`.
         count: rows of the samples, a power of two.
         seed: seed of the bootstrap.
 
@@ -133,43 +131,39 @@ def sobol(process: Process, table: PlateTable, count: int, seed: int = 0) -> lis
     if not outputs:
         return []
     values = np.stack([numbers[output].reshape(2 + len(sources), count) for output in outputs], axis=1)
-    first, total = _indices(values, np.arange(count))
-    found = bootstrap(
+    found = _indices(values, np.arange(count))
+    interval = bootstrap(
         [np.arange(count)],
-        lambda rows: np.stack(_indices(values, rows)),
+        lambda rows: _indices(values, rows),
         vectorized=False,
         n_resamples=_RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
         rng=np.random.default_rng([seed, 3]),
     ).confidence_interval
+
+    def index(*at: int) -> SensitivityIndex:
+        return SensitivityIndex(*(float(values[at]) for values in (found, interval.low, interval.high)))
+
     return [
-        Share(
-            source,
-            quantity,
-            colour,
-            Index(float(first[o, s]), float(found.low[0, o, s]), float(found.high[0, o, s])),
-            Index(float(total[o, s]), float(found.low[1, o, s]), float(found.high[1, o, s])),
-        )
+        VarianceShare(source, quantity, colour, index(0, o, s), index(1, o, s))
         for o, (quantity, colour) in enumerate(outputs)
         for s, source in enumerate(sources)
     ]
 
 
-def _clipped(values: Float[np.ndarray, " plate"]) -> Float[np.ndarray, " plate"]:
-    """Infinite numbers at the limits of the finite ones: a plate beyond all others counts as the worst of them."""
+def _clipped(values: Float[np.ndarray, " draw"]) -> Float[np.ndarray, " draw"]:
+    """Infinite numbers at the limits of the finite ones: a draw beyond all others counts as the worst of them."""
     finite = values[np.isfinite(values)]
     return np.clip(values, finite.min(), finite.max()) if len(finite) else values
 
 
-def _varies(values: Float[np.ndarray, " plate"]) -> bool:
+def _varies(values: Float[np.ndarray, " draw"]) -> bool:
     """Whether numbers are finite and differ by more than rounding does."""
     return bool(np.isfinite(values).all() and np.ptp(values) > 1e-6 * np.abs(values).max())
 
 
-def _indices(
-    values: Float[np.ndarray, "sample output row"], rows: np.ndarray
-) -> tuple[Float[np.ndarray, "output source"], Float[np.ndarray, "output source"]]:
+def _indices(values: Float[np.ndarray, "sample output row"], rows: np.ndarray) -> Float[np.ndarray, "2 output source"]:
     """First and total indices from the outputs of samples A, B, and A with each source from B, in that order."""
     from scipy.stats import sobol_indices
 
@@ -177,14 +171,11 @@ def _indices(
     a, b, *mixed = np.concatenate([values, values[:, :1]], axis=1)[..., rows]
     mixed = np.stack([*mixed, mixed[-1]])
     found = sobol_indices(func={"f_A": a, "f_B": b, "f_AB": mixed}, n=len(rows))
-    return found.first_order[:-1, :-1], found.total_order[:-1, :-1]
+    return np.stack([found.first_order[:-1, :-1], found.total_order[:-1, :-1]])
 
 
-def most_important(shares: Mapping[str, float]) -> tuple[str, float] | None:
-    """The source with the largest share."""
-    return max(shares.items(), key=lambda item: item[1]) if shares else None
-
-
-def as_records(found: Sequence[Change] | Sequence[Share]) -> list[dict[str, Any]]:
-    """The same as plain dictionaries, for JSON."""
-    return [{k: v._asdict() if isinstance(v, Index) else v for k, v in one._asdict().items()} for one in found]
+def as_records(found: Sequence[Effect] | Sequence[VarianceShare]) -> list[dict[str, Any]]:
+    """Plain dictionaries of effects or shares, for JSON."""
+    return [
+        {k: v._asdict() if isinstance(v, SensitivityIndex) else v for k, v in one._asdict().items()} for one in found
+    ]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from doedesign.calibration import Calibration, calibrate, load_shots, unknowns_of
+from doedesign.calibration import Calibration, calibrate, read_measurement
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.objective import (
@@ -19,6 +19,7 @@ from doedesign.calibration.objective import (
 )
 from doedesign.calibration.target import measured_weights
 from doedesign.calibration.uncertainty import posterior_of
+from doedesign.calibration.unknowns import unknowns_of
 from doedesign.design.design import Design
 from fab.errors import InputError
 from fab.process import Normal, Process
@@ -50,7 +51,7 @@ def measured(
     **options: Any,
 ) -> Calibration:
     path = photograph(folder, light_of(design, process, hidden, depths_m, margin), depths_m, electrons=electrons)
-    return calibrate(design, process, load_shots(path, design.camera), errors, **options)
+    return calibrate(design, read_measurement(path, design.camera), errors, process=process, **options)
 
 
 def small(cells: int = 96, count: int = 4, relief: float = 1.0) -> tuple[Design, Process]:
@@ -165,14 +166,14 @@ def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
     """Half of the pixels, as the green ones of a RAW file lie; the others are never looked at."""
     design, process = small()
     lights = light_of(design, process, FEW, (NEAR_M, FAR_M), margin=4)
-    whole = load_shots(photograph(tmp_path, lights, (NEAR_M, FAR_M), electrons=3e6), design.camera)
-    green = np.add.outer(*(np.arange(n) for n in whole.shots[0].psf.rate.shape)) % 2 == 1
+    whole = read_measurement(photograph(tmp_path, lights, (NEAR_M, FAR_M), electrons=3e6), design.camera)
+    green = np.add.outer(*(np.arange(n) for n in whole.images[0].psf.rate.shape)) % 2 == 1
     shots = []
-    for shot in whole.shots:
+    for shot in whole.images:
         valid = shot.psf.valid & green
         shots.append(shot._replace(psf=shot.psf._replace(rate=np.where(valid, shot.psf.rate, 0.0), valid=valid)))
-    half = calibrate(design, process, whole._replace(shots=tuple(shots)))
-    both = calibrate(design, process, whole)
+    half = calibrate(design, whole._replace(images=tuple(shots)), process=process)
+    both = calibrate(design, whole, process=process)
     for name, (value, sigma) in found(half).items():
         assert abs(value - FEW[name]) < 5 * sigma, name
     # Half the light is sqrt(2) less certain; the scatter between blocks knows that to a fifth or so.
@@ -185,7 +186,7 @@ def test_a_known_brightness_measures_the_throughput(tmp_path: Path):
     lights = light_of(design, process, FEW, (NEAR_M,))
     # 1.5e7 counts in a second for all light on the aperture, known to a per cent.
     path = photograph(tmp_path, lights, (NEAR_M,), image_more="incident = 15000000.0\nincident_sigma = 0.01")
-    result = calibrate(design, process, load_shots(path, design.camera))
+    result = calibrate(design, read_measurement(path, design.camera), process=process)
     (reading,) = [r for r in result.readings if r.quantity == "throughput"]
     assert reading.measured is not None
     assert reading.measured[0] == pytest.approx(reading.predicted[0], rel=0.03)
@@ -208,7 +209,7 @@ def test_a_picture_the_wrong_way_up_is_noticed(tmp_path: Path):
     design, process = small()
     lights = [np.rot90(light, 2).copy() for light in light_of(design, process, {}, (NEAR_M, FAR_M))]
     path = photograph(tmp_path, lights, (NEAR_M, FAR_M))
-    result = calibrate(design, process, load_shots(path, design.camera), evaluations=0)
+    result = calibrate(design, path, process=process, evaluations=0)
     assert any("turned left by 2 more quarter turns" in remark for remark in result.remarks)
 
 

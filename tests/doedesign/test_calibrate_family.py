@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from doedesign.calibration import Family, Targets, explanations
+from doedesign.calibration import ExplanationSet, Targets, explain_ratio
 from doedesign.design.design import Design
 from doedesign.prediction import predict
 from fab.errors import InputError
@@ -26,15 +26,17 @@ def plate() -> tuple[Design, Process]:
 
 
 @pytest.fixture(scope="module")
-def family(plate: tuple[Design, Process]) -> Family:
+def family(plate: tuple[Design, Process]) -> ExplanationSet:
     design, process = plate
-    nothing = explanations(design, process, Targets(PROBE_M, NEAR_M, 1.0), ("etch_lag",), pairs=False, reach=1.0)
+    nothing = explain_ratio(
+        design, Targets(PROBE_M, NEAR_M, 1.0), ("etch_lag",), process=process, pairs=False, reach=1.0
+    )
     ratio, throughput = (nothing.nominal[key] for key in ("ring_to_disc", "throughput"))
     targets = Targets(PROBE_M, NEAR_M, 0.9 * ratio, throughput, 0.02)
-    return explanations(design, process, targets, ERRORS)
+    return explain_ratio(design, targets, ERRORS, process=process)
 
 
-def test_every_explanation_gives_the_ratio(plate: tuple[Design, Process], family: Family):
+def test_every_explanation_gives_the_ratio(plate: tuple[Design, Process], family: ExplanationSet):
     design, process = plate
     assert len(family.singles) >= 2
     assert family.pairs
@@ -50,7 +52,7 @@ def test_every_explanation_gives_the_ratio(plate: tuple[Design, Process], family
         assert each.fits == (abs(row["throughput"] - (family.targets.throughput or 0)) <= 0.04)
 
 
-def test_explanations_come_in_order_and_within_reach(family: Family):
+def test_explanations_come_in_order_and_within_reach(family: ExplanationSet):
     for rows in (family.singles, family.pairs):
         distances = [each.distance for each in rows]
         assert distances == sorted(distances)
@@ -60,7 +62,7 @@ def test_explanations_come_in_order_and_within_reach(family: Family):
     assert {"common_depth_scale", "common_cd_bias_m", "etch_lag", "overlay_x_m[0]", "overlay_x_m[1]"} <= named
 
 
-def test_values_are_scores_times_sigmas(plate: tuple[Design, Process], family: Family):
+def test_values_are_scores_times_sigmas(plate: tuple[Design, Process], family: ExplanationSet):
     _, process = plate
     for each in family.singles:
         for name, value in each.values.items():
@@ -69,11 +71,11 @@ def test_values_are_scores_times_sigmas(plate: tuple[Design, Process], family: F
             assert name != "etch_lag" or value > 0
 
 
-def test_none_is_an_answer(plate: tuple[Design, Process], family: Family):
+def test_none_is_an_answer(plate: tuple[Design, Process], family: ExplanationSet):
     """A ratio a hundred times as large is not to be had from a little depth."""
     design, process = plate
     targets = Targets(PROBE_M, NEAR_M, 100 * family.nominal["ring_to_disc"])
-    found = explanations(design, process, targets, ("common_depth_scale", "common_cd_bias"), reach=2.0)
+    found = explain_ratio(design, targets, ("common_depth_scale", "common_cd_bias"), process=process, reach=2.0)
     assert not found.singles
     assert not found.pairs
     assert ("common_depth_scale",) in found.none
@@ -84,8 +86,8 @@ def test_none_is_an_answer(plate: tuple[Design, Process], family: Family):
 def test_impossible_targets_are_refused(plate: tuple[Design, Process]):
     design, process = plate
     with pytest.raises(InputError, match="ring_to_disc: must be positive"):
-        explanations(design, process, Targets(PROBE_M, NEAR_M, 0.0))
+        explain_ratio(design, Targets(PROBE_M, NEAR_M, 0.0), process=process)
     with pytest.raises(InputError, match="depth: the source must be near enough"):
-        explanations(design, process, Targets(PROBE_M, 1e3, 1.0))
+        explain_ratio(design, Targets(PROBE_M, 1e3, 1.0), process=process)
     with pytest.raises(InputError, match="in a definite way, but got weather"):
-        explanations(design, process, Targets(PROBE_M, NEAR_M, 1.0), ("weather",))
+        explain_ratio(design, Targets(PROBE_M, NEAR_M, 1.0), ("weather",), process=process)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from doedesign.calibration import load_measurement, load_shots
+from doedesign.calibration import load_measurement, read_measurement
 from fab.errors import InputError
 from tests.doedesign.calibration_fakes import (
     PIXEL_M,
@@ -74,19 +74,19 @@ def photographed(folder: Path, light: np.ndarray, extra: str = "", image_extra: 
 def test_images_that_cannot_be_used_are_refused_by_name(tmp_path: Path):
     camera = plate_drawn(32, 4, window=24).camera
     with pytest.raises(InputError, match=r"a\.tiff: the file must exist"):
-        load_shots(written(tmp_path, HEAD + IMAGE), camera)
+        read_measurement(written(tmp_path, HEAD + IMAGE), camera)
     path = photographed(tmp_path, spot(), "window = 64")
     with pytest.raises(InputError, match=r"image a: an image must have at least the window's 64 pixels"):
-        load_shots(path, camera)
+        read_measurement(path, camera)
     path = photographed(tmp_path, 0 * spot())
     with pytest.raises(InputError, match=r"image a: there must be light above the noise"):
-        load_shots(path, camera)
+        read_measurement(path, camera)
     tifffile.imwrite(tmp_path / "a.tiff", np.zeros((60, 70), np.uint8))
     with pytest.raises(InputError, match="16 bits per pixel"):
-        load_shots(path, camera)
+        read_measurement(path, camera)
     tifffile.imwrite(tmp_path / "a.tiff", np.full((60, 70), 4095, np.uint16))
     with pytest.raises(InputError, match="some pixels must not be saturated"):
-        load_shots(path, camera)
+        read_measurement(path, camera)
 
 
 @pytest.mark.parametrize(("turns", "mirrored"), [(0, False), (1, False), (2, False), (3, True), (0, True)])
@@ -106,7 +106,7 @@ def test_pictures_are_turned_to_the_plates_axes(tmp_path: Path, turns: int, mirr
     shots = []
     for image_extra in ("", f"centre = [{row}.0, {column}.0]"):
         path = photographed(tmp_path, shown[::-1], extra, image_extra)
-        (shot,) = load_shots(path, camera).shots
+        (shot,) = read_measurement(path, camera).images
         shots.append(shot)
     for shot in shots:
         y, x = (round(c) for c in shot.centre)
@@ -128,20 +128,21 @@ def test_a_window_of_other_pixels_covers_the_same_field(tmp_path: Path):
     text = path.read_text()
     # 60 pixels are all there are.
     for pixel, window in (("1.85 um", 24), ("0.925 um", 48), ("0.4 um", 60)):
-        assert load_shots(written(tmp_path, text.replace("1.85 um", pixel)), design.camera).window == window
+        assert read_measurement(written(tmp_path, text.replace("1.85 um", pixel)), design.camera).window == window
 
 
-def test_brackets_become_images(tmp_path: Path):
+def test_brackets_become_images(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     design = plate_drawn(96, 4, window=48)
     lights = light_of(design, usual_process(design), {}, (6e-3, np.inf))
     path = photograph(tmp_path, lights, (6e-3, np.inf), kinds=("tiff", "exr"), more="window = 40")
-    files: list[str] = []
-    measurement = load_shots(path, design.camera, files.append)
+    with caplog.at_level("INFO", "doedesign"):
+        measurement = read_measurement(path, design.camera)
+    files = [text.removeprefix("reading ") for text in caplog.messages if text.startswith("reading ")]
     assert len(files) == 8
     assert set(measurement.digests) == {"measurement.toml", *files}
-    assert [shot.name for shot in measurement.shots] == ["near0", "far1"]
+    assert [shot.name for shot in measurement.images] == ["near0", "far1"]
     assert measurement.full["near0"] < 10  # the shorter exposure has nearly all that the longer one lacks
-    near = measurement.shots[0]
+    near = measurement.images[0]
     total = near.psf.rate[near.psf.valid].sum() * 2.0 / 3e7
     assert total == pytest.approx(lights[0].sum(), rel=0.01)
     assert measurement.spec.pixel_m == PIXEL_M
@@ -151,6 +152,6 @@ def test_brackets_become_images(tmp_path: Path):
 def test_a_depth_that_is_not_exact_leaves_a_curvature(tmp_path: Path):
     camera = plate_drawn(32, 4, window=24).camera
     path = photographed(tmp_path, spot(), 'defocus_sigma = "1 um"', 'depth_sigma = "0.06 mm"')
-    (shot,) = load_shots(path, camera).shots
+    (shot,) = read_measurement(path, camera).images
     expected = np.hypot(0.06e-3 / 6e-3**2, 1e-6 / camera.sensor_distance_m**2)
     assert shot.defocus_sigma == pytest.approx(expected)

@@ -12,7 +12,7 @@ import pytest
 
 from doedesign.spec import LimitSpec
 from doedesign.tolerancing import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
-from doedesign.tolerancing.analysis import good_plates, obeys, statistics, table_of, worst_plate, yield_of
+from doedesign.tolerancing.analysis import good_draws, obeys, statistics, table_of, worst_draw, yield_of
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
 from fab.errors import InputError
@@ -94,7 +94,7 @@ def test_plates_with_other_rows_are_refused():
     rows = [row("red", None, strehl=1.0)]
     with pytest.raises(ValueError, match="the same rows"):
         table_of({"normal/0": rows, "normal/1": [row("blue", None, strehl=1.0)]})
-    with pytest.raises(ValueError, match="at least one plate with rows"):
+    with pytest.raises(ValueError, match="at least one draw with rows"):
         table_of({})
 
 
@@ -105,7 +105,7 @@ def test_yield_is_a_share_with_wilson_interval():
     assert (found.low, found.high) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert str(found) == "80.0 % (49.0 to 94.3 %)"
     assert yield_of(np.ones(5, dtype=bool)).high == 1.0
-    with pytest.raises(ValueError, match="at least one plate"):
+    with pytest.raises(ValueError, match="at least one draw"):
         yield_of(np.zeros(0, dtype=bool))
 
 
@@ -133,8 +133,8 @@ def test_a_limit_holds_for_every_row_it_speaks_of(text: str, good: list[bool]):
 
 def test_a_good_plate_obeys_every_limit():
     limits = [limit_from_text("zeroth_order <= 3.5 %"), limit_from_text("ring_to_disc >= 2")]
-    assert good_plates(TWO, limits).tolist() == [False, False]
-    assert good_plates(TWO, []).tolist() == [True, True]
+    assert good_draws(TWO, limits).tolist() == [False, False]
+    assert good_draws(TWO, []).tolist() == [True, True]
     both = LimitSpec(quantity="zeroth_order", min=0.015, max=0.035, colour="red")
     assert obeys(TWO, both).tolist() == [False, True]
     assert limit_text(both) == "zeroth_order >= 0.015 and <= 0.035 for red"
@@ -159,21 +159,21 @@ def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
     rows = [row("red", 0.05, strehl=0.9, zeroth_order=0.1, ring_to_disc=None)]
     table = table_of({"normal/0": OutOfModel("too much"), "normal/1": rows, "normal/2": rows})
     assert table.within.tolist() == [False, True, True]
-    assert good_plates(table, []).tolist() == [False, True, True]
+    assert good_draws(table, []).tolist() == [False, True, True]
     assert obeys(table, limit_from_text("strehl >= 0")).tolist() == [False, True, True]
-    assert worst_plate(table, []) == "normal/1"
-    assert worst_plate(table, [limit_from_text("strehl >= 0.95")]) == "normal/1"
+    assert worst_draw(table, []) == "normal/1"
+    assert worst_draw(table, [limit_from_text("strehl >= 0.95")]) == "normal/1"
     assert [found["min"] for found in statistics(table) if found["quantity"] == "strehl"] == [0.9, 0.9]
-    with pytest.raises(ValueError, match="at least one plate with rows"):
+    with pytest.raises(ValueError, match="at least one draw with rows"):
         table_of({"normal/0": OutOfModel("too much")})
 
 
 def test_the_worst_plate_is_farthest_beyond_a_limit():
-    assert worst_plate(TWO, []) == "normal/1"  # Strehl 0.7
-    assert worst_plate(TWO, [limit_from_text("zeroth_order <= 1 %")]) == "normal/0"
+    assert worst_draw(TWO, []) == "normal/1"  # Strehl 0.7
+    assert worst_draw(TWO, [limit_from_text("zeroth_order <= 1 %")]) == "normal/0"
     # 0.2 below 0.3 is worse than 0.04 above 0.035, against the size of the limits.
     limits = [limit_from_text("far_spot >= 0.3"), limit_from_text("zeroth_order <= 3.5 %")]
-    assert worst_plate(TWO, limits) == "normal/1"
+    assert worst_draw(TWO, limits) == "normal/1"
 
 
 def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
@@ -287,7 +287,7 @@ def test_a_budget_that_no_error_size_decides(fakes):
         ({"limits": ["strehl >= 0.9"]}, lambda asked: asked.budget("rotation"), "must name errors that vary"),
         ({}, lambda asked: asked.monte_carlo(0), "draws: must be at least 1"),
         ({"seed": -1}, lambda asked: asked, "must not be negative"),
-        ({"workers": 0}, lambda asked: asked, "--workers: must be at least 1"),
+        ({"workers": 0}, lambda asked: asked, "workers: must be at least 1"),
         ({"workers": 2, "scheduler": "tcp://x"}, lambda asked: asked, "brings its own workers"),
         ({"errors": {"overlay_q": "1 um"}}, lambda asked: asked, "overlay_q: must be a known key"),
         ({"errors": {"overlay_x": "1 kg"}}, lambda asked: asked, r"overlay_x\.sigma: must be a number with a unit"),
@@ -301,7 +301,7 @@ def test_what_cannot_be_studied_is_refused(ask: Callable[..., Study], settings: 
 
 
 def test_a_process_without_errors_is_refused_with_a_cure(ask: Callable[..., Study], fakes):
-    with pytest.raises(InputError, match=r'errors that vary.*stock = "contact_aligner".*--process'):
+    with pytest.raises(InputError, match=r'errors that vary.*process with errors, such as "contact_aligner"'):
         ask(process=Process(fakes.LEVELS))
 
 

@@ -164,7 +164,7 @@ def test_a_plate_that_kills_its_workers_is_named(
     strict = Cluster(tmp_path, allowed_failures=0)
     strict.staff(1)
     try:
-        with pytest.raises(InputError, match=r"draw normal/0: a worker must live through a draw.*--draw"):
+        with pytest.raises(InputError, match=r"draw normal/0: a worker must live through a draw.*evaluate it alone"):
             ask(evaluate=fakes.rows_or_death, scheduler=strict.address).monte_carlo(1)
     finally:
         strict.close()

@@ -3,16 +3,16 @@
 import csv
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import doedesign.commands.tolerance
 import doedesign.optimization
+import doedesign.tolerancing.result_files
 from doedesign.spec import load_variation
 from doedesign.tolerancing import study
+from doedesign.tolerancing.results import plain
 from fab.files import sha256_file
 from tests.doedesign.small_runs import call, finished_run
 from tests.pictures import leave_out_pictures
@@ -139,9 +139,9 @@ def test_the_same_bytes_again_and_from_two_workers(run: Path, asked: tuple[int, 
 def test_a_study_grows_and_leaves_no_old_pictures(
     run: Path, asked: tuple[int, str, str], monkeypatch: pytest.MonkeyPatch
 ):
-    commands = doedesign.commands.tolerance
-    leave_out_pictures(monkeypatch, commands)
-    monkeypatch.setattr(commands, "evaluate_here", lambda work, plates, workers: ((key, None) for key in plates))
+    files = doedesign.tolerancing.result_files
+    leave_out_pictures(monkeypatch, files)
+    monkeypatch.setattr(files, "evaluate_here", lambda model, plates, workers: ((key, None) for key in plates))
     before = (run / "tolerance" / "draws.jsonl").read_bytes()
     more = ("--draws", 5, "--sensitivity", "sobol", "--sobol", 2, "--corners", "--json")
     code, out, said = call("tolerance", run, *more)
@@ -214,8 +214,7 @@ def test_a_process_comes_from_a_file(run: Path, tmp_path: Path):
     assert study(run, limits=[], quiet=True).limits == ()
 
 
-def test_infinite_numbers_have_a_place_in_every_file(monkeypatch: pytest.MonkeyPatch):
-    plain: Callable = doedesign.commands.tolerance._plain
+def test_infinite_numbers_have_a_place_in_every_file():
     found = plain({"a": math.inf, "b": [np.nan, 1.0, (2, None)], "c": {"d": -math.inf}})
     assert found == {"a": None, "b": [None, 1.0, [2, None]], "c": {"d": None}}
     assert json.dumps(found, allow_nan=False)

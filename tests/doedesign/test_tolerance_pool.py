@@ -97,7 +97,7 @@ def test_a_plate_that_kills_its_worker_again_and_again_is_named(
     deadly = variation_of(2, {"overlay_x_m[0]": fakes.DEADLY})
     real = Study.variation
     monkeypatch.setattr(Study, "variation", lambda self, key: deadly if key == "normal/4" else real(self, key))
-    with pytest.raises(InputError, match=r"draw normal/4: a worker must live through a draw.*--workers"):
+    with pytest.raises(InputError, match=r"draw normal/4: a worker must live through a draw.*fewer workers"):
         asked.monte_carlo(10)
     assert set(asked.journal.finished) == set(normal_keys(10)) - {"normal/4"}
 
@@ -119,7 +119,7 @@ def test_a_plate_beyond_the_model_is_a_bad_plate(ask: Callable[..., Study], fake
     assert again.beyond(normal_keys(40)) == beyond
     # Only a study that has no plate to show is none.
     with pytest.raises(InputError, match=r"draw normal/\d+: must be within what can be evaluated.*0.5 um.*Lower"):
-        asked.plates(sorted(beyond)[:2])
+        asked.sample(sorted(beyond)[:2])
 
 
 def test_a_mistake_in_a_function_of_ones_own_is_named(
@@ -158,7 +158,7 @@ def test_a_folder_keeps_one_study(ask: Callable[..., Study], fakes: ModuleType, 
         (ask("other", out=out), "design"),
         (ask(out=out, evaluate=fakes.slow_rows), "evaluate"),
     ):
-        with pytest.raises(InputError, match=rf"one with another {what}.*Choose another --out"):
+        with pytest.raises(InputError, match=rf"one with another {what}.*Choose another folder"):
             other.monte_carlo(1)
     # Limits judge plates, they do not make them.
     assert ask(out=out, limits=["strehl >= 0"]).monte_carlo(1).yield_ is not None
@@ -175,7 +175,7 @@ def test_a_damaged_line_is_named(ask: Callable[..., Study], tmp_path: Path):
     ask(out=tmp_path / "out").monte_carlo(1)
     path = tmp_path / "out" / "draws.jsonl"
     path.write_bytes(b"[1]\n" + path.read_bytes())
-    with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished plate.*Remove"):
+    with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished draw.*Remove"):
         ask(out=tmp_path / "out").monte_carlo(2)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from doedesign.calibration import Calibration, Explanation, Family, Targets, calibrate, load_shots
+from doedesign.calibration import Calibration, Explanation, ExplanationSet, Targets, calibrate
+from doedesign.calibration.explanation_plots import plot_explanations
 from doedesign.calibration.explanations import Curve
-from doedesign.report.calibration import plot_check, plot_estimates, plot_fitted_psfs
-from doedesign.report.explanations import plot_explanations
+from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
 from doedesign.report.labels import value_text
 from fab.figure import png_bytes
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
@@ -27,15 +27,15 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     process = usual_process(drawn)
     lights = light_of(drawn, process, {"common_depth_scale": 0.03}, (6e-3, np.inf), margin=4)
     path = photograph(folder, lights, (6e-3, np.inf), exposures=(1.0,), electrons=3e6)
-    return calibrate(drawn, process, load_shots(path, drawn.camera))
+    return calibrate(drawn, path, process=process)
 
 
-def family() -> Family:
+def family() -> ExplanationSet:
     curve = Curve((-1.0, 0.0, 1.0), (2.0, 3.0, 4.5), (0.8, 0.9, 0.7))
     single = Explanation({"common_cd_bias_m": 1.2e-7}, {"common_cd_bias_m": 1.2}, 1.2, 1.0, 0.85, 0.1, 0.7, True)
     values, scores = {"depth_scale[3]": -0.03, "sidewall_rad": 0.1}, {"depth_scale[3]": -1.5, "sidewall_rad": 1.0}
     pair = Explanation(values, scores, 1.8, 1.0, 0.5, 0.2, 0.6, False)
-    return Family(
+    return ExplanationSet(
         Targets(520e-9, 0.1, 1.0, 0.86),
         {"ring_to_disc": 3.0, "throughput": 0.9, "zeroth_order": 0.01},
         [single],

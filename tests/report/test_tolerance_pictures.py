@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from doedesign.report.labels import error_label
-from doedesign.report.tolerance import plot_budget, plot_changes, plot_histograms, plot_shares, plot_yield
-from doedesign.tolerancing import Budget, Change, Index, PlateTable, Share, limit_from_text
+from doedesign.tolerancing import Budget, Effect, SampleTable, SensitivityIndex, VarianceShare, limit_from_text
 from doedesign.tolerancing.analysis import yield_of
+from doedesign.tolerancing.plots import plot_budget, plot_effects, plot_histograms, plot_variance_shares, plot_yield
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
@@ -28,7 +28,7 @@ LIMITS = [
 MARK = np.array([0xD1, 0x49, 0x5B]) / 255
 
 
-def random_table(rng: np.random.Generator, plates: int = 60) -> PlateTable:
+def random_table(rng: np.random.Generator, plates: int = 60) -> SampleTable:
     shape = (plates, len(PLACES))
     values = {
         "zeroth_order": rng.gamma(3, 0.01, shape),
@@ -39,15 +39,15 @@ def random_table(rng: np.random.Generator, plates: int = 60) -> PlateTable:
         "far_spot": np.where(NEAR_ROWS, np.nan, rng.normal(0.4, 0.02, shape)),
     }
     values["ring_to_disc"][0, 0] = np.inf  # a plate without any light in the disc
-    return PlateTable(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
+    return SampleTable(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
 
 
-def changes(rng: np.random.Generator) -> list[Change]:
+def changes(rng: np.random.Generator) -> list[Effect]:
     names = [f"{key}[{k}]" for key in ("overlay_x_m", "overlay_y_m", "depth_scale", "cd_bias_m") for k in range(4)]
 
-    def change(name: str, quantity: str, colour: str | None) -> Change:
+    def change(name: str, quantity: str, colour: str | None) -> Effect:
         low, high = 0.4 + 0.01 * rng.normal(size=2)
-        return Change(name, "overlay", quantity, colour, float(low), 0.4, float(high), 1e-6)
+        return Effect(name, "overlay", quantity, colour, float(low), 0.4, float(high), 1e-6)
 
     out = [
         change(name, quantity, colour)
@@ -55,16 +55,16 @@ def changes(rng: np.random.Generator) -> list[Change]:
         for colour in (None, "656nm")
         for name in names
     ]
-    return [*out, Change("corner_radius_m", "corners", "far_spot", None, None, 0.4, 0.38, 1e-6)]
+    return [*out, Effect("corner_radius_m", "corners", "far_spot", None, None, 0.4, 0.38, 1e-6)]
 
 
-def shares(rng: np.random.Generator) -> list[Share]:
-    def index() -> Index:
+def shares(rng: np.random.Generator) -> list[VarianceShare]:
+    def index() -> SensitivityIndex:
         value = float(rng.uniform(0, 0.6))
-        return Index(value, value - 0.1, value + 0.1)
+        return SensitivityIndex(value, value - 0.1, value + 0.1)
 
     return [
-        Share(source, quantity, colour, index(), index())
+        VarianceShare(source, quantity, colour, index(), index())
         for quantity in ("zeroth_order", "strehl", "far_spot", "ring_to_disc")
         for colour in (None, *(colour.name for colour in RGB))
         for source in ("depth", "overlay", "cd", "roughness", "defects")
@@ -85,9 +85,9 @@ def plot(name: str, ax: Axes | None = None) -> Axes | FigureBase:
         case "yield":
             return plot_yield(table, LIMITS, ax)
         case "one_at_a_time":
-            return plot_changes(changes(rng), ax)
+            return plot_effects(changes(rng), ax)
         case "sobol":
-            return plot_shares(shares(rng), CAMERA, ax)
+            return plot_variance_shares(shares(rng), CAMERA, ax)
         case "bare":
             return plot_yield(table, ax=ax)
         case _:
@@ -113,7 +113,7 @@ def coloured(drawn: Axes | FigureBase, hue: np.ndarray) -> int:
     [lambda table, limits: plot_histograms(table, table, CAMERA, limits), plot_yield],
     ids=["histograms", "yield"],
 )
-def test_a_limit_is_marked_wherever_it_lies(draw: Callable[[PlateTable, list], FigureBase], rng: np.random.Generator):
+def test_a_limit_is_marked_wherever_it_lies(draw: Callable[[SampleTable, list], FigureBase], rng: np.random.Generator):
     table = random_table(rng)
     assert coloured(draw(table, []), MARK) == 0
     # Far from all plates: the view is widened.
@@ -124,9 +124,9 @@ def test_a_limit_is_marked_wherever_it_lies(draw: Callable[[PlateTable, list], F
 def test_a_longer_bar_is_a_larger_change():
     blue = []
     for size in (0.01, 0.04):
-        change = Change("overlay_x_m[0]", "overlay", "far_spot", None, 0.4 - size, 0.4, 0.4 + size / 4, 1e-4)
-        other = Change("depth_scale[0]", "depth", "far_spot", None, 0.36, 0.4, 0.44, 1e-4)
-        blue.append(coloured(plot_changes([change, other]), np.array([0x56, 0xB4, 0xE9]) / 255))
+        change = Effect("overlay_x_m[0]", "overlay", "far_spot", None, 0.4 - size, 0.4, 0.4 + size / 4, 1e-4)
+        other = Effect("depth_scale[0]", "depth", "far_spot", None, 0.36, 0.4, 0.44, 1e-4)
+        blue.append(coloured(plot_effects([change, other]), np.array([0x56, 0xB4, 0xE9]) / 255))
     assert blue[1] > 1.3 * blue[0]
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-    from doedesign.calibration import Explanation, Family
+    from doedesign.calibration import Explanation, ExplanationSet
 
 __all__ = ["plot_explanations"]
 
@@ -20,46 +20,46 @@ _ROW = 0.27  # inches of one explanation's row
 _MOST_EXPLANATIONS = 14
 
 
-def plot_explanations(family: "Family", ax: "Axes | None" = None) -> "FigureBase":
+def plot_explanations(found: "ExplanationSet", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the ring:disc ratio along every error, and the explanations of the measured ratio in order.
 
     Args:
-        family: the explanations.
+        found: the explanations.
         ax: axes whose place the picture takes; a new figure by default.
     """
-    shown = [*family.singles[:_MOST_EXPLANATIONS], *family.pairs[: _MOST_EXPLANATIONS // 2]]
-    targets = family.targets
+    shown = [*found.singles[:_MOST_EXPLANATIONS], *found.pairs[: _MOST_EXPLANATIONS // 2]]
+    targets = found.targets
     title = f"what gives a ring:disc ratio of {targets.ring_to_disc:.3g} at {length_text(targets.depth_m)}"
-    with panels(ax, (11.1, max(_ROW * len(shown), 3.4) + 1.6), title, _words(family)) as figure:
+    with panels(ax, (11.1, max(_ROW * len(shown), 3.4) + 1.6), title, _words(found)) as figure:
         curves, bars = figure.subplots(1, 2, width_ratios=(3.1, 2.2))
-        _draw_curves(curves, family)
+        _draw_curves(curves, found)
         _draw_explanations(bars, shown)
     return figure
 
 
-def _words(family: "Family") -> str:
+def _words(found: "ExplanationSet") -> str:
     words = (
         "left: the model's ratio along the errors that change it most, dashed: measured; right: distance of each "
         "explanation from the process's means, in its standard deviations, with the throughput that comes with it"
     )
-    throughput = family.targets.throughput
+    throughput = found.targets.throughput
     if throughput is not None:
         words += f"; full bars: throughput within two standard deviations of the {100 * throughput:.3g} % measured"
-    alone = [error_label(one[0]) for one in family.none if len(one) == 1]
-    return words + (f"; none within {family.reach:g} standard deviations: {'; '.join(alone)}" if alone else "")
+    alone = [error_label(one[0]) for one in found.none if len(one) == 1]
+    return words + (f"; none within {found.reach:g} standard deviations: {'; '.join(alone)}" if alone else "")
 
 
-def _draw_curves(axes: "Axes", family: "Family") -> None:
-    reached = list(dict.fromkeys(name for each in family.singles for name in each.scores))[: 2 * len(SERIES)]
+def _draw_curves(axes: "Axes", found: "ExplanationSet") -> None:
+    reached = list(dict.fromkeys(name for each in found.singles for name in each.scores))[: 2 * len(SERIES)]
     # Besides those that explain it, those that change it most.
-    others = sorted(family.curves, key=lambda name: -np.ptp(np.log(family.curves[name].ring_to_disc)))
+    others = sorted(found.curves, key=lambda name: -np.ptp(np.log(found.curves[name].ring_to_disc)))
     shown = list(dict.fromkeys([*reached, *others]))[: max(len(reached), len(SERIES))]
     for i, name in enumerate(shown):
-        curve = family.curves[name]
+        curve = found.curves[name]
         style = "-" if i < len(SERIES) else ":"
         label = error_label(name)
         axes.plot(curve.scores, curve.ring_to_disc, style, color=SERIES[i % len(SERIES)], marker=".", label=label)
-    axes.axhline(family.targets.ring_to_disc, color=INK, ls="--", lw=1)
+    axes.axhline(found.targets.ring_to_disc, color=INK, ls="--", lw=1)
     axes.set_xlabel("error, standard deviations of the process")
     axes.set_ylabel("ring:disc ratio")
     axes.grid(True)

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.report.labels import error_label
-from doedesign.tolerancing.analysis import QUANTITIES, PlateTable, good_plates, yield_of
+from doedesign.tolerancing.analysis import QUANTITIES, SampleTable, good_draws, yield_of
 from doedesign.tolerancing.budget import Budget
-from doedesign.tolerancing.sensitivity import Change, Share
+from doedesign.tolerancing.sensitivity import Effect, VarianceShare
 from fab.figure import INK, LINE, MARK, SERIES, length_text, panels, single
 from fab.process import DEVIATIONS
 from sim.plots.colours import colour_label, line_colours
@@ -78,8 +78,8 @@ def _colour_keys(camera: "Camera", **style: Any) -> "list[Line2D]":
 
 
 def plot_histograms(
-    table: PlateTable,
-    nominal: PlateTable,
+    table: SampleTable,
+    nominal: SampleTable,
     camera: "Camera",
     limits: Sequence["LimitSpec"] = (),
     ax: "Axes | None" = None,
@@ -143,7 +143,7 @@ def _shade(axes: "Axes", limits: Sequence["LimitSpec"], scale: float) -> None:
                 axes.axvline(scale * bound, color=MARK, lw=1.2)
 
 
-def plot_yield(table: PlateTable, limits: Sequence["LimitSpec"] = (), ax: "Axes | None" = None) -> "FigureBase":
+def plot_yield(table: SampleTable, limits: Sequence["LimitSpec"] = (), ax: "Axes | None" = None) -> "FigureBase":
     """Draw the yield over where the limit of each quantity lies: the share of DOEs whose worst row is as good.
 
     Args:
@@ -157,7 +157,7 @@ def plot_yield(table: PlateTable, limits: Sequence["LimitSpec"] = (), ax: "Axes 
     chosen = list(dict.fromkeys(one.quantity for one in limits)) or list(table.values)
     words = f"share of {len(table.keys)} plates that are good if the limit lies there, with its 95 % confidence"
     if limits:
-        words += f"; all limits together: {yield_of(good_plates(table, limits))}"
+        words += f"; all limits together: {yield_of(good_draws(table, limits))}"
     with _per_quantity(ax, chosen, words) as (figure, grid):
         for axes, quantity in zip(grid, chosen, strict=True):
             places = {(one.colour, one.depth_m) for one in limits if one.quantity == quantity} or {(None, None)}
@@ -191,18 +191,18 @@ def _plot_yield_curve(axes: "Axes", values: Float[np.ndarray, " plate"], quantit
     axes.step(x, share, where="post", color=hue, lw=1.4, label=label)
 
 
-def plot_changes(changes: Sequence[Change], ax: "Axes | None" = None) -> "FigureBase":
+def plot_effects(effects: Sequence[Effect], ax: "Axes | None" = None) -> "FigureBase":
     """Draw the effect of every error alone on the worst row of each quantity, one standard deviation to either side.
 
     Of more than ten errors, those that matter most to a quantity are shown.
 
     Args:
-        changes: as `doedesign.tolerancing.sensitivity.one_at_a_time` gives them.
+        effects: as `doedesign.tolerancing.sensitivity.one_at_a_time` gives them.
         ax: axes whose place the picture takes; a new figure by default.
     """
     from matplotlib.lines import Line2D
 
-    worst = [one for one in changes if one.colour is None and math.isfinite(one.expected)]
+    worst = [one for one in effects if one.colour is None and math.isfinite(one.expected)]
     quantities = [
         q for q in dict.fromkeys(c.quantity for c in worst) if any(_reach(c) > 0 for c in worst if c.quantity == q)
     ]
@@ -217,17 +217,17 @@ def plot_changes(changes: Sequence[Change], ax: "Axes | None" = None) -> "Figure
     return figure
 
 
-def _reach(change: Change) -> float:
+def _reach(effect: Effect) -> float:
     """Distance by which an error moves its quantity."""
-    moved = (abs(value - change.expected) for value in (change.low, change.high) if value is not None)
+    moved = (abs(value - effect.expected) for value in (effect.low, effect.high) if value is not None)
     return max((one for one in moved if math.isfinite(one)), default=0.0)
 
 
-def _plot_bars(axes: "Axes", shown: Sequence[Change], scale: float) -> None:
+def _plot_bars(axes: "Axes", shown: Sequence[Effect], scale: float) -> None:
     expected = scale * shown[0].expected
     ends = [expected]
-    for position, change in enumerate(shown):
-        for value, hue, offset in ((change.low, _LOWER, -0.2), (change.high, _HIGHER, 0.2)):
+    for position, effect in enumerate(shown):
+        for value, hue, offset in ((effect.low, _LOWER, -0.2), (effect.high, _HIGHER, 0.2)):
             if value is not None and math.isfinite(value):
                 axes.barh(position + offset, scale * value - expected, 0.36, expected, color=hue)
                 ends.append(scale * value)
@@ -239,7 +239,7 @@ def _plot_bars(axes: "Axes", shown: Sequence[Change], scale: float) -> None:
     axes.grid(axis="x")
 
 
-def plot_shares(shares: Sequence[Share], camera: "Camera", ax: "Axes | None" = None) -> "FigureBase":
+def plot_variance_shares(shares: Sequence[VarianceShare], camera: "Camera", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the share of the variance of each quantity that every source of error causes.
 
     Bars are the worst row of a DOE: dark what a source causes by itself, light with other sources together. Marks are

@@ -1,0 +1,261 @@
+"""`calibrate`: the process errors that explain measured PSFs."""
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.build import with_edge_moves
+from doedesign.calibration.fit import Fit, search
+from doedesign.calibration.forward_model import ForwardModel, probe_camera
+from doedesign.calibration.measurement import Measurement, read_measurement
+from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.target import likeness, target_of
+from doedesign.calibration.uncertainty import (
+    DETERMINED,
+    EXPLAINED,
+    LeftOut,
+    Posterior,
+    Reading,
+    cost_rises,
+    left_out,
+    posterior_of,
+    readings,
+)
+from doedesign.calibration.unknowns import Unknowns, relative, unknowns_of
+from doedesign.design.design import Design
+from doedesign.report.labels import error_label, value_text
+from doedesign.runs.folder import Run
+from doedesign.runs.level_maps import open_design
+from doedesign.runs.results import results_folder
+from doedesign.runtime.progress import meter
+from fab.figure import html_of
+from fab.process import Normal, Process
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+log = logging.getLogger("doedesign")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A finished calibration.
+
+    Attributes:
+        objective: images and model.
+        fit: where the search ended.
+        posterior: values of the errors and their uncertainty.
+        process: the process with what is now known: means are the estimates, standard deviations their uncertainty.
+        left_out: every image predicted from the others; empty for a single image.
+        readings: what a lab reads off the images, measured and predicted.
+        rises: how much the cost rises where it should rise by one.
+        measurement: the images as they were read.
+        remarks: what a user must know before relying on any of it, in sentences.
+    """
+
+    objective: FitObjective
+    fit: Fit
+    posterior: Posterior
+    process: Process
+    left_out: list[LeftOut]
+    readings: list[Reading]
+    rises: list[float]
+    measurement: Measurement
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def explained(self) -> bool:
+        """Whether the model explains the images to their noise."""
+        return self.posterior.chi2_per_pixel <= EXPLAINED
+
+    @property
+    def determined(self) -> dict[str, bool]:
+        """Whether the images, and not the prior, say what an error is, by its name."""
+        return dict(zip(self.objective.unknowns.names, (self.posterior.ratio < DETERMINED).tolist(), strict=True))
+
+    @property
+    def estimates(self) -> dict[str, str]:
+        """Every error in words, with its standard deviation: "-120 ± 4 nm"."""
+        values = zip(self.objective.unknowns.names, self.posterior.values, self.posterior.sigma, strict=True)
+        return {name: value_text(name, float(value), float(sigma)) for name, value, sigma in values}
+
+    def __str__(self) -> str:
+        """What was found, a line per error."""
+        labels = {error_label(name): name for name in self.estimates}
+        wide = max(map(len, labels))
+        lines = [f"{self.posterior.chi2_per_pixel:.4g} chi2 per pixel after {self.fit.models} plates"]
+        for label, name in labels.items():
+            note = "" if self.determined[name] else "  (not determined)"
+            lines.append(f"{label:<{wide}}  {self.estimates[name]}{note}")
+        order = next(r for r in self.readings if r.quantity == "zeroth_order").predicted
+        lines.append(f"zeroth order {100 * order[0]:.3g} ± {100 * order[1]:.2g} %")
+        return "\n".join([*lines, *self.remarks])
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw every measured image beside the model's; see `doedesign.calibration.plots` for other pictures.
+
+        Args:
+            ax: axes whose place the picture takes; a new figure by default.
+        """
+        from doedesign.calibration.plots import plot_fitted_psfs
+
+        return plot_fitted_psfs(self, ax)
+
+    def _repr_html_(self) -> str:
+        rows = {error_label(name): text for name, text in self.estimates.items()}
+        title = f"{self.process.name}: {self.posterior.chi2_per_pixel:.3g} chi2 per pixel"
+        return html_of(title, {**rows, "remarks": " ".join(self.remarks)}, self.plot())
+
+
+def calibrate(
+    design: Design | Run | str | Path,
+    measurement: Measurement | str | Path,
+    errors: Sequence[str] = (),
+    *,
+    process: Process | str | Path | None = None,
+    masks: str | Path | None = None,
+    evaluations: int = 60,
+    polish: int = 0,
+    seed: int = 0,
+    out: str | Path | None = None,
+) -> Calibration:
+    """Find the process errors that explain measured PSFs.
+
+    Args:
+        design: a design, a finished run or its folder.
+        measurement: the images, or the TOML file that names them (`doedesign.calibration.measurement`).
+        errors: which errors to look for, such as "depth", "overlay_x" or "cd_bias[3]"; by default depth and line width
+            common to all masks, and overlay.
+        process: the process, whose means and standard deviations are the prior; the name of a stock process or a TOML
+            file; that of the design's spec by default.
+        masks: mask order of the run; `masks/NAME` if there is one.
+        evaluations: models of the global search, which begins only where it is needed.
+        polish: steps along the exact gradient at the end.
+        seed: seed of the global search.
+        out: folder for results, the estimate as TOML, and pictures; without one everything stays in memory.
+
+    Raises:
+        InputError: an unknown error, a measurement that does not fit, or a folder that holds something else.
+    """
+    design = open_design(design, masks)
+    prior = design.process(process)
+    unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # mistakes are told before files are read
+    if not isinstance(measurement, Measurement):
+        measurement = read_measurement(Path(measurement), design.camera)
+    writing = contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder)
+    # Usually seven rounds of derivatives and a step.
+    with writing as fresh, models_meter("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
+        result = _calibrated(design, prior, unknowns, measurement, evaluations, polish, seed, on_model)
+        if fresh is not None:
+            from doedesign.calibration.files import write_calibration
+
+            write_calibration(fresh, design, result, process)
+    log.info(str(result))
+    return result
+
+
+def _calibrated(
+    design: Design,
+    prior: Process,
+    unknowns: Unknowns,
+    measurement: Measurement,
+    evaluations: int,
+    polish: int,
+    seed: int,
+    on_model: Callable[[str], None],
+) -> Calibration:
+    spec, images = measurement.spec, measurement.images
+    fill = design.camera.fill if spec.fill_factor is None else spec.fill_factor
+    camera = probe_camera(design.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
+    model = ForwardModel(design.level_map.level, camera, prior, unknowns, tuple(image.depth_m for image in images))
+    nominal = model.plate(unknowns.start)
+    expected = [nominal.image(i, np.zeros(3)) for i in range(len(images))]
+    each = zip(images, expected, strict=True)
+    objective = FitObjective(model, tuple(target_of(image, measurement.window, like) for image, like in each))
+    fit = search(objective, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model)
+    posterior = posterior_of(objective, fit)
+    result = Calibration(
+        objective,
+        fit,
+        posterior,
+        _estimated(prior, unknowns, posterior, design.edge_moves_m),
+        left_out(objective, fit, posterior) if len(objective.targets) > 1 else [],
+        readings(objective, fit, posterior),
+        cost_rises(objective, fit, posterior),
+        measurement,
+    )
+    return replace(result, remarks=tuple(_remarks(result, expected)))
+
+
+@contextlib.contextmanager
+def models_meter(title: str, likely: int) -> Iterator[Callable[[str], None]]:
+    """A meter for models, of which nobody knows beforehand how many there will be."""
+    done = count(1)
+    with meter(title, likely) as progress:
+        yield lambda words: progress.advance(min(next(done), likely - 1), words)
+
+
+def _estimated(prior: Process, unknowns: Unknowns, posterior: Posterior, edge_moves_m: Sequence[float]) -> Process:
+    found = {
+        name: Normal(float(value), float(sigma))
+        for name, value, sigma in zip(unknowns.names, posterior.values, posterior.sigma, strict=True)
+    }
+    # The others' places are relative to mask 0.
+    references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if relative(name)}
+    still = {name: Normal(prior.spreads.get(name, Normal()).mean, 0.0) for name in references}
+    spreads = MappingProxyType({**prior.spreads, **still, **found})
+    process = replace(prior, spreads=spreads, name=f"{prior.name}, calibrated")
+    # What was found is relative to the design; what the process does, to the masks.
+    return with_edge_moves(process, [-move for move in edge_moves_m])
+
+
+def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> Iterator[str]:
+    posterior, unknowns = result.posterior, result.objective.unknowns
+    if not result.explained:
+        yield (
+            f"The model does not explain the images: chi2 per pixel is {posterior.chi2_per_pixel:.3g} where noise "
+            f"alone gives 1. Standard deviations are {posterior.inflation:.2g} times as wide for it, which covers what "
+            "is random in the misfit and nothing else."
+        )
+        yield from _turned_remarks(result, expected)
+    elif posterior.chi2_per_pixel < 1 / EXPLAINED:
+        yield (
+            f"The images are less noisy than stated: chi2 per pixel is {posterior.chi2_per_pixel:.3g} where noise "
+            "alone gives 1. Check gain and read noise."
+        )
+    open_ones = [name for name, determined in result.determined.items() if not determined]
+    if open_ones:
+        yield f"Not determined by the images, hardly better known than before: {', '.join(open_ones)}."
+    if unknowns.assumed:
+        yield f"The process says nothing of {', '.join(unknowns.assumed)}; wide ranges were assumed."
+    slack = 1e-3 * unknowns.sigma
+    at_end = (posterior.values <= unknowns.low + slack) | (posterior.values >= unknowns.high - slack)
+    if at_end.any():
+        names = [name for name, ends in zip(unknowns.names, at_end, strict=True) if ends]
+        yield f"At the end of the range that was looked at: {', '.join(names)}."
+    if result.rises and not all(0.5 < rise < 2 for rise in result.rises):
+        text = ", ".join(f"{rise:.2g}" for rise in result.rises)
+        yield f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1."
+    if any(relative(name) for name in unknowns.names):
+        yield "Places of masks are relative to mask 0; a common shift cannot be seen."
+
+
+def _turned_remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> Iterator[str]:
+    """Whether the images look more like the model when they are turned or mirrored."""
+    target, model = result.objective.targets[0], expected[0]
+    ways = {
+        (turns, mirrored): likeness(target, model, turns, mirrored) for mirrored in (False, True) for turns in range(4)
+    }
+    turns, mirrored = best = max(ways, key=lambda way: ways[way])
+    if ways[best] >= ways[0, False] + 0.02:
+        way = f"turned left by {turns} more quarter turns" + (" after mirroring them" if mirrored else "")
+        yield f"The images look more like the design when {way}: check quarter_turns and mirrored in the measurement."

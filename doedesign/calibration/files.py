@@ -1,0 +1,112 @@
+"""Files of a calibration and of explanations; `doedesign.runs.results` adds the manifest.
+
+calibration.json        everything that was found
+process-estimate.toml   the estimate, which every command takes as a process
+plate.toml              the errors of this DOE, which `psf --fabricated --variation` reads
+explanations.json/.txt  errors that would give a measured ring:disc ratio
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from doedesign.build import process_spec_of
+from doedesign.calibration.estimate import Calibration
+from doedesign.calibration.explanation_plots import plot_explanations
+from doedesign.calibration.explanations import ExplanationSet
+from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
+from doedesign.design.design import Design
+from doedesign.spec import load_process, process_to_toml, variation_to_toml
+from fab.figure import save
+from fab.files import canonical_json
+from fab.process import Process
+from fab.stock import STOCK
+
+
+def write_calibration(folder: Path, design: Design, result: Calibration, process: Process | str | Path | None) -> None:
+    """Write a calibration; the spec of the process says how far the chrome reaches, which a process does not know."""
+    record = {"run": design.name, "measurement_sha256": result.measurement.digests, **calibration_record(result)}
+    (folder / "calibration.json").write_bytes(canonical_json(record))
+    like = design.spec and design.spec.process
+    if isinstance(process, str | Path) and process not in STOCK:
+        like = load_process(process)
+    comments = _comments(result)
+    estimate = process_to_toml(process_spec_of(result.process, like), comments)
+    (folder / "process-estimate.toml").write_text(estimate, encoding="utf-8")
+    doe = result.objective.unknowns.variation(result.posterior.values)
+    (folder / "plate.toml").write_text(variation_to_toml(doe, comments), encoding="utf-8")
+    save(plot_fitted_psfs(result), folder / "psfs.png")
+    save(plot_estimates(result), folder / "errors.png")
+    save(plot_check(result), folder / "check.png")
+
+
+def _comments(result: Calibration) -> list[str]:
+    """Head of the estimate: where it comes from and how far it may be relied on."""
+    return [
+        "Estimated from measured PSFs by doedesign calibrate.",
+        "Means of the errors below are the estimates for one plate, sigmas how well they are known.",
+        f"{result.posterior.chi2_per_pixel:.4g} chi2 per pixel (noise alone gives 1)",
+        *result.remarks,
+        *(f"{name}: sha256 {digest}" for name, digest in result.measurement.digests.items()),
+    ]
+
+
+def calibration_record(result: Calibration) -> dict[str, Any]:
+    """A calibration as plain values, SI units."""
+    unknowns, posterior, at = result.objective.unknowns, result.posterior, result.fit.at
+    others = {one.name: one for one in result.left_out}
+    images = []
+    for i, target in enumerate(result.objective.targets):
+        motion, found = result.objective.motion(at.scores, i), at.matches[i]
+        row = {
+            "name": target.name,
+            "depth_m": None if math.isinf(target.depth_m) else target.depth_m,
+            "chi2_per_pixel": found.chi2 / max(target.pixels, 1),
+            "pixels": target.pixels,
+            "rate_per_unit_energy": found.gain * target.scale,
+            "background": found.background * target.scale,
+            "shift_px": [float(motion[0]), float(motion[1])],
+            "defocus_per_m": float(motion[2]),
+        }
+        if target.name in others:
+            row["chi2_per_pixel_from_the_others"] = others[target.name].predicted
+        images.append(row)
+    return {
+        "errors": [
+            {
+                "name": name,
+                "value": float(posterior.values[i]),
+                "sigma": float(posterior.sigma[i]),
+                "prior_mean": float(unknowns.mean[i]),
+                "prior_sigma": float(unknowns.sigma[i]),
+                "assumed": name in unknowns.assumed,
+                "determined": result.determined[name],
+            }
+            for i, name in enumerate(unknowns.names)
+        ],
+        "correlation": np.round(posterior.correlation, 6).tolist(),
+        "chi2_per_pixel": posterior.chi2_per_pixel,
+        "inflation": posterior.inflation,
+        "explained": result.explained,
+        "images": images,
+        "readings": [reading._asdict() for reading in result.readings],
+        "rises": result.rises,
+        "models": result.fit.models,
+        "remarks": list(result.remarks),
+    }
+
+
+def write_explanations(folder: Path, design: str, found: ExplanationSet) -> None:
+    """Write explanations as JSON, text and a picture."""
+    record = {
+        **found._asdict(),
+        "targets": found.targets._asdict(),
+        "singles": [each._asdict() for each in found.singles],
+        "pairs": [each._asdict() for each in found.pairs],
+        "curves": {name: curve._asdict() for name, curve in found.curves.items()},
+    }
+    (folder / "explanations.json").write_bytes(canonical_json({"run": design, **record}))
+    (folder / "explanations.txt").write_text(f"{found}\n", encoding="utf-8")
+    save(plot_explanations(found), folder / "explanations.png")

@@ -1,0 +1,277 @@
+"""`tolerance`: the usual questions of a tolerance study, and its result as a value."""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from doedesign.runs.folder import Run
+from doedesign.spec import LimitSpec
+from doedesign.tolerancing.analysis import QUANTITIES, Yield, limit_text, obeys, yield_of
+from doedesign.tolerancing.budget import Budget
+from doedesign.tolerancing.plots import plot_histograms
+from doedesign.tolerancing.pool import Evaluate, predicted_rows
+from doedesign.tolerancing.result_files import forget_results, write_results
+from doedesign.tolerancing.sensitivity import Effect, VarianceShare, as_records, source_shares
+from doedesign.tolerancing.studies import FORMAT, Sample, Study, study
+from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys
+from fab.errors import InputError
+from fab.figure import html_of
+from fab.process import DEVIATIONS, Process, short_name
+from fab.units import format_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+    from doedesign.design.design import Design
+
+log = logging.getLogger("doedesign")
+
+
+class StudyPlan(NamedTuple):
+    """Questions about a process; see `tolerance`."""
+
+    draws: int = 100
+    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time"
+    sobol: int = 64
+    corners: bool = False
+    budget: str | None = None
+    wanted: float = 0.9
+
+    def keys(self, of: Study) -> list[str]:
+        """Every draw that the answers need.
+
+        Raises:
+            InputError: a question that cannot be asked of this study.
+        """
+        if self.draws < 1:
+            raise InputError("draws", "must be at least 1", self.draws, "For example 100.")
+        keys = [NOMINAL, EXPECTED, *normal_keys(self.draws)]
+        if self.sensitivity == "one_at_a_time":
+            keys += one_at_a_time_keys(of.process)
+        if self.sensitivity == "sobol":
+            keys += of.sobol_keys(self.sobol)
+        if self.corners:
+            keys += corner_keys(of.process)
+        if self.budget is not None:
+            keys += [key for some in of.budget_keys(self.budget, self.wanted, self.draws) for key in some]
+        return list(dict.fromkeys(keys))
+
+
+@dataclass(frozen=True)
+class ToleranceResult:
+    """Result of a tolerance study; None where a question was not asked.
+
+    Attributes:
+        study: design, process and evaluated draws, of which more can be asked.
+        plan: the questions.
+        nominal: the DOE exactly as drawn.
+        expected: the one with every error at its mean.
+        sample: the Monte-Carlo draws.
+        effects: effect of every error alone.
+        variance_shares: Sobol indices of every source of error.
+        corners: worst-case corners.
+        budget: how large some errors may be.
+    """
+
+    study: Study
+    plan: StudyPlan
+    nominal: Sample
+    expected: Sample
+    sample: Sample
+    effects: list[Effect] | None
+    variance_shares: list[VarianceShare] | None
+    corners: Sample | None
+    budget: Budget | None
+
+    @property
+    def yield_(self) -> Yield | None:
+        """Share of the Monte-Carlo draws that obey every limit; None without limits."""
+        return self.sample.yield_
+
+    @property
+    def worst(self) -> str:
+        """Key of the worst Monte-Carlo draw, for `study.variation`."""
+        return self.sample.worst
+
+    def statistics(self) -> list[dict[str, Any]]:
+        """Mean, spread and percentiles of every metric; see `doedesign.tolerancing.analysis.statistics`."""
+        return self.sample.statistics()
+
+    @property
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Share of every source in the variance of each metric, the worst row of a draw; empty if not asked."""
+        quantities = self.sample.table.values
+        if self.variance_shares is not None:
+            of = [one for one in self.variance_shares if one.colour is None]
+            return {name: {one.source: one.total.value for one in of if one.quantity == name} for name in quantities}
+        return {name: source_shares(self.effects, name) for name in quantities} if self.effects is not None else {}
+
+    def record(self) -> dict[str, Any]:
+        """Everything that was found as plain values for JSON, SI units; what is not finite is None."""
+        out: dict[str, Any] = {
+            "format": FORMAT,
+            "design": self.study.design.name,
+            "seed": self.study.seed,
+            "plan": self.plan._asdict(),
+            "units": "SI; a depth of null is infinity; a colour of null is the worst colour and depth of each plate",
+            "nominal": self.nominal.rows,
+            "expected": self.expected.rows,
+            "beyond": self.study.beyond(self.plan.keys(self.study)),
+            "plates": self._sample_record(self.sample),
+        }
+        if self.effects is not None:
+            out["one_at_a_time"] = as_records(self.effects)
+        if self.variance_shares is not None:
+            out["sobol"] = as_records(self.variance_shares)
+        if shares := self.shares:
+            out["shares"] = shares
+        if self.corners is not None:
+            out["corners"] = self._sample_record(self.corners)
+        if self.budget is not None:
+            out["budget"] = self.budget.as_record()
+        return plain(out)
+
+    def _sample_record(self, sample: Sample) -> dict[str, Any]:
+        together = sample.yield_
+        each = [{"limit": limit_text(one), **yield_of(obeys(sample.table, one))._asdict()} for one in sample.limits]
+        return {
+            "count": len(sample.table.keys),
+            "statistics": sample.statistics(),
+            "worst": {"key": sample.worst, "rows": self.study.sample([sample.worst]).rows},
+            "yield": None if together is None else {**together._asdict(), "limits": each},
+        }
+
+    def __str__(self) -> str:
+        """What was found, on one line."""
+        quantity, limits = "strehl", self.study.limits
+        words = [f"{self.plan.draws} plates; without limits there is no yield"]
+        if limits:
+            words = [f"yield {self.yield_} of {self.plan.draws} plates"]
+            # The limit that most draws break.
+            quantity = min(limits, key=lambda one: yield_of(obeys(self.sample.table, one)).share).quantity
+        if shares := self.shares.get(quantity):
+            source = max(shares, key=lambda name: shares[name])
+            label = QUANTITIES[quantity].label
+            words.append(f"most important: {source}, {100 * shares[source]:.0f} % of the variance of the {label}")
+        if self.budget is not None:
+            words.append(f"{self.budget}{_sigmas(self.budget)}")
+        if beyond := self.study.beyond(self.plan.keys(self.study)):
+            key, reason = next(iter(beyond.items()))
+            words.append(f"{len(beyond)} plates beyond the model count as bad, such as {key} ({reason})")
+        return "; ".join(words)
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw how every metric is distributed over the draws; see `doedesign.tolerancing.plots` for other pictures.
+
+        Args:
+            ax: axes whose place the picture takes; a new figure by default.
+        """
+        camera, limits = self.study.design.camera, self.study.limits
+        return plot_histograms(self.sample.table, self.nominal.table, camera, limits, ax)
+
+    def _repr_html_(self) -> str:
+        drawn = {row["quantity"]: row for row in self.statistics() if row["colour"] is None}
+        rows: dict[str, object] = {"yield": self.yield_ or "no limits"}
+        for name, row in drawn.items():
+            nominal = float(self.nominal.table.worst(name)[0])
+            told = f"mean {row['mean']:.4g}, 5 to 95 %: {row['p05']:.4g} to {row['p95']:.4g}, as drawn {nominal:.4g}"
+            rows[QUANTITIES[name].label] = told
+        return html_of(f"Tolerance of {self.study.design.name}, {self.plan.draws} draws", rows, self.plot())
+
+
+def tolerance(
+    design: "Design | Run | str | Path",
+    *,
+    process: "Process | str | Path | None" = None,
+    errors: Mapping[str, Any] | None = None,
+    limits: Sequence[str | LimitSpec] | None = None,
+    draws: int = 100,
+    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
+    sobol: int = 64,
+    corners: bool = False,
+    budget: str | None = None,
+    wanted: float = 0.9,
+    seed: int = 0,
+    masks: str | Path | None = None,
+    out: str | Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    evaluate: Evaluate = predicted_rows,
+) -> ToleranceResult:
+    """Study what the errors of a process make of a design: yield, which errors matter, and how large they may be.
+
+    Args:
+        design: a design, a finished run or its folder.
+        process: a process, the name of a stock process ("contact_aligner") or a TOML file; that of the design's spec
+            by default.
+        errors: errors to be changed, `{"overlay_x": "0.5 um"}` or, in SI units, `{"overlay_x_m": 0.5e-6}`.
+        limits: what a good DOE obeys, such as "strehl >= 0.6"; the limits of the design's spec by default.
+        draws: Monte-Carlo draws; also the draws per point of the budget.
+        sensitivity: which errors matter: each alone, as Sobol indices (shares of variance), or not at all.
+        sobol: rows of the samples behind Sobol indices, a power of two; each costs sources + 2 draws.
+        corners: whether worst-case corners are looked at, too.
+        budget: errors for which the largest sigma is sought, such as "overlay", "overlay_x" or "overlay_x[3]".
+        wanted: yield that the budget is for, 0-1.
+        seed: seed of every draw.
+        masks: mask order of the run; `masks/NAME` if there is one.
+        out: folder for draws, results and pictures, in which a stopped study goes on where it was stopped, and one that
+            asks for more takes the finished draws over; without one everything stays in memory.
+        workers: worker processes; see `study`.
+        scheduler: address of a Dask scheduler whose workers are taken instead.
+        evaluate: what is asked of every draw; see `study`.
+
+    Raises:
+        InputError: something that cannot be used; see `study`.
+    """
+    settings: dict[str, Any] = {"process": process, "errors": errors, "limits": limits, "seed": seed, "masks": masks}
+    where: dict[str, Any] = {"out": out, "workers": workers, "scheduler": scheduler, "evaluate": evaluate}
+    asked = study(design, **settings, **where)
+    plan = StudyPlan(draws, sensitivity, sobol, corners, budget, wanted)
+    keys = plan.keys(asked)  # mistakes in the plan are told before anything is computed
+    with asked.journal.open():
+        asked.sample(keys)  # all at once, so that no worker waits between two questions
+        result = ToleranceResult(
+            asked,
+            plan,
+            asked.sample([NOMINAL]),
+            asked.sample([EXPECTED]),
+            asked.monte_carlo(draws),
+            asked.one_at_a_time() if sensitivity == "one_at_a_time" else None,
+            asked.sobol(sobol) if sensitivity == "sobol" else None,
+            asked.corners() if corners else None,
+            asked.budget(budget, wanted, draws) if budget is not None else None,
+        )
+        if out is not None:
+            forget_results(Path(out))
+            write_results(Path(out), result, keys)
+    log.info(str(result))
+    return result
+
+
+def plain(value: Any) -> Any:
+    """Plain values for JSON: what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _sigmas(budget: Budget) -> str:
+    """The standard deviations of a budget: ": sigma of overlay_x 0.31 um"."""
+    if budget.verdict == "out of reach":
+        return ""
+    named: dict[str, set[float]] = {}
+    for name, sigma in budget.sigmas.items():
+        named.setdefault(name.partition("[")[0], set()).add(sigma)
+    alike = {key: of.pop() for key, of in named.items() if len(of) == 1}
+    return "".join(f", sigma of {short_name(key)} {_sigma_text(key, sigma)}" for key, sigma in alike.items())
+
+
+def _sigma_text(key: str, sigma: float) -> str:
+    rounded, unit = float(f"{sigma:.3g}"), DEVIATIONS[key].unit
+    return format_length(rounded) if unit == "m" else f"{rounded:g}{' rad' if unit == 'rad' else ''}"
