@@ -18,5 +18,7 @@ from .spec import load_spec as load_spec
 from .tolerancing.results import ToleranceResult as ToleranceResult
 from .tolerancing.results import tolerance as tolerance
 from .tolerancing.studies import study as study
+from .training.finetune import finetune as finetune
+from .training.train import train as train
 
 __version__: str

@@ -34,7 +34,7 @@ from doedesign.capture.images import PICTURE_FILES, Pictures, picture_files, sam
 from doedesign.capture.scenes import NamedScene, SceneData
 from doedesign.capture.simulate import inner, photograph
 from doedesign.cli import exit_code
-from doedesign.commands.train import TrainingSettings, train
+from doedesign.commands.train import train
 from doedesign.optimization import optimize
 from doedesign.recon.model import Model
 from doedesign.runtime.progress import meter
@@ -149,8 +149,9 @@ def trained(plan: Plan, design: Path, model: str, camera: str, seed: int) -> dic
     """Train one network, and return how it is judged."""
     images, test, licence = source_of(plan)
     settings = [f"train.validation={len(picture_files(test))}", f'train.camera="{camera}"', f"train.seed={seed}"]
-    request = TrainingSettings(images, test, (*settings, *plan.overrides), licence=licence, occlusion=model)
-    folder = train(design, plan.out / f"{model}_{camera}_{seed}", request, say)
+    how: Any = {"validation": test, "licence": licence, "occlusion": model}
+    out = plan.out / f"{model}_{camera}_{seed}"
+    folder = train(design, images, out, overrides=(*settings, *plan.overrides), **how)
     return json.loads((folder / "metrics.json").read_text())
 
 
@@ -173,7 +174,7 @@ def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[
             (name, scene), key = data.item(number), jax.random.key(number)
             turns = {"own": (scene, own), "reflect": (inner(scene, own.margin_px), replace(own, border="reflect"))}
             for border, (seen, by) in turns.items():
-                shot = photograph(NamedScene(name, seen), by, *psfs, key)
+                shot = photograph(NamedScene(name, seen), by, psfs[0], psfs[1], key)
                 for camera, light in zip(CAMERAS, (shot.doe, shot.conventional), strict=True):
                     bank, depths = models[camera].bank, (shot.depth_far_m, shot.depth_near_m)
                     network = see_through.restored(models[camera], light, *(bank.at(depth) for depth in depths))

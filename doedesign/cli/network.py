@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from doedesign.cli.console import print_paths, say
+from doedesign.cli.console import print_paths
 from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
 
@@ -66,14 +66,12 @@ def train(
         hosts: Number of hosts; each runs this command, and all see the same folders.
         host: Number of this host, from 0.
     """
-    from doedesign.commands.train import TrainingSettings
     from doedesign.commands.train import train as work
 
-    several = coordinator, hosts, host
-    request = TrainingSettings(
-        images, validation, set_, lpips_weights, licence, tensorboard, devices, occlusion, obstruction, *several
-    )
-    folder = work(run, out, request, say)
+    several: Any = {"devices": devices, "coordinator": coordinator, "hosts": hosts, "host": host}
+    how: Any = {"occlusion": occlusion, "obstruction": obstruction, "licence": licence, "tensorboard": tensorboard}
+    how |= {"validation": validation, "lpips_weights": lpips_weights, "overrides": set_, **several}
+    folder = work(run, images, out, **how)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -112,13 +110,11 @@ def finetune(
         linear: Whether PNG and TIFF hold linear light; by default those of 8 and 16 bits hold display values.
         mirror: Exchange left and right at random, of captures and PSFs.
     """
-    from doedesign.commands.finetune import FinetuneSettings
     from doedesign.commands.finetune import finetune as work
 
-    choice = _psf_choice(psf, pixel, near_depth, far_depth)
-    others: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation}
-    others |= {"size": size, "lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
-    folder = work(run, pairs, out, FinetuneSettings(**choice, **others), say)
+    how: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation, "size": size}
+    how |= {"lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
+    folder = work(run, pairs, out, **_psf_choice(psf, pixel, near_depth, far_depth), **how)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 

@@ -1,11 +1,24 @@
-"""One step of fine-tuning: a trained network, real pairs, and the PSFs of the camera that took them (paper §4).
+"""Fine-tuning: a trained network on real captures, each with a picture of what was to be seen (paper §4).
 
 The loss is that of training (eq. 13); its masked term counts where a mask is known. The optics is glass by now, so the
-network alone moves. A step is a pure function of the state and the batch.
+network alone moves. Batch, size of crops, weights of the loss and precision are those of the model's own training,
+where a spec lies beside it. The step size falls along a cosine to a tenth.
+
+A folder of a fine-tuning (`doedesign.training.job`) is a model. It has besides
+
+    pairs.json          names of all pairs, trained on and held out
+    network.npz         the network (`doedesign.recon.weights`)
+    psf.exr             the PSFs that it was given
+    metrics.json        scores on held-out pairs, and those before
 """
 
-from collections.abc import Callable
+import logging
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,14 +28,247 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from doedesign.recon.model import PsfPair
+from doedesign import __version__
+from doedesign.capture.scenes import Batch
+from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.network import Network
+from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.runtime.compiling import compiled_step
+from doedesign.runtime.stopping import stoppable
+from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
-from doedesign.training.crops import PairBatch
+from doedesign.training.evaluation import EvaluationResult, judge
+from doedesign.training.job import TrainingJob, perceptual_distance, run_job
 from doedesign.training.joint import TrainingRecord, rates_at
 from doedesign.training.loss import TERMS, Weights, losses
+from doedesign.training.pairs import PairData, Pairs, crop_shape, cut, find_pairs, pairs_digest, split_pairs
+from doedesign.training.perceptual import Lpips
+from doedesign.training.validation import ValidationSample
 from fab.errors import InputError
+from fab.files import canonical_json, sha256_bytes, write_atomic
+from sim.light import srgb_from_linear
+from sim.store import write_bank
+
+FORMAT = "doedesign fine-tuning 1"
+
+STEPS = 2000
+_OPTIONS = ("steps", "batch", "learning_rate", "seed", "l1", "perceptual", "masked", "precision", "checkpointing")
+_log = logging.getLogger("doedesign")
+
+
+def finetune(
+    model: Model,
+    pairs: str | Path,
+    out: str | Path | None = None,
+    *,
+    psfs: PsfPair | None = None,
+    steps: int = STEPS,
+    learning_rate: float | None = None,
+    seed: int = 0,
+    validation: int | None = None,
+    size: int | None = None,
+    lpips_weights: Sequence[Path] = (),
+    linear: bool | None = None,
+    mirrored: bool = True,
+) -> Model:
+    """Fine-tune a model on real pairs.
+
+    Args:
+        model: the model.
+        pairs: folder of pairs (`doedesign.training.pairs`).
+        out: folder, in which a stopped fine-tuning goes on where it was stopped; a temporary one, which is removed, if
+            None.
+        psfs: PSFs to give to the network; the model's own if None (`Model.psfs`).
+        steps: steps.
+        learning_rate: Adam's first step size; a tenth of that of the model's training if None.
+        seed: seed of everything random.
+        validation: pairs that are never trained on; a fifth, and at most eight, if None.
+        size: pixels per side of a crop; those of the model's training if None, and at most what every pair has.
+        lpips_weights: files with the weights of LPIPS; multi-scale SSIM stands in for it without them.
+        linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
+        mirrored: exchange left and right at random, of captures and PSFs.
+
+    Returns:
+        the fine-tuned model.
+
+    Raises:
+        InputError: a pair or number that cannot be used, a folder that belongs to something else, or a loss that is no
+            longer finite.
+        KeyboardInterrupt: it was stopped; the same call goes on from there.
+    """
+    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
+    with stoppable() as stop, place as folder:
+        options = _options(model, steps, learning_rate, seed)
+        chosen = psfs or model.psfs()
+        run_job(
+            FineTuning.prepare(model, chosen, Path(pairs), options, validation, size, lpips_weights, linear, mirrored),
+            Path(folder),
+            stop,
+        )
+        model = Model.open(folder)
+    return replace(model, folder=None) if out is None else model
+
+
+def _options(model: Model, steps: int, learning_rate: float | None, seed: int) -> TrainSpec:
+    """How the model was trained, with what is asked for now.
+
+    Raises:
+        InputError: a number out of range.
+    """
+    path = None if model.folder is None else model.folder / "spec.toml"
+    before = load_spec(path).train if path is not None and path.is_file() else TrainSpec()
+    rate = before.learning_rate / 10 if learning_rate is None else learning_rate
+    for name, fits, rule, value in (
+        ("steps", 0 <= steps <= 10_000_000, "must be from 0 to 10 million", steps),
+        ("learning_rate", 0 < rate < np.inf, "must be positive", rate),
+        ("seed", 0 <= seed < 2**32, "must be from 0 to 2^32 - 1", seed),
+    ):
+        if not fits:
+            raise InputError(name, rule, value, "Correct it, or leave it out.")
+    asked = {"steps": steps, "learning_rate": rate, "seed": seed}
+    return before.model_copy(update={"freeze": "optics", "schedule": "cosine", **asked})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FineTuning(TrainingJob):
+    """A training on real pairs.
+
+    Attributes:
+        model: what to begin with.
+        psfs: PSFs of the camera.
+        tuner: what a step does.
+        data: crops to train on.
+        held_out: pairs to judge by.
+        lpips: weights of LPIPS, if at hand.
+        pairs: names of the pairs.
+    """
+
+    model: Model
+    psfs: PsfPair
+    tuner: "Tuner"
+    data: PairData
+    held_out: Pairs
+    lpips: Lpips | None
+    pairs: Mapping[str, Any]
+
+    @classmethod
+    def prepare(
+        cls,
+        model: Model,
+        psfs: PsfPair,
+        folder: Path,
+        options: TrainSpec,
+        validation: int | None,
+        size: int | None,
+        lpips_weights: Sequence[Path],
+        linear: bool | None,
+        mirrored: bool,
+    ) -> "FineTuning":
+        """Prepare a fine-tuning; see `finetune`."""
+        split = split_pairs(find_pairs(folder), validation, options.seed, str(folder))
+        if split.left_out:
+            count = len(split.left_out)
+            _log.warning("%d pairs show what is held out under another name and are left out", count)
+        training, held_out = (Pairs(files, model, linear) for files in split[:2])
+        _log.info("reading %d pairs to train on and %d to judge by", len(training), len(held_out))
+        least = np.minimum(training.least_size(), held_out.least_size())
+        wanted = options.size if size is None else size
+        shape = crop_shape((int(least[0]), int(least[1])), wanted, model.network.layout.multiple, str(folder))
+        lpips, perceptual = perceptual_distance(options, min(shape), f"{folder}: size of crops", lpips_weights)
+        settings = {
+            "format": FORMAT,
+            "model_sha256": dict(model.digests),
+            "psfs_sha256": sha256_bytes(psfs.far.tobytes() + psfs.near.tobytes()),
+            "near_m": psfs.near_m,
+            "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
+            "pairs_sha256": pairs_digest(split.training),
+            "held_out_sha256": pairs_digest(split.held_out),
+            "crop_px": list(shape),
+            "mirrored": mirrored,
+            "linear": linear,
+            "options": {name: getattr(options, name) for name in _OPTIONS},
+            "perceptual": "none" if perceptual is None else perceptual.name,
+            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
+            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
+        }
+        names: dict[str, Any] = {name: [pair.name for pair in pairs] for name, pairs in split._asdict().items()}
+        names["with_mask"] = [pair.name for pairs in split[:2] for pair in pairs if pair.mask is not None]
+        return cls(
+            name="fine-tuning",
+            title=str(model.about.get("run", "model" if model.folder is None else model.folder.name)),
+            options=options,
+            settings=settings,
+            inputs={"pairs.json": canonical_json(names)},
+            differs="one with another model, PSFs, settings or pairs",
+            validates_first=True,
+            model=model,
+            psfs=psfs,
+            tuner=Tuner.of(psfs, options, perceptual),
+            data=PairData(training, shape, options.seed, options.batch, mirrored),
+            held_out=held_out,
+            lpips=lpips,
+            pairs=names,
+        )
+
+    def initial(self) -> "FinetuneState":
+        """The state before the first step."""
+        return self.tuner.initial(self.model.network)
+
+    def batches(self, start: int, stop: int) -> AbstractContextManager[Iterator[Batch]]:
+        """Crops from step `start` to step `stop`."""
+        return self.data.batches(start, stop)
+
+    def step(self, state: "FinetuneState", batch: Batch) -> tuple["FinetuneState", dict[str, Any]]:
+        """Take one step."""
+        rate = self.tuner.rate(state.step)
+        state, record = self.tuner.step(state, batch)
+        return state, {**record._asdict(), "learning_rates": {"network": rate}}
+
+    def evaluate(self, state: "FinetuneState") -> EvaluationResult:
+        """Judge a state by the middle of the held-out pairs."""
+
+        def samples() -> Iterator[ValidationSample]:
+            for k, files in enumerate(self.held_out.files):
+                pair = cut(self.held_out.get(k), self.data.shape)
+                pictures = {
+                    "capture": srgb_from_linear(pair.capture),
+                    "reconstruction": self.tuner.reconstruct(state, pair.capture),
+                }
+                clipped = {name: np.clip(picture, 0, 1) for name, picture in pictures.items()}
+                yield ValidationSample(files.name, clipped, np.clip(pair.reference, 0, 1), pair.mask)
+
+        def to_rgb(image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "3 y x"]:
+            picture = self.model.rgb(image)
+            return np.repeat(picture, 3, axis=0) if len(picture) == 1 else picture
+
+        return judge(samples(), self.lpips, to_rgb)
+
+    def caption(self, state: "FinetuneState") -> tuple[str, str]:
+        """Title and words for a picture of validation."""
+        words = "middle of real pairs never trained on; PSNR"
+        if any(pair.mask is not None for pair in self.held_out.files):
+            words += ", and in brackets where it is covered"
+        return f"{self.title}, fine-tuned by {state.step} steps", words
+
+    def write_results(self, folder: Path, state: "FinetuneState") -> list[str]:
+        """Write network, PSFs and scores."""
+        before, after = (self.evaluate(each) for each in (self.initial(), state))
+        metrics = {**after.means, "before": before.means["reconstruction"], "scenes": after.scenes}
+        write_atomic(folder / "metrics.json", canonical_json(metrics))
+        write_bank(folder / BANK_NAME, self.psfs.bank)
+        about = {
+            "colours": list(self.model.colours),
+            "wavelengths_m": list(self.model.wavelengths_m),
+            "pixel_m": self.model.pixel_m,
+            # At these depths it is given the PSFs that it was tuned with.
+            "near_m": [self.psfs.near_m],
+            "far_m": None if self.psfs.far_m == max(self.psfs.bank.depths_m) else self.psfs.far_m,
+            "run": self.title,
+            "finetuned": {**self.settings, "pairs": self.pairs, "version": __version__},
+            "before": dict(self.model.about),
+        }
+        write_network(folder / NETWORK_NAME, state.network, about)
+        return [NETWORK_NAME, BANK_NAME, "metrics.json"]
 
 
 class FinetuneState(NamedTuple):
@@ -73,7 +319,7 @@ class Tuner(eqx.Module):
         """Step size of Adam."""
         return rates_at(self.options, step).network
 
-    def step(self, state: FinetuneState, batch: PairBatch) -> tuple[FinetuneState, TrainingRecord]:
+    def step(self, state: FinetuneState, batch: Batch) -> tuple[FinetuneState, TrainingRecord]:
         """Take one step.
 
         Args:
@@ -83,22 +329,24 @@ class Tuner(eqx.Module):
         Raises:
             InputError: the loss is no longer finite.
         """
-        given = Given(*(jnp.asarray(each) for each in batch[:4]))
+        images = (jnp.asarray(np.stack(each)) for each in zip(*(item.pair for item in batch.items), strict=True))
+        capture, reference, mask = images
+        given = Given(capture, reference, mask, jnp.asarray([item.mirrored for item in batch.items]))
         constants = self, given, jnp.float32(self.rate(state.step))
         (network, moments), loss, terms = _update()(constants, (state.network, state.moments))
         record = TrainingRecord(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
         if not np.isfinite(record.loss):
-            rule, cure = "the loss must stay finite", "Lower --learning-rate."
+            rule, cure = "the loss must stay finite", "Lower the learning rate."
             raise InputError(f"finetune, step {state.step}", rule, record.loss, cure)
         return FinetuneState(state.step + 1, network, moments), record
 
     def reconstruct(self, state: FinetuneState, capture: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "c y x"]:
         """One capture through the network, in display values."""
-        return np.asarray(_look(state.network, self.far[None], self.near[None], jnp.asarray(capture)[None]))[0]
+        return np.asarray(_reconstructed(state.network, self.far[None], self.near[None], jnp.asarray(capture)[None]))[0]
 
 
 def mirrored_as(psf: Float[Array, "c ky kx"], mirrored: Bool[Array, " b"]) -> Float[Array, "b c ky kx"]:
-    """The PSFs of every item: those of the mirrored plate where left and right are exchanged."""
+    """The PSFs of every item: those of the mirrored DOE where left and right are exchanged."""
     return jnp.where(mirrored[:, None, None, None], psf[None, ..., ::-1], psf[None])
 
 
@@ -130,8 +378,8 @@ Learnt = tuple[Network, optax.OptState]
 def _take(constants: tuple[Tuner, Given, Array], learnt: Learnt) -> tuple[Learnt, Array, Array]:
     """One step in arrays."""
     (tuner, given, rate), (network, moments) = constants, learnt
-    (loss, terms), slopes = eqx.filter_value_and_grad(_loss, has_aux=True)(network, tuner, given)
-    direction, moments = optax.scale_by_adam().update(slopes, moments)
+    (loss, terms), gradient = eqx.filter_value_and_grad(_loss, has_aux=True)(network, tuner, given)
+    direction, moments = optax.scale_by_adam().update(gradient, moments)
     moved = eqx.apply_updates(network, jax.tree.map(lambda d: -rate * d, direction))
     return (moved, moments), loss, terms
 
@@ -143,5 +391,5 @@ def _update() -> Callable[[tuple[Tuner, Given, Array], Learnt], Any]:
 
 
 @eqx.filter_jit
-def _look(network: Network, far: Array, near: Array, capture: Array) -> Array:
+def _reconstructed(network: Network, far: Array, near: Array, capture: Array) -> Array:
     return network(capture, far, near)

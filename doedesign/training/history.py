@@ -124,7 +124,7 @@ def require_tensorboard() -> None:
     """
     if find_spec("tensorboardX") is None:
         cure = f"Run: pip install tensorboardX. Or leave the option out; {HISTORY_NAME} holds the same numbers."
-        raise InputError("--tensorboard", "needs the package tensorboardX", "none", cure)
+        raise InputError("tensorboard", "needs the package tensorboardX", "none", cure)
 
 
 @contextlib.contextmanager

@@ -42,14 +42,14 @@ def join_hosts(coordinator: str | None, hosts: int | None = None, host: int | No
         InputError: an option is missing or out of range, the cluster says nothing, or the others do not come.
     """
     if coordinator is None:
-        for name, value in (("--hosts", hosts), ("--host", host)):
+        for name, value in (("hosts", hosts), ("host", host)):
             if value is not None:
-                raise InputError(name, "must be given with --coordinator", value, "Add --coordinator HOST:PORT.")
+                raise InputError(name, "must be given with a coordinator", value, "Add its address, HOST:PORT.")
         return
     if coordinator == AUTO:
-        for name, value in (("--hosts", hosts), ("--host", host)):
+        for name, value in (("hosts", hosts), ("host", host)):
             if value is not None:
-                raise InputError(name, "must be left out with --coordinator auto", value, "The cluster says it.")
+                raise InputError(name, "must be left out with the coordinator auto", value, "The cluster says it.")
     else:
         _require_numbers(coordinator, hosts, host)
         if host:
@@ -63,8 +63,8 @@ def join_hosts(coordinator: str | None, hosts: int | None = None, host: int | No
 
 
 def _not_found(coordinator: str, wait_s: float, got: str) -> InputError:
-    cure = "Start every host with the same --coordinator and --hosts, and look whether the port is open."
-    return InputError(f"--coordinator {coordinator}", f"all hosts must find each other within {wait_s} s", got, cure)
+    cure = "Start every host with the same coordinator and number of hosts, and look whether the port is open."
+    return InputError(f"coordinator {coordinator}", f"all hosts must find each other within {wait_s} s", got, cure)
 
 
 def _require_listening(coordinator: str, wait_s: float) -> None:
@@ -86,13 +86,13 @@ def _require_numbers(coordinator: str, hosts: int | None, host: int | None) -> N
     name, _, port = coordinator.rpartition(":")
     if not name or not port.isdigit() or not 0 < int(port) < 65536:
         cure = "Give the address of host 0 and a free port of it, such as 10.0.0.1:1234."
-        raise InputError("--coordinator", 'must be HOST:PORT or "auto"', f'"{coordinator}"', cure)
+        raise InputError("coordinator", 'must be HOST:PORT or "auto"', f'"{coordinator}"', cure)
     if hosts is None or hosts < 1:
         got = "nothing" if hosts is None else hosts
-        raise InputError("--hosts", "must be the number of hosts, 1 or more", got, "Give --hosts N.")
+        raise InputError("hosts", "must be the number of hosts, 1 or more", got, "Give it.")
     if host is None or not 0 <= host < hosts:
         got = "nothing" if host is None else host
-        raise InputError("--host", f"must lie from 0 to {hosts - 1}", got, "Give every host its own number.")
+        raise InputError("host", f"must lie from 0 to {hosts - 1}", got, "Give every host its own number.")
 
 
 def gathered(value: int) -> list[int]:

@@ -309,7 +309,7 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
     wanted = len(devices) if count is None else count
     if not 1 <= wanted <= len(devices):
         rule = f"must lie from 1 to the {len(devices)} that there are"
-        raise InputError("--devices", rule, wanted, "Leave it out to take all.")
+        raise InputError("devices", rule, wanted, "Leave it out to take all.")
     return None if wanted == 1 else Mesh(np.array(devices[:wanted]), (AXIS,))
 
 

@@ -1,6 +1,6 @@
-"""Real pairs for fine-tuning: captures through a plate, and what was to be seen.
+"""Real pairs for fine-tuning: captures through a DOE, and what was to be seen; found, split, read, and cut into crops.
 
-    DIR/NAME_capture.png     DIR/capture/NAME.png       through the plate and the obstruction
+    DIR/NAME_capture.png     DIR/capture/NAME.png       through the DOE and the obstruction
     DIR/NAME_reference.png   DIR/reference/NAME.png     the same frame without either, pixel for pixel
     DIR/NAME_mask.png        DIR/mask/NAME.png          where it was covered, white for wholly; where it is known
 
@@ -8,15 +8,24 @@ Either way of naming, any kind of file that `doedesign.recon.photos` reads. Pair
 
 Pairs that are never trained on are the last in an order shuffled by the seed. Whatever has the capture or the reference
 of one of them under another name is not trained on either: the same view behind other dirt is the same view.
+
+Crop i of epoch e is a pure function of the seed, e and i, as scenes are (`doedesign.capture.scenes`): its place, and
+whether it is exchanged left and right. **A mirrored capture was seen through a mirrored DOE**, so whoever takes such a
+crop has to mirror the PSFs, too. They have odd windows, so that is exact.
 """
 
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.capture.scenes import Batch, batches_ahead, epoch_order
 from doedesign.recon.model import Model
 from doedesign.recon.photos import PHOTO_FILES, read_capture
 from fab.errors import InputError
@@ -25,6 +34,9 @@ from sim.light import srgb_from_linear
 
 _PARTS = ("capture", "reference", "mask")
 _ORDER = 2  # apart from the epochs' orders
+_LEAST_PX = 16
+_MOST_BYTES = 2 << 30  # of pictures that are kept
+_THREADS, _AHEAD = 4, 8
 
 
 class PairFiles(NamedTuple):
@@ -127,7 +139,7 @@ def split_pairs(pairs: Sequence[PairFiles], count: int | None, seed: int, where:
     if not 1 <= count < len(pairs):
         rule = f"must be from 1 to {len(pairs) - 1}, fewer than the pairs in {where}"
         cure = "Give more pairs, or hold out fewer."
-        raise InputError("--validation", rule, count, cure)
+        raise InputError("validation", rule, count, cure)
     order = np.random.default_rng((seed, _ORDER)).permutation(len(pairs))[-count:]
     chosen = {int(k) for k in order}
     seen = {digest for k in chosen for digest in _digests(pairs[k])[:2]}
@@ -178,3 +190,132 @@ def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Cap
 
 def _size(image: np.ndarray) -> str:
     return f"{image.shape[-1]} x {image.shape[-2]}"
+
+
+class Pairs:
+    """Pairs by their number; those that are read first are kept, as long as there is room.
+
+    Attributes:
+        files: their files.
+    """
+
+    def __init__(
+        self, files: Sequence[PairFiles], model: Model, linear: bool | None = None, most_bytes: int = _MOST_BYTES
+    ) -> None:
+        self.files = tuple(files)
+        self._model, self._linear = model, linear
+        self._kept: dict[int, CapturePair] = {}
+        self._room, self._lock = most_bytes, threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def get(self, index: int) -> CapturePair:
+        """One pair.
+
+        Raises:
+            InputError: see `read_pair`.
+        """
+        with self._lock:
+            if index in self._kept:
+                return self._kept[index]
+        pair = read_pair(self.files[index], self._model, self._linear)
+        size = sum(image.nbytes for image in pair)
+        with self._lock:
+            if index not in self._kept and size <= self._room:
+                self._kept[index] = pair
+                self._room -= size
+        return pair
+
+    def least_size(self) -> tuple[int, int]:
+        """Rows and columns that every pair has; all are read for it, and refused if they cannot be used.
+
+        Raises:
+            InputError: see `read_pair`.
+        """
+        with ThreadPoolExecutor(_THREADS) as pool:
+            sizes = list(pool.map(lambda k: self.get(k).capture.shape[1:], range(len(self))))
+        return min(y for y, _ in sizes), min(x for _, x in sizes)
+
+
+class PairCrop(NamedTuple):
+    """A crop of a pair.
+
+    Attributes:
+        name: of the pair.
+        pair: the crop.
+        mirrored: whether left and right are exchanged.
+    """
+
+    name: str
+    pair: CapturePair
+    mirrored: bool
+
+
+@dataclass(frozen=True)
+class PairData:
+    """A stream of batches of crops. An epoch shows every pair once.
+
+    Attributes:
+        pairs: the pairs.
+        shape: pixels (y, x) of a crop.
+        seed: seed of everything.
+        batch: crops per batch.
+        mirrored: whether left and right are exchanged at random.
+    """
+
+    pairs: Pairs
+    shape: tuple[int, int]
+    seed: int
+    batch: int
+    mirrored: bool = True
+
+    def item(self, number: int) -> PairCrop:
+        """Make one crop; every epoch has as many as there are pairs."""
+        epoch, index = divmod(number, len(self.pairs))
+        chosen = int(epoch_order(self.seed, epoch, len(self.pairs))[index])
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch, index)))
+        place, mirror = (float(rng.uniform()), float(rng.uniform())), bool(rng.integers(2)) and self.mirrored
+        crop = cut(self.pairs.get(chosen), self.shape, place)
+        if mirror:
+            crop = CapturePair(*(image[..., ::-1] for image in crop))
+        return PairCrop(self.pairs.files[chosen].name, crop, mirror)
+
+    def batches(self, start: int, stop: int) -> AbstractContextManager[Iterator[Batch]]:
+        """Open the stream, from batch number `start` to the one before `stop`; some are prepared ahead."""
+        return batches_ahead(self.item, self.batch, start, stop, _THREADS, _AHEAD)
+
+
+def cut(pair: CapturePair, shape: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)) -> CapturePair:
+    """The same crop of everything in a pair.
+
+    Args:
+        pair: the pair.
+        shape: pixels (y, x) of the crop.
+        place: where it lies, from 0 (lowest) to 1.
+    """
+    spare = [have - want for have, want in zip(pair.mask.shape, shape, strict=True)]
+    y, x = (min(int(share * (most + 1)), most) for share, most in zip(place, spare, strict=True))
+    return CapturePair(*(image[..., y : y + shape[0], x : x + shape[1]] for image in pair))
+
+
+def crop_shape(least: tuple[int, int], size: int, multiple: int, where: str) -> tuple[int, int]:
+    """Pixels (y, x) of crops: `size`, or the most that every pair has.
+
+    Args:
+        least: rows and columns that every pair has.
+        size: pixels per side that are wanted.
+        multiple: what both have to be multiples of (`NetworkShape.multiple`).
+        where: the folder, for messages.
+
+    Raises:
+        InputError: a pair that is too small.
+    """
+    y, x = (min(size, side) // multiple * multiple for side in least)
+    # At the coarsest scale a border is reflected, which takes two pixels.
+    needed = max(_LEAST_PX, 2 * multiple)
+    if min(y, x) < needed:
+        got = f"{least[1]} x {least[0]}" if min(least) < needed else f"crops of {size}"
+        rule = f"pairs and crops must have at least {needed} x {needed} pixels for this network"
+        raise InputError(where, rule, got, "Give larger pictures, or a larger `size`.")
+    return y, x

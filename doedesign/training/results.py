@@ -17,12 +17,12 @@ from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
 from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
-from doedesign.runs.folder import CONTINUOUS, Run
-from doedesign.runs.level_maps import open_design, read_any_height, write_design
+from doedesign.runs.level_maps import write_design
 from doedesign.training.evaluation import EvaluationResult, judge
 from doedesign.training.joint import JointState, Trainer, resting_doe
 from doedesign.training.perceptual import Lpips
 from doedesign.training.validation import looks
+from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
 from fab.level_map import LevelMap
 from sim.camera import Camera
@@ -94,19 +94,22 @@ def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -
     }
 
 
-def height_at_rest_m(run: Run, camera: Camera) -> Float[np.ndarray, "y x"]:
-    """The plate that a run draws, or a flat one where the spec wants a conventional camera."""
-    if run.spec.train.camera == "conventional":
-        return np.zeros(camera.grid.shape, np.float32)
-    return open_design(run, levels=run.spec.process.levels).nominal_height_m
+def height_at_rest_m(design: Design, camera: Camera) -> Float[np.ndarray, "y x"]:
+    """Heights of a design, or of flat glass where its spec wants a conventional camera."""
+    assert design.spec is not None
+    conventional = design.spec.train.camera == "conventional"
+    return np.zeros(camera.grid.shape, np.float32) if conventional else design.nominal_height_m
 
 
-def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
-    """The heights that training begins with: those of the run before rounding; of rings, their profile."""
-    if run.spec.train.camera == "conventional":
+def heights_before(design: Design, trainer: Trainer) -> Float[np.ndarray, "*s"]:
+    """The heights that training begins with: those of the design before rounding; of rings, their profile."""
+    if trainer.spec.train.camera == "conventional":
         learns = trainer.doe.parametrization is not None
         return np.zeros(trainer.doe.learnt.shape if learns else trainer.bench.camera.grid.shape, np.float32)
-    heights = read_any_height(run.path(CONTINUOUS)).height_m
+    heights = design.continuous_m
+    if heights is None:
+        rule, cure = "must have its heights before rounding", "Give one that was optimised, or the run of one."
+        raise InputError("design", rule, "level numbers alone", cure)
     if trainer.doe.parametrization is None:
         return heights
     found = trainer.doe.learnt.heights_of(heights)
@@ -114,10 +117,10 @@ def heights_before(run: Run, trainer: Trainer) -> Float[np.ndarray, "*s"]:
     return found
 
 
-def design_after(run: Run, trainer: Trainer, state: JointState) -> Design:
+def design_after(design: Design, trainer: Trainer, state: JointState) -> Design:
     """The design of a state: as it was, or as `doedesign.design.optimize.finished_design` makes it of parameters."""
-    if not run.spec.train.moves_optics or trainer.doe.parametrization is None:
-        return replace(open_design(run, levels=run.spec.process.levels), continuous_m=None)
+    if not trainer.spec.train.moves_optics or trainer.doe.parametrization is None:
+        return replace(design, continuous_m=None)
     return _design_of(trainer, state)
 
 
@@ -135,7 +138,7 @@ def _design_of(trainer: Trainer, state: JointState) -> Design:
 
 def write_results(
     folder: Path,
-    run: Run,
+    design: Design,
     trainer: Trainer,
     state: JointState,
     held_out: HeldOut,
@@ -146,7 +149,7 @@ def write_results(
 
     Args:
         folder: where to.
-        run: the run, with the spec of the training.
+        design: the design that the training began with.
         trainer: the training.
         state: its last state.
         held_out: scenes to judge it by.
@@ -156,14 +159,14 @@ def write_results(
     Returns:
         names of the files.
     """
-    spec, camera = run.spec, trainer.bench.camera
+    spec, camera = trainer.spec, trainer.bench.camera
     near = spec.scene.near_m or depth_range_m(kind)
     names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
     height = np.zeros(camera.grid.shape, np.float32)
     if spec.train.camera == "doe":
-        design = design_after(run, trainer, state)
-        height = design.nominal_height_m
-        names += write_design(folder, design)
+        trained = design_after(design, trainer, state)
+        height = trained.nominal_height_m
+        names += write_design(folder, trained)
     depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
     bank = psf(height, camera, depths, propagation=spec.optics.propagation)
     write_bank(folder / BANK_NAME, bank, {"design": spec.name})

@@ -54,13 +54,13 @@ def split_pictures(images: Path | None, validation: Path | None, count: int, see
     pool = files if validation is None else picture_files(validation)
     where = str(images or "scikit-image's pictures")
     if validation is None and len(files) <= count:
-        cure = f"Set train.validation below {len(files)}, or give --validation a folder of its own."
+        cure = f"Set train.validation below {len(files)}, or give the pictures to hold out a folder of their own."
         raise InputError(where, f"must hold more than the {count} pictures of train.validation", len(files), cure)
     order = np.random.default_rng((seed, _ORDER)).permutation(len(pool))[-count:]
     held_out = tuple(pool[k] for k in order)
     training = _without(files, held_out if validation is None else pool)
     if not training:
-        cure = "Give --validation other pictures than --images."
+        cure = "Hold out other pictures than those to train on."
         raise InputError(where, "a picture must be left to train on", "only those held out", cure)
     return Split(training, held_out)
 

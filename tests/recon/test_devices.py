@@ -95,9 +95,8 @@ def test_two_devices_take_the_step_of_one() -> None:
 HOST = """
 import os, sys
 from fab.files import write_atomic
-import doedesign.commands.train as command
+import doedesign.training.job as job
 from doedesign.cli import main
-from fab.pictures import read_display
 
 out, written = sys.argv[3], []
 def audit(event, args):
@@ -106,8 +105,8 @@ def audit(event, args):
         written.append(str(args[0]))
 sys.addaudithook(audit)
 for name in ("plot_training", "plot_validation"):
-    setattr(command, name, lambda *_: None)
-command.save = lambda _, path: write_atomic(path, b"picture")
+    setattr(job, name, lambda *_: None)
+job.save = lambda _, path: write_atomic(path, b"picture")
 code = main(["train", sys.argv[1], "--images", sys.argv[2], "--out", out, *sys.argv[4:]])
 print("written:", len(written))
 sys.exit(code)
@@ -184,14 +183,14 @@ def test_two_hosts_train_as_one_and_stop_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ((None, 2, None), "--hosts: must be given with --coordinator"),
-        ((None, None, 0), "--host: must be given with --coordinator"),
+        ((None, 2, None), "hosts: must be given with a coordinator"),
+        ((None, None, 0), "host: must be given with a coordinator"),
         (("10.0.0.1", 2, 0), 'HOST:PORT or "auto"'),
         (("10.0.0.1:99999", 2, 0), 'HOST:PORT or "auto"'),
-        (("10.0.0.1:1234", None, 0), "--hosts: must be the number of hosts.*nothing"),
-        (("10.0.0.1:1234", 2, None), "--host: must lie from 0 to 1.*nothing"),
-        (("10.0.0.1:1234", 2, 2), "--host: must lie from 0 to 1"),
-        (("auto", 2, None), "--hosts: must be left out with --coordinator auto"),
+        (("10.0.0.1:1234", None, 0), "hosts: must be the number of hosts.*nothing"),
+        (("10.0.0.1:1234", 2, None), "host: must lie from 0 to 1.*nothing"),
+        (("10.0.0.1:1234", 2, 2), "host: must lie from 0 to 1"),
+        (("auto", 2, None), "hosts: must be left out with the coordinator auto"),
     ],
 )
 def test_hosts_that_cannot_be(given: tuple[Any, ...], words: str) -> None:

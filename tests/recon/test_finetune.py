@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,16 @@ import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
-import doedesign.commands.finetune as command
+import doedesign.training.job
 from doedesign.cli import exit_code, main
-from doedesign.commands.finetune import FinetuneSettings, finetune
+from doedesign.commands.finetune import finetune
 from doedesign.recon.model import Model
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import read_network, write_network
-from doedesign.training.crops import PairData, Pairs
-from doedesign.training.finetune import Tuner, mirrored_as
+from doedesign.training.finetune import FineTuning, Tuner, mirrored_as
 from doedesign.training.history import read_history
-from doedesign.training.pairs import find_pairs, read_pair, split_pairs
+from doedesign.training.pairs import PairData, Pairs, find_pairs, read_pair, split_pairs
 from fab.errors import InputError
 from fab.files import read_json, sha256_file
 from sim.light import linear_from_srgb, srgb_from_linear
@@ -132,12 +132,12 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tuned(model: Path, pairs: Path, out: Path, *, drawn: bool = False, **options: Any) -> tuple[int, str]:
     """Fine-tune: the exit code, and what was said. Drawing takes longer than all else, so it is left out."""
     said: list[str] = []
-    request = FinetuneSettings(**{"steps": STEPS, "validation": 2, **options})
+    how = {"steps": STEPS, "validation": 2, **options}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.console.say", said.append)
         if not drawn:
-            leave_out_pictures(patch, command)
-        code = exit_code(lambda: finetune(model, pairs, out, request, said.append))
+            leave_out_pictures(patch, doedesign.training.job)
+        code = exit_code(lambda: finetune(model, pairs, out, **how))
     return code, "\n".join(said)
 
 
@@ -292,14 +292,15 @@ def test_a_mirrored_capture_is_seen_through_a_mirrored_plate(tmp_path: Path, mod
     for name, image in (("reference", light), ("capture", convolve2d(light, psf[0], mode="same"))):
         write_picture(tmp_path / f"a_{name}.exr", {"Y": image})
     data = PairData(Pairs(find_pairs(tmp_path), Model.open(model)), (24, 32), seed=0, batch=16)
-    batch = data.at(0)
-    assert 0 < batch.mirrored.sum() < 16
-    kernels = np.asarray(mirrored_as(jax.numpy.asarray(psf), jax.numpy.asarray(batch.mirrored)))
+    crops = [data.item(k) for k in range(16)]
+    mirrored = [crop.mirrored for crop in crops]
+    assert 0 < sum(mirrored) < 16
+    kernels = np.asarray(mirrored_as(jax.numpy.asarray(psf), jax.numpy.asarray(mirrored)))
     inner = (slice(2, -2), slice(2, -2))  # the rim lacks what lies beyond the crop
-    for capture, reference, kernel in zip(batch.capture[:, 0], batch.reference[:, 0], kernels[:, 0], strict=True):
-        seen = convolve2d(linear_from_srgb(reference), kernel, mode="same")
+    for crop, kernel in zip(crops, kernels[:, 0], strict=True):
+        seen = convolve2d(linear_from_srgb(crop.pair.reference[0]), kernel, mode="same")
         # Single precision, through the curve and back.
-        np.testing.assert_allclose(seen[inner], capture[inner], atol=1e-5)
+        np.testing.assert_allclose(seen[inner], crop.pair.capture[0][inner], atol=1e-5)
 
 
 def test_the_stream_goes_on_from_any_step(pairs: Path, model: Path):
@@ -311,13 +312,13 @@ def test_the_stream_goes_on_from_any_step(pairs: Path, model: Path):
         whole, part = list(stream), list(later)
     assert [batch.step for batch in whole] == list(range(6))
     for epoch in (whole[:3], whole[3:]):
-        assert sorted(name for batch in epoch for name in batch.names) == list("012345")
+        assert sorted(item.name for batch in epoch for item in batch.items) == list("012345")
     for one, other in zip(whole[3:5], part, strict=True):
-        for a, b in zip(one, other, strict=True):
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             np.testing.assert_array_equal(a, b)
-    masked = {name: batch.mask[k].any() for batch in whole for k, name in enumerate(batch.names)}
-    assert {name for name, covered in masked.items() if covered} <= {"2"}
-    assert not any(batch.mirrored.any() for batch in (data._replace(mirrored=False).at(k) for k in range(6)))
+    assert {item.name for batch in whole for item in batch.items if item.pair.mask.any()} <= {"2"}
+    straight = replace(data, mirrored=False)
+    assert not any(straight.item(k).mirrored for k in range(12))
 
 
 def test_what_is_held_out_is_never_trained_on(
@@ -338,7 +339,7 @@ def test_what_is_held_out_is_never_trained_on(
     step = Tuner.step
 
     def noting(self: Tuner, state: Any, batch: Any) -> Any:
-        seen.update(batch.names)
+        seen.update(item.name for item in batch.items)
         return step(self, state, batch)
 
     monkeypatch.setattr(Tuner, "step", noting)
@@ -442,11 +443,11 @@ def test_other_mistakes(model: Path, pairs: Path, tmp_path: Path):
         ({"psf": [tmp_path / "colours.exr"]}, "colours of the network"),
         ({"psf": [tmp_path / "even.exr"]}, "odd window, such as 9"),
         ({"near_m": 0.01}, "--near-depth: must lie within"),
-        ({"validation": 6}, "--validation: must be from 1 to 5"),
-        ({"validation": 0}, "--validation"),
-        ({"steps": -1}, "--steps"),
-        ({"learning_rate": float("nan")}, "--learning-rate"),
-        ({"seed": -1}, "--seed"),
+        ({"validation": 6}, "validation: must be from 1 to 5"),
+        ({"validation": 0}, "validation"),
+        ({"steps": -1}, "steps"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"seed": -1}, "seed"),
         ({"size": 8}, "crops of 8"),
         ({"lpips_weights": [tmp_path / "weights.npz"]}, "weights.npz"),
     ]
@@ -475,7 +476,7 @@ def test_folders_and_checkpoints_of_others(model: Path, pairs: Path, whole: Path
     assert (code, "other content" in said) == (2, True)
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "_finish", lambda *_: interrupt())
+        patch.setattr(FineTuning, "write_results", lambda *_: interrupt())
         assert tuned(model, pairs, out)[0] == 130
         assert tuned(model, pairs, tmp_path / "other", seed=1)[0] == 130
     shutil.copy(tmp_path / "other" / "checkpoint.npz", out)
@@ -490,11 +491,13 @@ def test_a_loss_that_is_not_finite(model: Path, pairs: Path, tmp_path: Path, mon
     step = Tuner.step
 
     def breaking(self: Tuner, state: Any, batch: Any) -> Any:
-        return step(self, state, batch._replace(reference=batch.reference * np.float32(np.nan)))
+        nothing = [item.pair._replace(reference=item.pair.reference * np.nan) for item in batch.items]
+        spoilt = [item._replace(pair=pair) for item, pair in zip(batch.items, nothing, strict=True)]
+        return step(self, state, batch._replace(items=tuple(spoilt)))
 
     monkeypatch.setattr(Tuner, "step", breaking)
     code, said = tuned(model, pairs, tmp_path / "out")
-    assert (code, "step 0: the loss must stay finite" in said, "--learning-rate" in said) == (2, True, True)
+    assert (code, "step 0: the loss must stay finite" in said, "learning rate" in said) == (2, True, True)
 
 
 # --- the command line ------------------------------------------------------------------------------------------------

@@ -197,7 +197,7 @@ def test_what_cannot_be_trained(changes: tuple[str, ...], words: str) -> None:
 
 def test_devices() -> None:
     assert devices_mesh(1) is None
-    with pytest.raises(InputError, match="--devices"):
+    with pytest.raises(InputError, match="devices"):
         devices_mesh(len(jax.devices()) + 1)
 
 

@@ -20,20 +20,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import doedesign.commands.train as command
+import doedesign.training.job
 import doedesign.training.results
+import doedesign.training.train
 import fab.archive
 from doedesign.build import camera_from_spec
 from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code, main
-from doedesign.commands.train import TrainingSettings, train
+from doedesign.commands.train import train
 from doedesign.recon.weights import read_network
 from doedesign.report.history import plot_training
 from doedesign.report.sheet import ValidationRow, plot_validation
-from doedesign.runs.level_maps import drawing_from
+from doedesign.runs.level_maps import drawing_from, open_design
 from doedesign.spec import load_spec
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
+from doedesign.training.train import train as train_design
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.figure import save
@@ -125,16 +127,15 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are looked at in a test of their own; drawing them takes longer than all else."""
-    leave_out_pictures(monkeypatch, command)
+    leave_out_pictures(monkeypatch, doedesign.training.job)
 
 
 def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> tuple[int, str]:
     """Train: the exit code, and what was said."""
     said: list[str] = []
-    request = TrainingSettings(images=images, overrides=changes, **more)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.console.say", said.append)
-        code = exit_code(lambda: train(run, out, request, said.append))
+        code = exit_code(lambda: train(run, images, out, overrides=changes, **more))
     return code, "\n".join(said)
 
 
@@ -152,7 +153,7 @@ def whole(run: Path, images: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """A training that was never stopped."""
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        leave_out_pictures(patch, command)
+        leave_out_pictures(patch, doedesign.training.job)
         code, said = trained(run, out, images)
     assert code == 0, said
     return out
@@ -257,6 +258,21 @@ def test_a_training_without_a_plate_has_no_masks(
     assert "must hold a plate, level_map.npz" in capsys.readouterr().err
 
 
+def test_without_a_folder_the_model_is_what_is_left(run: Path, images: Path, whole: Path):
+    """The same training in memory, but for a shorter one that an option asks for."""
+    design = open_design(run, levels=4)
+    model = train_design(design, images)
+    assert model.folder is None
+    learnt, _ = read_network(whole / "network.npz")
+    for one, other in zip(jax.tree.leaves(model.network), jax.tree.leaves(learnt), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert train_design(design, images, steps=1).about["steps"] == 1
+    with pytest.raises(InputError, match="stepps"):
+        train_design(design, images, stepps=1)
+    with pytest.raises(InputError, match="design: must have a spec"):
+        train_design(design.bare(), images)
+
+
 # --- stopped and resumed ---------------------------------------------------------------------------------------------
 
 
@@ -313,12 +329,12 @@ def test_stopped_between_steps(
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (command, "spec_to_toml"),  # between the manifest and the spec
-        (command, "write_checkpoint"),  # between a line of history and the checkpoint
-        (command, "plot_validation"),
-        (command, "write_results"),  # when all steps are done
+        (doedesign.training.job, "settled"),  # after the manifest and the spec
+        (doedesign.training.job, "write_checkpoint"),  # between a line of history and the checkpoint
+        (doedesign.training.job, "plot_validation"),
+        (doedesign.training.train, "write_results"),  # when all steps are done
         (doedesign.training.results, "write_network"),  # among the results
-        (command, "plot_training"),
+        (doedesign.training.job, "plot_training"),
     ],
 )
 def test_stopped_in_between(
@@ -358,8 +374,9 @@ def test_stopped_at_every_few_writes(
 SCRIPT = """
 import sys, time
 from pathlib import Path
+import doedesign.training.job as job
 from doedesign.cli import exit_code
-from doedesign.commands import train as command
+from doedesign.commands.train import train
 from doedesign.training.joint import Trainer
 from fab.files import write_atomic
 
@@ -369,12 +386,10 @@ def slowly(self, state, batch):
     return step(self, state, batch)
 Trainer.step = slowly
 for name in ("plot_training", "plot_validation"):
-    setattr(command, name, lambda *_: None)
-command.save = lambda _, path: write_atomic(path, b"picture")
+    setattr(job, name, lambda *_: None)
+job.save = lambda _, path: write_atomic(path, b"picture")
 run, out, images = map(Path, sys.argv[1:])
-def say(text):
-    print(text, file=sys.stderr)
-sys.exit(exit_code(lambda: command.train(run, out, command.TrainingSettings(images=images), say)))
+sys.exit(exit_code(lambda: train(run, images, out)))
 """
 
 
@@ -526,7 +541,7 @@ def test_what_stays_at_rest(
         drawn, before = (drawing_from(folder, 4).level_map.level for folder in (out, run))
         assert np.array_equal(drawn, before) == height
     moved, _ = read_network(out / "network.npz")
-    fresh = jax.tree.leaves(command.Trainer.initial(_still(run), np.zeros((2, 2), np.float32)).network)
+    fresh = jax.tree.leaves(Trainer.initial(_still(run), np.zeros((2, 2), np.float32)).network)
     assert any(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(moved), fresh, strict=True)) == network
     camera = camera_from_spec(load_spec(run / "spec.toml"))
     flat = psf(np.zeros((64, 64), np.float32), replace(camera, window=33), (np.inf,)).energy
@@ -554,7 +569,7 @@ def _still(run: Path) -> Any:
         (["process.levels=8"], ["--set", "another process", "[network], [train]"]),
         (["sensor.binning=2"], ["--set", "sensor.binning"]),
         (["train.size=484"], ["train.size", "480 binned pixels"]),
-        (["train.validation=12"], ["more than the 12 pictures", "train.validation below 12", "--validation"]),
+        (["train.validation=12"], ["more than the 12 pictures", "train.validation below 12", "folder of their own"]),
     ],
 )
 def test_what_is_refused(run: Path, images: Path, tmp_path: Path, changes: list[str], words: list[str]):
@@ -575,7 +590,7 @@ def test_what_must_be_named_and_whole(run: Path, images: Path, tmp_path: Path):
     code, said = trained(run, tmp_path / "out", images, lpips_weights=[tmp_path / "none.npz"])
     assert (code, "none.npz" in said) == (2, True)
     code, said = trained(run, tmp_path / "out", images, devices=64)
-    assert (code, "--devices" in said) == (2, True)
+    assert (code, "devices: must lie" in said) == (2, True)
 
 
 def test_folders_of_others_are_left_alone(run: Path, images: Path, whole: Path, tmp_path: Path):

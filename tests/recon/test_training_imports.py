@@ -16,7 +16,7 @@ class Absent(importlib.abc.MetaPathFinder):
             raise ImportError(f"{{name}} is not there")
 
 sys.meta_path.insert(0, Absent())
-import doedesign.cli, doedesign.commands.train
+import doedesign.cli, doedesign.training.train
 from tests.recon.small_training import trainer
 trainer("train.fabricated=true", "process.errors.overlay_y={{sigma='0.5 um'}}")
 trainer('train.freeze="optics"')
