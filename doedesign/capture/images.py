@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Num, UInt8
 
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes
@@ -179,7 +179,7 @@ def crop(
 
 
 def display_values(picture: np.ndarray) -> Picture:
-    """An array of display values, uint8 or floats from 0 to 1, as a picture.
+    """An array `[y, x, 3]` of display values, uint8 or floats from 0 to 1, as a picture.
 
     Raises:
         InputError: another shape or another type, or values beyond 0 to 1.

@@ -35,7 +35,7 @@ def camera(pixel_m: float = PIXEL, waves: tuple[float, ...] = tuple(reversed(WAV
 
 def shot(seen_by: Camera, light: np.ndarray) -> SimulatedCapture:
     """A capture whose PSFs are the model's at 0.05 m and at infinity, colours in the other order."""
-    energy = bank().energy[::-1]
+    energy = bank().energy[::-1][: len(light)]
     blank = np.zeros(light.shape[1:], np.float32)
     return SimulatedCapture(
         light, light, light, blank, blank[None], blank, energy[:, 3], energy[:, 0], 0.05, np.inf, seen_by, "paper"
