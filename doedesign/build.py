@@ -1,6 +1,6 @@
-"""From a spec to the values the physics works on. The only file that knows both."""
+"""Values of the physics from the tables of a spec: camera, levels, process, wafer."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
-from fab.stock import STOCK
+from fab.stock import STOCK, process_from
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -21,10 +21,10 @@ _EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")
 
 
 def camera_from_spec(spec: Spec) -> Camera:
-    """Lens, sensor, substrate and DOE grid of a spec."""
+    """Return lens, sensor, substrate and DOE grid of a spec."""
     return Camera(
         grid=Grid((spec.doe.samples, spec.doe.samples), spec.doe.pitch_m),
-        # What the chrome leaves open, not what is etched: this is the circle light passes.
+        # Light passes the opening in the chrome, which is smaller than the etched circle.
         aperture_m=spec.doe.aperture_m - 2 * spec.process.chrome_overlap_m,
         material=spec.doe.material,
         colours=tuple(Colour(c.name, c.wavelengths_m, c.weights) for c in spec.optics.colours),
@@ -37,31 +37,30 @@ def camera_from_spec(spec: Spec) -> Camera:
 
 
 def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
-    """The staircase of heights that a process makes.
+    """Return the staircase that a process makes.
 
     Args:
         spec: the process of a spec, or of a file of its own.
-        chosen: what to take where the depths of the etches are to be chosen by `doedesign optimize`.
+        chosen: the staircase where the spec leaves the depths of the etches to the optimisation.
 
     Raises:
         InputError: the depths are still to be chosen.
     """
     depths_m = spec.etch_depths_m
     if isinstance(depths_m, str):
-        if chosen is None:
-            rule = "the depths must be known here"
-            cure = f"Give them as numbers; those that a run chose are in its {MANIFEST_NAME}."
-            raise InputError("process.etch_depths", rule, f'"{depths_m}"', cure)
-        return chosen
+        if chosen is not None:
+            return chosen
+        cure = f"Give them as numbers; those that a run chose are in its {MANIFEST_NAME}."
+        raise InputError("process.etch_depths", "the depths must be known here", f'"{depths_m}"', cure)
     return Levels(spec.levels, spec.level_step_m, depths_m or ())
 
 
 def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
-    """What the fab lab does, with what the spec leaves out taken from its stock process.
+    """Return a process, with what the spec leaves out taken from its stock process.
 
     Args:
         spec: the process of a spec, or of a file of its own.
-        chosen: the staircase where the spec leaves its choice to the optimisation (`levels_from_spec`).
+        chosen: see `levels_from_spec`.
 
     Returns:
         The process; errors whose mean and standard deviation are zero are left out of its spreads.
@@ -70,8 +69,12 @@ def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Proces
         InputError: the depths are still to be chosen.
     """
     full = spec.filled()
-    spreads = dict(_spreads(full))
     defects = full.defects.in_si()
+    spreads: dict[str, Normal] = {}
+    for error, given in full.errors.given().items():
+        names = error_names(spec.masks, error)
+        every = zip(names, given.spreads(len(names)), strict=True)
+        spreads |= {name: spread for name, spread in every if spread != Normal()}
     return Process(
         levels=levels_from_spec(spec, chosen),
         order=tuple(etch.mask for etch in full.etches),
@@ -83,7 +86,7 @@ def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Proces
 
 
 def wafer_from_spec(spec: WaferSpec) -> Wafer:
-    """What the masks of an order are filled with.
+    """Return the layout of a wafer.
 
     Raises:
         InputError: numbers that do not go together.
@@ -94,29 +97,25 @@ def wafer_from_spec(spec: WaferSpec) -> Wafer:
 def resolve_process(
     given: "Process | ProcessSpec | str | Path | None", levels: Levels, default: ProcessSpec | None = None
 ) -> Process:
-    """Return a process for a staircase, however it was named.
+    """Return a process for a staircase.
 
     Args:
         given: a process or its spec; the name of a stock process; a TOML file; None for the default.
         levels: the staircase it must make.
-        default: the process of the design's spec, from which a stock process takes levels and step; an ideal process
-            if there is none.
+        default: the process of the design's spec; an ideal process if there is none.
 
     Raises:
         InputError: the file cannot be read, or the process makes another staircase.
     """
-    if isinstance(given, Process):
-        return require_levels_of(given, levels, "process")
-    if isinstance(given, str) and given in STOCK:
-        stock = process_from_json({"levels": levels.count, "level_step_m": levels.step_m, "stock": given}, given)
-        return process_from_spec(stock.model_copy(update={"etch_depths_m": "optimize"}), levels)
-    if isinstance(given, str | Path):
-        return require_levels_of(process_from_spec(load_process(given), levels), levels, str(given))
-    spec = default if given is None else given
-    return Process(levels) if spec is None else require_levels_of(process_from_spec(spec, levels), levels, "process")
+    where, given = "process", default if given is None else given
+    if isinstance(given, Path) or (isinstance(given, str) and given not in STOCK):
+        where, given = str(given), load_process(given)
+    if isinstance(given, ProcessSpec):
+        return require_levels(process_from_spec(given, levels), levels, where)
+    return process_from(given, levels)
 
 
-def require_levels_of(process: Process, levels: Levels, where: str) -> Process:
+def require_levels(process: Process, levels: Levels, where: str) -> Process:
     """Return a process that makes a staircase.
 
     Raises:
@@ -128,7 +127,7 @@ def require_levels_of(process: Process, levels: Levels, where: str) -> Process:
 
 
 def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
-    """Return the process as a design sees it through masks whose edges were moved: with another line-width bias.
+    """Return a process with the line-width bias that is left where masks draw moved edges.
 
     Args:
         process: the process.
@@ -142,20 +141,12 @@ def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
     return replace(process, spreads={**process.spreads, **moved})
 
 
-def _spreads(spec: ProcessSpec) -> Iterator[tuple[str, Normal]]:
-    for error, given in spec.errors.given().items():
-        names = error_names(spec.masks, error)
-        for name, spread in zip(names, given.spreads(len(names)), strict=True):
-            if spread != Normal():
-                yield name, spread
-
-
-def process_spec_of(process: Process, like: ProcessSpec | None = None) -> ProcessSpec:
-    """The spec of a process, every number said and none left to a stock process.
+def spec_from_process(process: Process, like: ProcessSpec | None = None) -> ProcessSpec:
+    """Return the spec of a process, with every number given and none left to a stock process.
 
     Args:
         process: the process, for example one fitted to measurements.
-        like: the spec it came from, for what a process does not know (the chrome's overlap); the usual one by default.
+        like: the spec it came from, for the chrome's overlap; the usual one by default.
 
     Raises:
         InputError: a number that no spec may hold.

@@ -90,7 +90,8 @@ class Stock:
         """Return the process with these numbers for a staircase; all masks have the same ones."""
         spreads = {
             name: Normal(typical.mean, typical.sigma)
-            for error, typical in self.errors.items()
+            for error in DEVIATIONS
+            if (typical := self.errors.get(error))
             for name in error_names(levels.bits, error)
         }
         limits = {name: getattr(self, name).value for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m")}

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from doedesign.build import process_spec_of
+from doedesign.build import spec_from_process
 from doedesign.calibration.estimate import Calibration
 from doedesign.calibration.explanation_plots import plot_explanations
 from doedesign.calibration.explanations import ExplanationSet
@@ -33,7 +33,7 @@ def write_calibration(folder: Path, design: Design, result: Calibration, process
     if isinstance(process, str | Path) and process not in STOCK:
         like = load_process(process)
     comments = _comments(result)
-    estimate = process_to_toml(process_spec_of(result.process, like), comments)
+    estimate = process_to_toml(spec_from_process(result.process, like), comments)
     (folder / "process-estimate.toml").write_text(estimate, encoding="utf-8")
     doe = result.objective.unknowns.variation(result.posterior.values)
     (folder / "plate.toml").write_text(variation_to_toml(doe, comments), encoding="utf-8")

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.build import camera_from_spec, process_from_spec, require_levels_of, wafer_from_spec
+from doedesign.build import camera_from_spec, process_from_spec, require_levels, wafer_from_spec
 from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
 from doedesign.runs.level_maps import Drawing
@@ -151,7 +151,7 @@ def _foretold(design: Design, order: Order, moves_m: list[float], probe_m: float
 def _process(spec: Spec | None, levels: Levels, file: Path | None) -> Process:
     """The process of a file or a spec; for other levels than a spec's (`--levels`) what it says of the lithography."""
     if file is not None:
-        return require_levels_of(process_from_spec(load_process(file), levels), levels, str(file))
+        return require_levels(process_from_spec(load_process(file), levels), levels, str(file))
     if spec is None:
         return Process(levels)
     made = process_from_spec(spec.process)

@@ -1,4 +1,4 @@
-"""How long work runs.
+"""Support of long work.
 
 progress      a bar with rate and time left, or plain lines
 stopping      SIGINT and SIGTERM

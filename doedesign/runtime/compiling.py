@@ -1,9 +1,9 @@
-"""Steps of an optimisation or a training, compiled so that they take little memory.
+"""Compilation of the steps of an optimisation or a training, so that they take little memory.
 
 Two things raise the peak of a full-size step, and neither is needed. XLA's default schedule for a processor keeps the
 buffers of all PSFs alive at once; first touching that much memory costs as much time as the transforms themselves. And
-compiling takes about a gigabyte, which it frees, but which the C library keeps for later, beside what the step itself
-takes: a third of a training's peak. glibc gives it back when asked; other systems are left alone.
+compiling takes about a gigabyte, which it frees, but which the C library keeps for later, beside the memory of the step
+itself: a third of a training's peak. glibc gives it back on request; other systems are left alone.
 """
 
 import ctypes
@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-_LEAST_S = 1.0  # what took less left little
+_LEAST_S = 1.0  # a shorter compilation leaves little
 
 
 def compiled_step(step: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -31,7 +31,7 @@ def compiled_step(step: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
 
 @cache
 def _trim_after_compiling() -> None:
-    """From now on, give memory back to the system after every compilation of a second and more."""
+    """Have memory given back to the system after every compilation of a second and more from now on."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is None:
         return

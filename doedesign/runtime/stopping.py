@@ -1,4 +1,4 @@
-"""Ending long work between two steps: what SIGINT and SIGTERM ask for, and what several hosts agree on."""
+"""SIGINT and SIGTERM during long work: the end between two steps, agreed on by all hosts."""
 
 import signal
 import threading
@@ -8,17 +8,17 @@ from typing import Any
 
 
 class StopRequest:
-    """Whether someone asked for an end; made by `stoppable`.
+    """Request to end the work; made by `stoppable`.
 
     Attributes:
-        asked: whether.
+        asked: whether a signal arrived.
     """
 
     def __init__(self) -> None:
         self.asked, self._waits = False, False
 
     def ask(self, *_: Any) -> None:
-        """Handle a signal: at once, or after the step where there is one; a second signal does not wait.
+        """Handle a signal: at once, or after the step within `gently`; a second signal does not wait.
 
         Raises:
             KeyboardInterrupt: at once.
@@ -29,7 +29,7 @@ class StopRequest:
 
     @contextmanager
     def gently(self) -> Iterator[None]:
-        """Let steps end: within this block a signal only sets `asked`, which is to be looked at between steps."""
+        """Let steps end: within this block a signal only sets `asked`, which the caller checks between steps."""
         self._waits = True
         try:
             yield
@@ -37,7 +37,7 @@ class StopRequest:
             self._waits = False
 
     def agreed(self) -> bool:
-        """Whether any host was asked: one that stopped alone would leave the others waiting for ever."""
+        """Whether any host was asked; one that stopped alone would leave the others waiting for ever."""
         import jax
 
         if jax.process_count() == 1:
@@ -50,10 +50,10 @@ class StopRequest:
 
 @contextmanager
 def stoppable() -> Iterator[StopRequest]:
-    """Take SIGINT and SIGTERM as questions; both raise KeyboardInterrupt where nothing is said of steps."""
+    """Handle SIGINT and SIGTERM by a `StopRequest`; both raise KeyboardInterrupt outside of its `gently`."""
     stop = StopRequest()
     if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread is told of signals
+        yield stop  # only the main thread receives signals
         return
     before = {number: signal.signal(number, stop.ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

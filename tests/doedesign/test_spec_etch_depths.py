@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from doedesign.build import levels_from_spec, process_from_spec, process_spec_of, resolve_process
+from doedesign.build import levels_from_spec, process_from_spec, resolve_process, spec_from_process
 from doedesign.spec import (
     ProcessSpec,
     load_process,
@@ -58,7 +58,7 @@ def test_etches_go_from_shallow_to_deep_unless_an_order_is_given():
     # And back to a spec, order and all.
     for one in (spec, said):
         process = process_from_spec(one.process)
-        assert process_from_spec(process_spec_of(process, one.process)) == Process(
+        assert process_from_spec(spec_from_process(process, one.process)) == Process(
             process.levels, process.order, name="ideal"
         )
 

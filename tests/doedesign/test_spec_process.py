@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from doedesign.build import process_from_spec, process_spec_of
+from doedesign.build import process_from_spec, spec_from_process
 from doedesign.spec import (
     ErrorsSpec,
     LimitSpec,
@@ -351,7 +351,7 @@ def processes(draw: st.DrawFn) -> Process:
 @given(process=processes())
 def test_a_process_survives_its_file_to_the_last_bit(process: Process, tmp_path_factory: pytest.TempPathFactory):
     like = ProcessSpec(levels=2, level_step_m=75e-9, chrome_overlap_m=3e-6, stock="stepper")
-    spec = process_spec_of(process, like)
+    spec = spec_from_process(process, like)
     path = tmp_path_factory.mktemp("process") / "process-estimate.toml"
     path.write_text(process_to_toml(spec, ["fitted to measurements", "two\nlines"]), "utf-8")
     assert load_process(path) == spec
@@ -366,7 +366,7 @@ def test_a_process_survives_its_file_to_the_last_bit(process: Process, tmp_path_
 @pytest.mark.parametrize("name", [None, *STOCK])
 def test_a_stock_process_said_in_full_is_the_same(name: str | None):
     spec = ProcessSpec(levels=16, level_step_m=75e-9, stock=name)
-    said = process_spec_of(process_from_spec(spec), spec)
+    said = spec_from_process(process_from_spec(spec), spec)
     assert said.stock is None
     assert replace(process_from_spec(said), name=name or "ideal") == process_from_spec(spec)
     assert said.filled().errors == spec.filled().errors
@@ -379,7 +379,7 @@ def test_a_stock_process_said_in_full_is_the_same(name: str | None):
 
 def test_a_process_beyond_what_a_spec_may_hold_is_refused():
     process = Process(Levels(2, 75e-9), spreads={"depth_scale[0]": Normal(0.6, 0.01)}, name="estimate")
-    message = refusal(process_spec_of, process, ProcessSpec(levels=2, level_step_m=75e-9))
+    message = refusal(spec_from_process, process, ProcessSpec(levels=2, level_step_m=75e-9))
     assert "process estimate: process.errors.depth_scale.mean: must lie between -0.5 and 0.5, but got 0.6." in message
 
 
