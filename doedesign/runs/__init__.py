@@ -1,6 +1,5 @@
 """Designs on the disk.
 
     folder        run folders: manifest, checkpoint, resume
-    archive       arrays with a header in one file, without pickle
     level_maps    the level map of a run, of mask files, or of a map the user brings
 """
