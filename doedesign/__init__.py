@@ -13,9 +13,9 @@ the result:
     build           spec -> values: camera, levels, process, wafer
     design          parameters, objectives and optimisation of a height map; `Design`, which carries the result
     optimization    `optimize`: a spec becomes a design, in memory or in a run folder
-    runs            designs on the disk
+    runs            designs on the disk, and the PSFs of a run
     prediction      PSFs and figures of merit of a design as fabricated
-    lab             predictions for a run sheet, and plates as measured
+    lab             mask orders with their run sheets, and plates as measured
     tolerancing     yield, sensitivities and error budgets of a process
     calibration     the process errors that explain measured PSFs
     capture         scenes photographed through a plate
@@ -23,7 +23,7 @@ the result:
     training        its training, with the plate or alone
     report          pictures
     runtime         progress, signals, compilation
-    commands, cli   the command line
+    cli             the command line
 
 Conventions (see README.md): in specs a length is text with a unit (`pitch = "1.85 um"`), everywhere else an SI number
 with the unit in its name (`pitch_m`); functions take either. Importing this package imports nothing heavy.

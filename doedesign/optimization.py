@@ -28,7 +28,6 @@ from doedesign.runs.folder import (
     finish_run,
     input_digests,
     load_checkpoint,
-    open_run,
     save_checkpoint,
     write_history,
 )
@@ -85,7 +84,7 @@ def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Se
     with claim_run(folder, spec, input_digests(files), overrides) as run:
         if run.done:
             log.info(f"{folder} already holds the finished run of this spec")
-            return open_design(open_run(folder), levels=spec.process.levels)
+            return open_design(folder, False)
         log.info("preparing sources and propagation")
         problem, sources = problem_of(spec, files)
         state, history = _resume(run, problem, sources, files)
@@ -97,7 +96,7 @@ def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Se
             log.info(f"chosen: {design.levels}")
         results = _write_results(run, problem, design)
         finish_run(run, results, design.levels.depths_m)
-    return open_design(open_run(folder), levels=spec.process.levels)
+    return open_design(folder, False)
 
 
 def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:

@@ -1,6 +1,6 @@
-"""What a drawn design will do once it is made: from masks and process errors to PSFs and the numbers a lab measures.
+"""Prediction of a drawn design once it is made: from masks and process errors to PSFs and the numbers a lab measures.
 
-`predict` is one draw of every tolerance study, the model of every calibration, and `doedesign psf --fabricated`.
+`predict` is one draw of every tolerance study and the model of every calibration.
 """
 
 from functools import lru_cache
@@ -16,13 +16,7 @@ from sim.surface import FabricatedDoe, as_fabricated
 
 
 class Prediction(NamedTuple):
-    """A plate and what it does.
-
-    Attributes:
-        surface: the plate.
-        bank: its PSFs at `Design.depths_m`.
-        rows: see `plate_rows`.
-    """
+    """A DOE as fabricated, its PSFs at `Design.depths_m`, and their metrics (`plate_rows`)."""
 
     surface: FabricatedDoe
     bank: PsfBank
@@ -30,7 +24,7 @@ class Prediction(NamedTuple):
 
 
 def predict(design: Design, process: Process, variation: Variation) -> Prediction:
-    """Predict the plate that a design, a process and its errors give.
+    """Predict the DOE that a design, a process and a variation (its errors, SI units) give.
 
     Raises:
         InputError: errors beyond what the model describes (`sim.surface.as_fabricated`).
@@ -48,5 +42,5 @@ def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[di
 
 @lru_cache(maxsize=1)
 def _nominal(camera: Camera, level_map: LevelMap) -> FabricatedDoe:
-    """The plate exactly as drawn; kept, because every draw is compared with it."""
+    """The DOE exactly as drawn; kept, because every draw is compared with it."""
     return as_fabricated(level_map.level, camera, Process(level_map.levels), Variation())

@@ -16,11 +16,10 @@ import sys
 from pathlib import Path
 
 from doedesign.cli import exit_code
-from doedesign.commands.masks import write_masks
-from doedesign.commands.psf import psf
 from doedesign.design.design import Design
+from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
-from doedesign.runs.level_maps import drawing_from
+from doedesign.runs.psfs import psfs
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
 from fab.units import format_length
@@ -54,12 +53,12 @@ def demo(spec_path: Path = HERE / "automotive.toml", runs: Path = Path("runs"), 
         report = verify(order)
         report.require()
     else:
-        order, report = write_masks(drawing_from(folder, design.levels.count), order)
+        report = write_masks(folder, order).report
 
     light = folder / "psf"
     say(f"3/3 PSFs of the continuous, the quantised and the drawn design into {light}")
     if not (light / "from_masks.exr").is_file():
-        psf(folder, order)
+        psfs(folder, order, out=light)
     return summary(folder, order, light, len(report.checks))
 
 

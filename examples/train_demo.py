@@ -34,12 +34,14 @@ from doedesign.capture.images import PICTURE_FILES, Pictures, picture_files, sam
 from doedesign.capture.scenes import NamedScene, SceneData
 from doedesign.capture.simulate import inner, photograph
 from doedesign.cli import exit_code
-from doedesign.commands.train import train
 from doedesign.optimization import optimize
 from doedesign.recon.model import Model
+from doedesign.runs.folder import TRAINING_TABLES
+from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import load_spec
 from doedesign.training.scores import mean_and_interval, paired_difference, scores
+from doedesign.training.train import train
 from doedesign.training.validation import SCENE_SEED
 from fab.errors import InputError
 from fab.files import canonical_json, write_atomic
@@ -151,8 +153,10 @@ def trained(plan: Plan, design: Path, model: str, camera: str, seed: int) -> dic
     settings = [f"train.validation={len(picture_files(test))}", f'train.camera="{camera}"', f"train.seed={seed}"]
     how: Any = {"validation": test, "licence": licence, "occlusion": model}
     out = plan.out / f"{model}_{camera}_{seed}"
-    folder = train(design, images, out, overrides=(*settings, *plan.overrides), **how)
-    return json.loads((folder / "metrics.json").read_text())
+    changes = (*settings, *plan.overrides)
+    begun = open_design(design, False, overrides=changes, free=TRAINING_TABLES)
+    train(begun, images, out, overrides=changes, **how)
+    return json.loads((out / "metrics.json").read_text())
 
 
 def surroundings(plan: Plan, model: str, seed: int) -> dict[str, dict[str, list[float]]]:

@@ -69,39 +69,33 @@ def masks(
     if as_built is not None:
         if wafer is not None:
             raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
-        from doedesign.commands.asbuilt import as_built as work
+        from doedesign.lab.as_built_run import as_built as predict
 
-        folder = work(source, as_built, order, process=process)
+        folder = source / "as-built"
+        predict(source, as_built, order, process=process, out=folder)
         print_paths([folder, *sorted(folder.iterdir())], json_)
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
-    from doedesign.commands.masks import write_masks
-    from doedesign.lab.predictions import PROBE_M
-    from doedesign.runs.level_maps import drawing_from
+    from doedesign.lab.order import PROBE_M, write_masks
 
-    drawing = drawing_from(
+    done = write_masks(
         source,
-        levels,
+        out,
+        levels=levels,
+        on_violation=on_violation,
+        probe_m=length_of("--probe", probe) or PROBE_M,
+        patch=_patch(patch, mesh_patch),
+        process=process,
+        wafer=wafer,
         step_m=length_of("--step", step),
-        depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
+        etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
         pitch_m=None if pitch_um is None else pitch_um * 1e-6,
         scale_m=length_of("--scale", scale),
         aperture_m=length_of("--aperture", aperture),
     )
-    probe_m = PROBE_M if probe is None else length_of("--probe", probe) or PROBE_M
-    window = _patch(patch, mesh_patch)
-    folder, report = write_masks(
-        drawing,
-        out,
-        on_violation=on_violation,
-        probe_m=probe_m,
-        patch=window,
-        process_file=process,
-        wafer_file=wafer,
-    )
-    say(f"{len(report.checks)} checks passed: every pixel of every file is as designed")
-    print_paths([folder, *sorted(folder.iterdir())], json_, checks=len(report.checks))
+    say(f"{len(done.report.checks)} checks passed: every pixel of every file is as designed")
+    print_paths([done.folder, *sorted(done.folder.iterdir())], json_, checks=len(done.report.checks))
 
 
 def verify(order: Path, *, json_: AsJson = False) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from doedesign.cli.console import print_paths, say
+from doedesign.cli.console import print_paths
 from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
 
@@ -44,23 +44,25 @@ def psf(
             option = "--depths" if depths else "--field-deg"
             cure = "Leave it out; the depths are those of the spec, on the axis."
             raise InputError(option, "does not go with --fabricated", "a value", cure)
-        from doedesign.commands.fabricated import fabricated as predict
+        from doedesign.runs.fabricated import fabricated as predict
 
-        folder = predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, say=say)
+        folder = run / "fabricated"
+        predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, out=folder)
         print_paths([folder, *sorted(folder.iterdir())], json_)
         return
     if process is not None or variation is not None or seed is not None:
         raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
     from math import inf, radians
 
-    from doedesign.commands.psf import psf as work
+    from doedesign.runs.psfs import psfs
 
     depths_m = [inf if text == "inf" else length_of("--depths", text) or 0.0 for text in depths]
     if any(not z > 0 for z in depths_m):
         raise InputError("--depths", "must be positive", ", ".join(depths), 'For example --depths "5 cm".')
     if not all(abs(angle) <= 60 for angle in field_deg):
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
-    folder = work(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), say)
+    folder = run / "psf"
+    psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)
     print_paths([folder, *sorted(folder.iterdir())], json_)
 
 
@@ -108,11 +110,14 @@ def simulate(
     if not fabricated and (process is not None or variation is not None or plate_seed is not None):
         rule = "must be given with --process, --variation or --plate-seed"
         raise InputError("--fabricated", rule, "not there", "Add it.")
-    from doedesign.commands.simulate import Fabrication
-    from doedesign.commands.simulate import simulate as work
+    from doedesign.capture.folder import PlateErrors, simulate_files
+    from doedesign.runs.level_maps import open_design
 
-    plate = Fabrication(process, variation, plate_seed, draw) if fabricated else None
+    design, plate = open_design(run, masks, overrides=set_), None
+    if fabricated:
+        made_by = design.process(process)
+        plate = PlateErrors(made_by, *design.plate_errors(made_by, variation, plate_seed, draw))
     how = {"obstruction": obstruction, "occlusion": occlusion, "count": count, "seed": seed, "size": size, "png": png}
-    done = work(run, out, overrides=set_, masks=masks, fabrication=plate, images=images, **how)
+    done = simulate_files(design, out or run / "simulated", images, plate=plate, **how)
     paths = [done.folder, *(done.folder / name for name in ("contact.png", "manifest.json", *done.items))]
     print_paths(paths, json_, items=list(done.items), skipped=done.skipped)

@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from doedesign.cli.console import print_paths
 from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
+
+if TYPE_CHECKING:
+    from doedesign.recon.model import Model, PsfPair
 
 PsfFiles = Annotated[
     tuple[Path, ...],
@@ -66,12 +69,17 @@ def train(
         hosts: Number of hosts; each runs this command, and all see the same folders.
         host: Number of this host, from 0.
     """
-    from doedesign.commands.train import train as work
+    from doedesign.runs.folder import TRAINING_TABLES
+    from doedesign.runs.level_maps import open_design
+    from doedesign.training.train import train as work
 
+    # The run's own levels: a mask order of it may draw them otherwise.
+    design = open_design(run, False, overrides=set_, free=TRAINING_TABLES)
     several: Any = {"devices": devices, "coordinator": coordinator, "hosts": hosts, "host": host}
     how: Any = {"occlusion": occlusion, "obstruction": obstruction, "licence": licence, "tensorboard": tensorboard}
     how |= {"validation": validation, "lpips_weights": lpips_weights, "overrides": set_, **several}
-    folder = work(run, images, out, **how)
+    folder = out or run / "trained"
+    work(design, images, folder, **how)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -110,11 +118,13 @@ def finetune(
         linear: Whether PNG and TIFF hold linear light; by default those of 8 and 16 bits hold display values.
         mirror: Exchange left and right at random, of captures and PSFs.
     """
-    from doedesign.commands.finetune import finetune as work
+    from doedesign.recon.model import Model
+    from doedesign.training.finetune import finetune as work
 
+    folder, model = out or run / "finetuned", Model.open(run)
     how: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation, "size": size}
     how |= {"lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
-    folder = work(run, pairs, out, **_psf_choice(psf, pixel, near_depth, far_depth), **how)
+    work(model, pairs, folder, psfs=_psfs(model, psf, pixel, near_depth, far_depth), **how)
     print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -147,22 +157,26 @@ def reconstruct(
         kind: Kind of the results: png, tif or exr; that of the capture by default.
         beside: Draw every capture and its reconstruction side by side, too.
     """
-    from doedesign.commands.reconstruct import model_and_captures
-    from doedesign.commands.reconstruct import reconstruct as work
+    from doedesign.recon.files import reconstruct_files
+    from doedesign.recon.model import Model
+    from doedesign.recon.photos import PHOTO_FILES
 
-    model, files = model_and_captures([run, *captures])
+    # Captures alone: RUN was left out.
+    alone = run.is_file() or (run.suffix.lower() in PHOTO_FILES and not run.is_dir())
+    files, model = (run, *captures) if alone else captures, Model.released() if alone else Model.open(run)
     ending = None if kind is None else f".{kind.lower().removeprefix('.')}"
-    how = {"tile": tile, "overlap": overlap, "linear": linear, "kind": ending, "beside": beside}
+    how: Any = {"tile": tile, "overlap": overlap, "linear": linear, "kind": ending, "beside": beside}
     given = {name: value for name, value in how.items() if value is not None}
-    print_paths(work(model, files, out, **_psf_choice(psf, pixel, near_depth, far_depth), **given), json_)
+    psfs = _psfs(model, psf, pixel, near_depth, far_depth)
+    print_paths(reconstruct_files(model, files, out or Path("reconstructed"), psfs=psfs, **given), json_)
 
 
-def _psf_choice(files: Sequence[Path], pixel: str | None, near: str | None, far: str | None) -> dict[str, Any]:
-    """The PSFs of --psf, --pixel, --near-depth and --far-depth, as `doedesign.recon.model.Model.psfs` takes them."""
+def _psfs(model: "Model", files: Sequence[Path], pixel: str | None, near: str | None, far: str | None) -> "PsfPair":
+    """The PSFs of --psf, --pixel, --near-depth and --far-depth."""
     from math import inf
 
     pixel_m, near_m = length_of("--pixel", pixel), length_of("--near-depth", near)
     if pixel_m is not None and not pixel_m > 0:
         raise InputError("--pixel", "must be positive", f'"{pixel}"', 'For example --pixel "3.7 um".')
     far_m = inf if far == "inf" else length_of("--far-depth", far)
-    return {"psf": files, "pixel_m": pixel_m, "near_m": near_m, "far_m": far_m}
+    return model.psfs(files, pixel_m=pixel_m, near_m=near_m, far_m=far_m)

@@ -36,7 +36,8 @@ _PLACES = {
     "near_m": "--near-depth",
     "overrides": "--set",
     "step_m": "--step",
-    "depths_m": "--etch-depths",
+    "depths_m": "--depths",
+    "etch_depths_m": "--etch-depths",
     "pitch_m": "--pitch-um",
     "scale_m": "--scale",
     "aperture_m": "--aperture",
@@ -50,6 +51,7 @@ _OPTIONS = {
     "another output folder": "another --out",
     "have the level map repaired": "take --on-violation fix",
     "take the mesh alone": "take the mesh alone (--mesh-patch)",
+    "also `variation`": "also --variation",
     "or its masks.": "or its masks (--order).",
     "or give `obstruction`": "or give --obstruction",
     "or give `occlusion`": "or give --occlusion",
@@ -72,9 +74,10 @@ def in_options(error: InputError, options: Collection[str] = ()) -> str:
         options: names of arguments that are options.
     """
     text = str(error)
-    if error.where in _PLACES or error.where in options:
-        option = _PLACES.get(error.where, f"--{error.where.replace('_', '-')}")
-        text = option + text.removeprefix(error.where)
+    # Where values have rules of a spec, its key follows the argument.
+    where = "depths_m" if error.where.startswith("depths_m: ") else error.where
+    if where in _PLACES or where in options:
+        text = _PLACES.get(where, f"--{where.replace('_', '-')}") + text.removeprefix(where)
     for words, option in _OPTIONS.items():
         text = text.replace(words, option)
     return text

@@ -1,5 +1,7 @@
 """Tolerances and calibration: tolerance, calibrate."""
 
+import json
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,9 +52,7 @@ def tolerance(
     """
     settings: dict[str, Any] = {"process": process, "limits": limit or None, "seed": seed, "masks": masks}
     if draw is not None:
-        from doedesign.commands.tolerance import one_draw
-
-        print_text(one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
+        print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
     from doedesign.runs.folder import open_run
     from doedesign.tolerancing import tolerance as study
@@ -73,6 +73,30 @@ def tolerance(
         scheduler=scheduler,
     )
     print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
+
+
+def _one_draw(run: Path, key: str, as_json: bool, **settings: Any) -> str:
+    """One draw of a study: its errors as TOML that other commands read and its metrics in words, or both as JSON."""
+    from doedesign.spec import variation_to_toml
+    from doedesign.tolerancing.analysis import QUANTITIES
+    from doedesign.tolerancing.pool import OutOfModel
+    from doedesign.tolerancing.studies import study
+    from fab.units import format_length
+
+    asked = study(run, quiet=True, workers=1, **settings)
+    variation = asked.variation(key)
+    asked.sample([key])
+    kept = asked.journal.finished[key]
+    rows = [] if isinstance(kept, OutOfModel) else kept
+    if as_json:
+        return json.dumps({"key": key, "variation": vars(variation), "rows": rows}, sort_keys=True)
+    lines = [f"draw {key} of {asked.design.name}, seed {asked.seed}"]
+    for row in rows:
+        found = {name: inf if row[name] is None else row[name] for name in QUANTITIES if name in row}
+        place = "infinity" if row["depth_m"] is None else format_length(row["depth_m"])
+        numbers = ", ".join(f"{name} {value:.6g}" for name, value in found.items())
+        lines.append(f"{row['colour']} at {place}: {numbers}")
+    return variation_to_toml(variation, lines)
 
 
 def calibrate(

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.build import resolve_process, with_edge_moves
-from doedesign.spec import Spec
+from doedesign.spec import Spec, load_variation
 from fab.draws import EXPECTED, variation_at
+from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process, Variation
@@ -101,20 +102,44 @@ class Design:
         own = None if self.spec is None else self.spec.process
         return with_edge_moves(resolve_process(process, self.levels, own), self.edge_moves_m)
 
+    def plate_errors(
+        self,
+        process: Process,
+        variation: "Variation | str | Path | None" = None,
+        seed: int | None = None,
+        draw: str = "normal/0",
+    ) -> tuple[Variation, str]:
+        """Return the errors of one DOE of a process, and a few words on where they come from.
+
+        Args:
+            process: the process.
+            variation: the errors themselves, SI units, or a TOML file with them.
+            seed: seed to draw them from instead; with neither, every error is at its mean.
+            draw: which draw of the seed, as in a tolerance study (`fab.draws`).
+
+        Raises:
+            InputError: both a variation and a seed, or a file that cannot be read.
+        """
+        if variation is not None and seed is not None:
+            raise InputError("seed", "a plate has one source of errors", "also `variation`", "Leave one of them out.")
+        if isinstance(variation, Variation):
+            return variation, "given errors"
+        if variation is not None:
+            return load_variation(variation), f"errors of {Path(variation).name}"
+        key = EXPECTED if seed is None else draw
+        errors = variation_at(process, seed or 0, max(self.camera.grid.extent_m), key)
+        if seed is not None:
+            return errors, f"draw {key} of seed {seed} of the process {process.name}"
+        return errors, f"every error of the process {process.name} at its mean"
+
     def fabricated(
         self,
         process: "Process | str | Path | None" = None,
         seed: int | None = None,
         draw: str = "normal/0",
-        variation: Variation | None = None,
+        variation: "Variation | str | Path | None" = None,
     ) -> "FabricatedDoe":
-        """Predict the DOE that a process makes of this design.
-
-        Args:
-            process: see `process`.
-            seed: seed of the process errors; without one (and without a variation) every error is at its mean.
-            draw: which draw of the seed, as in a tolerance study (`fab.draws`).
-            variation: the process errors themselves, SI units.
+        """Predict the DOE that a process (see `process`) makes of this design; see `plate_errors` for the others.
 
         Raises:
             InputError: a process that cannot be used, or errors beyond the model (`sim.surface.as_fabricated`).
@@ -122,10 +147,8 @@ class Design:
         from sim.surface import as_fabricated
 
         made_by = self.process(process)
-        if variation is None:
-            side_m = max(self.camera.grid.extent_m)
-            variation = variation_at(made_by, seed or 0, side_m, EXPECTED if seed is None else draw)
-        return as_fabricated(self.level_map.level, self.camera, made_by, variation)
+        errors, _ = self.plate_errors(made_by, variation, seed, draw)
+        return as_fabricated(self.level_map.level, self.camera, made_by, errors)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the level map; on `ax`, or on a new figure. Returns what it drew on."""

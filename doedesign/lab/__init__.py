@@ -1,5 +1,6 @@
 """What a lab should see, and what it measured.
 
 predictions   the numbers of a run sheet: what light does after every etch
-as_built      the plate that a filled run sheet describes
+as_built      the plate that a filled run sheet describes; as_built_run predicts it
+order         the mask order of a design, with its run sheet
 """

@@ -44,6 +44,9 @@ TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of 
 CHECKPOINT = "checkpoint.npz"
 LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
 _DEPTHS = "etch_depths_m"
+# Tables of a spec that may be changed for a finished DOE, where it is looked through and where a network is trained.
+CAPTURE_TABLES = ("scene", "sensor", "obstruction")
+TRAINING_TABLES = (*CAPTURE_TABLES, "network", "train")
 # The part of the sensor that a DOE is designed for.
 _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "defocus_m")
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from math import isclose
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
-from doedesign.runs.folder import CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run
+from doedesign.runs.folder import CAPTURE_TABLES, CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run, spec_with
 from doedesign.spec import HEIGHT_FILES
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, sha256_file
@@ -87,25 +87,33 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
 
 
 def open_design(
-    source: "Design | Run | str | Path", masks: str | Path | None = None, *, levels: int | None = None
+    source: "Design | Run | str | Path",
+    masks: str | Path | Literal[False] | None = None,
+    *,
+    levels: int | None = None,
+    overrides: Sequence[str] = (),
+    free: Sequence[str] = CAPTURE_TABLES,
 ) -> Design:
     """Return the design of a finished run, as its masks draw it.
 
     Args:
         source: the run, or its folder; a design is returned as it is.
-        masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map.
+        masks: its mask order, whose files are read; `masks/NAME` where there is one, else the run's own level map;
+            False for that in any case.
         levels: another number of levels; mask orders are then left aside.
+        overrides: changes to the spec that the design does not depend on, "table.key=value".
+        free: tables of the spec that may be changed; of the sensor, only its response to light.
 
     Raises:
-        InputError: a run or order that cannot be read, or an order of another run.
+        InputError: a run or order that cannot be read, an order of another run, or an override of something else.
     """
     if isinstance(source, Design):
         return source
     run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
-    folder = Path("masks") / run.spec.name if masks is None else Path(masks)
+    folder = Path(masks or f"masks/{run.spec.name}")
     moves_m: tuple[float, ...] = ()
-    if levels is None and (masks is not None or (folder / MANIFEST_NAME).is_file()):
+    if levels is None and masks is not False and (masks or (folder / MANIFEST_NAME).is_file()):
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
     continuous = run.path(CONTINUOUS)
@@ -116,7 +124,7 @@ def open_design(
         run.spec.scene.far_m,
         edge_moves_m=moves_m if any(moves_m) else (),
         continuous_m=read_any_height(continuous).height_m if continuous.is_file() else None,
-        spec=run.spec,
+        spec=spec_with(run, overrides, free),
         folder=run.folder,
     )
 
@@ -135,22 +143,22 @@ def write_design(folder: Path, design: Design) -> list[str]:
 
 
 def drawing_from(
-    source: Path,
-    count: int | None,
+    source: Design | Run | str | Path,
+    count: int | None = None,
     *,
     step_m: float | None = None,
-    depths_m: Sequence[float] = (),
+    etch_depths_m: Sequence[float] = (),
     pitch_m: float | None = None,
     scale_m: float | None = None,
     aperture_m: float | None = None,
 ) -> Drawing:
-    """Return the level map of a run folder or of a height map.
+    """Return the level map of a design, of a run (as optimised, not as an order draws it) or of a height map.
 
     Args:
-        source: the run folder or height map.
+        source: the design, the run or its folder, or the height map.
         count: number of levels.
         step_m: height of one level, metres; for a bare height map, like the rest.
-        depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
+        etch_depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
         pitch_m: pixel pitch, metres.
         scale_m: metres per count, for integers.
         aperture_m: diameter of the relief, metres.
@@ -158,22 +166,30 @@ def drawing_from(
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
     """
-    if not source.exists():
+    if isinstance(source, str):
+        source = Path(source)
+    if isinstance(source, Path) and not source.exists():
         raise InputError(str(source), "must be a run folder or a height map", "nothing of that name", "Check the path.")
-    if source.is_dir():
-        geometry = {"step_m": step_m, "depths_m": depths_m or None, "pitch_m": pitch_m, "scale_m": scale_m}
+    if not isinstance(source, Path) or source.is_dir():
+        geometry = {"step_m": step_m, "etch_depths_m": etch_depths_m or None, "pitch_m": pitch_m, "scale_m": scale_m}
         for name, value in {**geometry, "aperture_m": aperture_m}.items():
             if value is not None:
                 cure = "Leave it out, or give a height map."
                 raise InputError(name, "a run brings its own geometry", "a value", cure)
-        run = open_run(source)
-        design = open_design(run, levels=run.spec.process.levels if count is None else count)
-        origin = {"kind": "run", "name": run.spec.name, "level_map_sha256": level_map_of_run(run).digest}
-        return Drawing(design.level_map, origin, design)
+        if isinstance(source, Path):
+            source = open_run(source)
+        if isinstance(source, Run):
+            design = open_design(source, False, levels=count)
+            own = level_map_of_run(source)
+        elif count in (None, source.levels.count):
+            design, own = source, source.level_map
+        else:
+            raise InputError("levels", "a design has its own levels", count, "Leave it out, or give its run.")
+        return Drawing(design.level_map, {"kind": "run", "name": own.name, "level_map_sha256": own.digest}, design)
     if count is None or step_m is None:
-        missing, cure = ("number of levels", "Give `levels`.") if count is None else ("height of a level", "Give `step`.")
-        raise InputError(str(source), f"a bare height map needs the {missing}", "none", cure)
-    levels = Levels(count, step_m, tuple(depths_m))
+        missing, name = ("number of levels", "levels") if count is None else ("height of a level", "step")
+        raise InputError(str(source), f"a bare height map needs the {missing}", "none", f"Give `{name}`.")
+    levels = Levels(count, step_m, tuple(etch_depths_m))
     height = read_any_height(source, pitch_m, scale_m, aperture_m)
     # Mask shops take ASCII names; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"

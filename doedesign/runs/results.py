@@ -10,13 +10,14 @@ from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, s
 
 
 @contextlib.contextmanager
-def results_folder(folder: Path, design: str, run: Path | None = None) -> Iterator[Path]:
+def results_folder(folder: Path, design: str, run: Path | None = None, **about: str) -> Iterator[Path]:
     """Open a folder of results; its kind is its name. Nobody else may write into the run meanwhile.
 
     Args:
         folder: the folder; an earlier result is replaced.
         design: name of the design.
         run: folder of its run, if it has one.
+        about: further entries of the manifest.
 
     Yields:
         the folder to write to; it takes its name when all is written.
@@ -24,20 +25,15 @@ def results_folder(folder: Path, design: str, run: Path | None = None) -> Iterat
     Raises:
         InputError: the folder holds something else, or another process works in the run.
     """
-    require_own(folder)
-    inside = run is not None and folder.resolve().is_relative_to(run.resolve())
-    with alone_in(run) if run and inside else contextlib.nullcontext(), atomic_folder(folder) as fresh:
-        yield fresh
-        digests = {path.name: sha256_file(path) for path in sorted(fresh.iterdir())}
-        manifest = {"format": f"doedesign {folder.name} 1", "run": design, "results_sha256": digests}
-        (fresh / MANIFEST_NAME).write_bytes(canonical_json(manifest))
-
-
-def require_own(folder: Path) -> None:
-    """Refuse to replace a folder that holds more than an earlier call wrote."""
     if (folder / MANIFEST_NAME).is_file():
         listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}
         for path in sorted(folder.iterdir()):
             if path.name not in listed:
                 rule = "a folder of results that is replaced must hold nothing else"
                 raise InputError(str(folder), rule, f"also {path.name!r}", "Move that file.")
+    inside = run is not None and folder.resolve().is_relative_to(run.resolve())
+    with alone_in(run) if run and inside else contextlib.nullcontext(), atomic_folder(folder) as fresh:
+        yield fresh
+        digests = {path.name: sha256_file(path) for path in sorted(fresh.iterdir())}
+        manifest = {"format": f"doedesign {folder.name} 1", "run": design, **about, "results_sha256": digests}
+        (fresh / MANIFEST_NAME).write_bytes(canonical_json(manifest))

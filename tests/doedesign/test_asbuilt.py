@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from doedesign.commands.asbuilt import as_built
 from doedesign.design.design import Design
 from doedesign.lab.as_built import as_built_doe, compare_gratings, compare_with_sheet
+from doedesign.lab.as_built_run import as_built
 from doedesign.lab.predictions import predicted_metrics
 from doedesign.prediction import predict
 from doedesign.runs.folder import open_run
@@ -253,7 +253,8 @@ def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run
     before = [seen._asdict() for seen in predicted_metrics(predict(design, IDEAL, Variation()).rows)]
     file = write_sheet(tmp_path / "s.json", design, numbers_of(PLATE, LEVELS), {"as_drawn": before, "expected": before})
     caplog.set_level(logging.INFO)
-    folder = as_built(run, file)
+    folder = run / "as-built"
+    as_built(run, file, out=folder)
     assert folder == run / "as-built"
     bank = read_bank(folder / "as-built.exr")
     # The lag comes out of differences of pads good to 1e-7, and all is float32.
@@ -274,12 +275,13 @@ def test_a_filled_sheet_gives_the_prediction_of_the_plate_it_was_filled_from(run
     again = predict(design, IDEAL, variation)
     np.testing.assert_array_equal(again.bank.energy.astype(np.float32), bank.energy)
     content = {path.name: path.read_bytes() for path in folder.iterdir()}
-    as_built(run, file)
+    as_built(run, file, out=folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == content
 
 
 def test_an_unfilled_sheet_gives_the_plate_as_drawn(run, design, tmp_path):
-    folder = as_built(run, write_sheet(tmp_path / "s.json", design, {}))
+    folder = run / "as-built"
+    as_built(run, write_sheet(tmp_path / "s.json", design, {}), out=folder)
     nominal = predict(design, IDEAL, Variation())
     np.testing.assert_array_equal(read_bank(folder / "as-built.exr").energy, nominal.bank.energy.astype(np.float32))
     assert load_variation(folder / "variation.toml") == Variation()

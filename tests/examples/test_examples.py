@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-import doedesign.commands.psf
 import doedesign.optimization
+import doedesign.runs.psfs
 from doedesign.cli import main
 from doedesign.runs.level_maps import open_design
 from doedesign.spec import load_spec, spec_warnings
@@ -105,7 +105,7 @@ def test_demo_twice(demo: ModuleType, small: Path, tmp_path: Path):
 def test_demo_takes_no_other_order_for_its_own(
     demo: ModuleType, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.commands.psf)
+    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.runs.psfs)
     runs, masks = tmp_path / "runs", tmp_path / "masks"
     demo.demo(small, runs, masks)
     run, order = runs / "quick", masks / "quick"

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import pytest
 
-import doedesign.commands.psf
 import doedesign.optimization
+import doedesign.runs.psfs
 from doedesign.cli import main
 from tests.pictures import leave_out_pictures
 
@@ -137,7 +137,7 @@ def copied(finished: Finished, tmp_path: Path) -> Finished:
 @pytest.fixture
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing takes most of the time of a run this small; write a few bytes instead."""
-    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.commands.psf)
+    leave_out_pictures(monkeypatch, doedesign.optimization, doedesign.runs.psfs)
 
 
 @pytest.fixture(scope="session")

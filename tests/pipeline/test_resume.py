@@ -153,7 +153,7 @@ def test_psf_interrupted_keeps_the_earlier_results(copied, cli, content, monkeyp
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("doedesign.commands.psf.plot_mtf", stop)
+    monkeypatch.setattr("doedesign.runs.psfs.plot_mtf", stop)
     assert cli("psf", copied.run, "--masks", copied.order).code == 130
     assert content(copied.run) == before
 

@@ -15,12 +15,11 @@ from scipy.signal import convolve2d
 
 import doedesign.training.job
 from doedesign.cli import exit_code, main
-from doedesign.commands.finetune import finetune
 from doedesign.recon.model import Model
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import read_network, write_network
-from doedesign.training.finetune import FineTuning, Tuner, mirrored_as
+from doedesign.training.finetune import FineTuning, Tuner, finetune, mirrored_as
 from doedesign.training.history import read_history
 from doedesign.training.pairs import PairData, Pairs, find_pairs, read_pair, split_pairs
 from fab.errors import InputError
@@ -133,11 +132,17 @@ def tuned(model: Path, pairs: Path, out: Path, *, drawn: bool = False, **options
     """Fine-tune: the exit code, and what was said. Drawing takes longer than all else, so it is left out."""
     said: list[str] = []
     how = {"steps": STEPS, "validation": 2, **options}
+    files, lengths = how.pop("psf", ()), {name: how.pop(name) for name in ("pixel_m", "near_m", "far_m") if name in how}
+
+    def work() -> None:
+        opened = Model.open(model)
+        finetune(opened, pairs, out, psfs=opened.psfs(files, **lengths), **how)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.console.say", said.append)
         if not drawn:
             leave_out_pictures(patch, doedesign.training.job)
-        code = exit_code(lambda: finetune(model, pairs, out, **how))
+        code = exit_code(work)
     return code, "\n".join(said)
 
 
@@ -464,7 +469,7 @@ def test_views_that_are_all_one(model: Path, pairs: Path, tmp_path: Path):
         for part in ("capture", "reference"):
             shutil.copy(pairs / f"0_{part}.png", tmp_path / f"{k}_{part}.png")
     with pytest.raises(InputError, match="none of whose pictures is held out"):
-        finetune(model, tmp_path, tmp_path / "out")
+        finetune(Model.open(model), tmp_path, tmp_path / "out")
 
 
 def test_folders_and_checkpoints_of_others(model: Path, pairs: Path, whole: Path, tmp_path: Path):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,7 @@ from PIL import Image
 
 import doedesign
 from doedesign.cli import main
-from doedesign.commands.reconstruct import reconstruct
-from doedesign.recon.files import FORMAT
+from doedesign.recon.files import FORMAT, reconstruct_files
 from doedesign.recon.model import Model
 from doedesign.recon.network import NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
@@ -48,6 +48,12 @@ def model_in(
     write_network(folder / "network.npz", drawn(layout, spread), about)
     write_bank(folder / "psf.exr", psfs or bank(about["colours"] and tuple(about["colours"])))
     return folder
+
+
+def reconstruct(model: Path, captures: list[Path], out: Path, *, psf: Any = (), **how: Any) -> list[Path]:
+    opened = Model.open(model)
+    lengths = {name: how.pop(name) for name in ("pixel_m", "near_m", "far_m") if name in how}
+    return reconstruct_files(opened, captures, out, psfs=opened.psfs(psf, **lengths), **how)
 
 
 @pytest.fixture

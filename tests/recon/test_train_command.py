@@ -27,15 +27,16 @@ import fab.archive
 from doedesign.build import camera_from_spec
 from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code, main
-from doedesign.commands.train import train
+from doedesign.design.design import Design
 from doedesign.recon.weights import read_network
 from doedesign.report.history import plot_training
 from doedesign.report.sheet import ValidationRow, plot_validation
+from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import drawing_from, open_design
 from doedesign.spec import load_spec
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
-from doedesign.training.train import train as train_design
+from doedesign.training.train import train
 from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.figure import save
@@ -130,12 +131,16 @@ def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     leave_out_pictures(monkeypatch, doedesign.training.job)
 
 
+def changed_design(run: Path, *changes: str) -> Design:
+    return open_design(run, False, overrides=changes, free=TRAINING_TABLES)
+
+
 def trained(run: Path, out: Path, images: Path, *changes: str, **more: Any) -> tuple[int, str]:
     """Train: the exit code, and what was said."""
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("doedesign.cli.console.say", said.append)
-        code = exit_code(lambda: train(run, images, out, overrides=changes, **more))
+        code = exit_code(lambda: train(changed_design(run, *changes), images, out, overrides=changes, **more))
     return code, "\n".join(said)
 
 
@@ -261,16 +266,16 @@ def test_a_training_without_a_plate_has_no_masks(
 def test_without_a_folder_the_model_is_what_is_left(run: Path, images: Path, whole: Path):
     """The same training in memory, but for a shorter one that an option asks for."""
     design = open_design(run, levels=4)
-    model = train_design(design, images)
+    model = train(design, images)
     assert model.folder is None
     learnt, _ = read_network(whole / "network.npz")
     for one, other in zip(jax.tree.leaves(model.network), jax.tree.leaves(learnt), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert train_design(design, images, steps=1).about["steps"] == 1
+    assert train(design, images, steps=1).about["steps"] == 1
     with pytest.raises(InputError, match="stepps"):
-        train_design(design, images, stepps=1)
+        train(design, images, stepps=1)
     with pytest.raises(InputError, match="design: must have a spec"):
-        train_design(design.bare(), images)
+        train(design.bare(), images)
 
 
 # --- stopped and resumed ---------------------------------------------------------------------------------------------
@@ -376,8 +381,9 @@ import sys, time
 from pathlib import Path
 import doedesign.training.job as job
 from doedesign.cli import exit_code
-from doedesign.commands.train import train
+from doedesign.runs.level_maps import open_design
 from doedesign.training.joint import Trainer
+from doedesign.training.train import train
 from fab.files import write_atomic
 
 step = Trainer.step
@@ -389,7 +395,7 @@ for name in ("plot_training", "plot_validation"):
     setattr(job, name, lambda *_: None)
 job.save = lambda _, path: write_atomic(path, b"picture")
 run, out, images = map(Path, sys.argv[1:])
-sys.exit(exit_code(lambda: train(run, images, out)))
+sys.exit(exit_code(lambda: train(open_design(run, False), images, out)))
 """
 
 

@@ -1,0 +1,152 @@
+"""PSFs of a finished run: of the continuous design, the quantised one, and the one drawn in the masks."""
+
+import contextlib
+import logging
+import shutil
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from doedesign.build import camera_from_spec
+from doedesign.design.metrics import design_metrics
+from doedesign.runs.folder import CONTINUOUS, Run, open_run
+from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
+from doedesign.runs.results import results_folder
+from doedesign.runtime.progress import meter
+from doedesign.spec import Spec, spec_from_json, spec_to_json
+from fab.errors import CheckFailed
+from fab.figure import save
+from fab.files import MANIFEST_NAME, canonical_json
+from fab.height import HeightMap
+from fab.plots.height import plot_height
+from sim.camera import Camera
+from sim.optic import HeightOptic, RingOptic
+from sim.plots.curves import plot_encircled, plot_mtf
+from sim.plots.psfs import plot_psfs
+from sim.propagation.hankel import radial_profile, ring_count
+from sim.psf_bank import PsfBank, psf
+from sim.store import write_bank
+from sim.transfer import mtf
+
+log = logging.getLogger("doedesign")
+
+
+def psfs(
+    run: Run | str | Path,
+    masks: str | Path | None = None,
+    depths_m: Sequence[float] = (),
+    field_rad: tuple[float, float] = (0.0, 0.0),
+    out: str | Path | None = None,
+) -> dict[str, PsfBank]:
+    """Compute the PSFs of a run's heights before rounding, of its level map, and of what its masks draw.
+
+    Args:
+        run: a finished run, or its folder.
+        masks: its mask order; `masks/NAME` if there is one.
+        depths_m: source depths, metres; those of the spec by default.
+        field_rad: field angles (y, x), radians.
+        out: folder for the banks, their metrics (SI units) and pictures.
+
+    Returns:
+        PSF banks by name: "continuous", "quantised", and "from_masks" if there is a mask order.
+
+    Raises:
+        InputError: a run, a mask order or depths that cannot be used.
+        CheckFailed: the masks draw something else than the design.
+    """
+    run = run if isinstance(run, Run) else open_run(Path(run))
+    camera = camera_from_spec(run.spec)
+    near, far = _near_and_far(run.spec, depths_m)
+    designs = _heights_of(run, masks)
+    total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
+    writing = contextlib.nullcontext() if out is None else results_folder(Path(out), run.spec.name, run.folder)
+    with writing as fresh:
+        with meter("PSFs", total) as progress:
+            done = count(1)
+
+            def bank(name: str) -> PsfBank:
+                optic, propagation = HeightOptic.of(camera, designs[name]), run.spec.optics.propagation
+                profile = radial_profile(designs[name], camera.grid) if _takes_hankel(run, name, field_rad) else None
+                if profile is not None:
+                    optic, propagation = RingOptic(camera, jnp.asarray(profile[: ring_count(camera)])), "far_field"
+                given: Any = {"field_rad": field_rad, "propagation": propagation}
+                return psf(optic, depths=(*near, *far), on_psf=lambda: progress.advance(next(done)), **given)
+
+            banks = {name: bank(name) for name in designs}
+        if "from_masks" in banks and not np.array_equal(banks["from_masks"].energy, banks["quantised"].energy):
+            raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
+        if fresh is not None:
+            log.info("writing banks and pictures")
+            _write(fresh, run, camera, designs, banks, near, far)
+    return banks
+
+
+def _heights_of(run: Run, masks: str | Path | None) -> dict[str, np.ndarray]:
+    """Height maps by name; see `psfs`."""
+    level_map = level_map_of_run(run)
+    designs = {"continuous": read_any_height(run.path(CONTINUOUS)).height_m, "quantised": level_map.height_m}
+    folder = Path("masks") / run.spec.name if masks is None else Path(masks)
+    if masks is None and not (folder / MANIFEST_NAME).is_file():
+        log.info(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
+        return designs
+    rebuilt = level_map.with_level(drawn_in_masks(folder, level_map))
+    different = rebuilt.level != level_map.level
+    if different.any():
+        y, x = (int(i) for i in np.argwhere(different)[0])
+        where = f"{int(different.sum())} cells are not drawn as designed in {run.folder}, first row {y}, column {x}"
+        raise CheckFailed([f"{folder}: {where}"])
+    return designs | {"from_masks": rebuilt.height_m}
+
+
+def _near_and_far(spec: Spec, depths_m: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Near and far depths to look at; the rules of a spec hold for depths that are given, too."""
+    depths = tuple(dict.fromkeys(depths_m or (*spec.scene.near_m, *spec.scene.far_m)))
+    # A depth the spec does not name counts as near if it is no farther than the farthest obstruction.
+    near = tuple(z for z in depths if z <= max(spec.scene.near_m, default=0.0))
+    far = tuple(z for z in depths if z not in near)
+    scene = {"near_m": near or spec.scene.near_m, "far_m": far or spec.scene.far_m}
+    spec_from_json(spec_to_json(spec) | {"scene": scene}, "depths_m")
+    return near, far
+
+
+def _takes_hankel(run: Run, name: str, field_rad: tuple[float, float]) -> bool:
+    """Rings before rounding, seen on the axis, are rings; what is drawn is a raster of cells."""
+    return name == "continuous" and run.spec.optimize.parametrization == "radial" and not any(field_rad)
+
+
+def _write(
+    folder: Path,
+    run: Run,
+    camera: Camera,
+    designs: dict[str, np.ndarray],
+    banks: dict[str, PsfBank],
+    near: tuple[float, ...],
+    far: tuple[float, ...],
+) -> None:
+    flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
+    lens = psf(flat, depths=depths, field_rad=field)
+    lens_transfer = mtf(flat, depths=depths)
+    metrics: dict[str, Any] = {}
+    for name in ("continuous", "quantised"):
+        bank, height = banks[name], designs[name]
+        write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
+        save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
+        transfer = mtf(height, camera, depths)
+        save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
+        save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
+        metrics[name] = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
+    if _takes_hankel(run, "continuous", field):
+        # The budget's band is that of a raster of cells, which rings are not.
+        metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]
+    if "from_masks" in banks:
+        # Equal to the last bit (checked above), so its numbers and pictures are the same files.
+        metrics["from_masks"] = metrics["quantised"]
+        for path in sorted(folder.glob("quantised*")):
+            shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
+    height_map = HeightMap(designs["continuous"], camera.grid, camera.aperture_m)
+    save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
+    (folder / "metrics.json").write_bytes(canonical_json(metrics))
