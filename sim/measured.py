@@ -190,7 +190,7 @@ def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
     size = tuple(cast(int, next_fast_len(2 * count, real=True)) for count in clear.shape)
     folded = np.asarray(irfft2(np.square(np.asarray(rfft2(clear, size))), size))
     top, left = (int(i) for i in np.unravel_index(np.argmax(folded), size))
-    peak = (top + _vertex(folded[:, left], top), left + _vertex(folded[top], left))
+    peak = (top + parabola_vertex(folded[:, left], top), left + parabola_vertex(folded[top], left))
     # A bin's middle lies (factor - 1) / 2 pixels beyond its first one.
     row, column = (factor * place / 2 + (factor - 1) / 2 for place in peak)
     return row, column
@@ -227,7 +227,7 @@ def _sums(values: Float[np.ndarray, "y x"], factor: int) -> Float[np.ndarray, "v
     return padded.reshape(rows, factor, columns, factor).sum(axis=(1, 3))
 
 
-def _vertex(values: Float[np.ndarray, " n"], at: int) -> float:
+def parabola_vertex(values: Float[np.ndarray, " n"], at: int) -> float:
     """Where between its neighbours the parabola through a peak has its vertex."""
     low, peak, high = values[at - 1], values[at], values[(at + 1) % len(values)]
     bend = low - 2 * peak + high

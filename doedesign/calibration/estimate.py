@@ -6,29 +6,20 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from doedesign.build import with_edge_moves
-from doedesign.calibration.fit import Fit, search
-from doedesign.calibration.forward_model import ForwardModel, probe_camera
+from doedesign.calibration.files import write_calibration
+from doedesign.calibration.fit import search
+from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.measurement import Measurement, read_measurement
-from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.objective import FitObjective, Linearization, OnModel
+from doedesign.calibration.plots import plot_fitted_psfs
 from doedesign.calibration.target import likeness, target_of
-from doedesign.calibration.uncertainty import (
-    DETERMINED,
-    EXPLAINED,
-    LeftOut,
-    Posterior,
-    Reading,
-    cost_rises,
-    left_out,
-    posterior_of,
-    readings,
-)
+from doedesign.calibration.uncertainty import Posterior, Reading, cost_rises, left_out, posterior_of, readings
 from doedesign.calibration.unknowns import Unknowns, relative, unknowns_of
 from doedesign.design.design import Design
 from doedesign.report.labels import error_label, value_text
@@ -38,6 +29,7 @@ from doedesign.runs.results import results_folder
 from doedesign.runtime.progress import meter
 from fab.figure import html_of
 from fab.process import Normal, Process
+from sim.camera import Colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,42 +37,49 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("doedesign")
 
+_EXPLAINED = 1.5  # chi2 per pixel up to which images count as explained
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A finished calibration.
 
     Attributes:
-        objective: images and model.
-        fit: where the search ended.
+        fit: images and model where the search ended, and derivatives there.
         posterior: values of the errors and their uncertainty.
         process: the process with what is now known: means are the estimates, standard deviations their uncertainty.
-        left_out: every image predicted from the others; empty for a single image.
+        left_out: chi2 per pixel of every image predicted from the others; empty for a single image.
         readings: what a lab reads off the images, measured and predicted.
         rises: how much the cost rises where it should rise by one.
         measurement: the images as they were read.
+        models: fabricated DOEs that were computed; a central difference counts as one.
         remarks: what a user must know before relying on any of it, in sentences.
     """
 
-    objective: FitObjective
-    fit: Fit
+    fit: Linearization
     posterior: Posterior
     process: Process
-    left_out: list[LeftOut]
+    left_out: list[float]
     readings: list[Reading]
     rises: list[float]
     measurement: Measurement
+    models: int
     remarks: tuple[str, ...] = ()
+
+    @property
+    def objective(self) -> FitObjective:
+        """Images and model."""
+        return self.fit.at.objective
 
     @property
     def explained(self) -> bool:
         """Whether the model explains the images to their noise."""
-        return self.posterior.chi2_per_pixel <= EXPLAINED
+        return self.posterior.chi2_per_pixel <= _EXPLAINED
 
     @property
     def determined(self) -> dict[str, bool]:
         """Whether the images, and not the prior, say what an error is, by its name."""
-        return dict(zip(self.objective.unknowns.names, (self.posterior.ratio < DETERMINED).tolist(), strict=True))
+        return dict(zip(self.objective.unknowns.names, self.posterior.determined, strict=True))
 
     @property
     def estimates(self) -> dict[str, str]:
@@ -92,7 +91,7 @@ class Calibration:
         """What was found, a line per error."""
         labels = {error_label(name): name for name in self.estimates}
         wide = max(map(len, labels))
-        lines = [f"{self.posterior.chi2_per_pixel:.4g} chi2 per pixel after {self.fit.models} plates"]
+        lines = [f"{self.posterior.chi2_per_pixel:.4g} chi2 per pixel after {self.models} plates"]
         for label, name in labels.items():
             note = "" if self.determined[name] else "  (not determined)"
             lines.append(f"{label:<{wide}}  {self.estimates[name]}{note}")
@@ -106,8 +105,6 @@ class Calibration:
         Args:
             ax: axes whose place the picture takes; a new figure by default.
         """
-        from doedesign.calibration.plots import plot_fitted_psfs
-
         return plot_fitted_psfs(self, ax)
 
     def _repr_html_(self) -> str:
@@ -154,10 +151,8 @@ def calibrate(
     writing = contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder)
     # Usually seven rounds of derivatives and a step.
     with writing as fresh, models_meter("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
-        result = _calibrated(design, prior, unknowns, measurement, evaluations, polish, seed, on_model)
+        result = _calibrated(design, unknowns, measurement, evaluations, polish, seed, on_model)
         if fresh is not None:
-            from doedesign.calibration.files import write_calibration
-
             write_calibration(fresh, design, result, process)
     log.info(str(result))
     return result
@@ -165,35 +160,40 @@ def calibrate(
 
 def _calibrated(
     design: Design,
-    prior: Process,
     unknowns: Unknowns,
     measurement: Measurement,
     evaluations: int,
     polish: int,
     seed: int,
-    on_model: Callable[[str], None],
+    on_model: OnModel,
 ) -> Calibration:
-    spec, images = measurement.spec, measurement.images
+    spec, images, models = measurement.spec, measurement.images, count()
+
+    def counted(words: str) -> None:
+        next(models)
+        on_model(words)
+
     fill = design.camera.fill if spec.fill_factor is None else spec.fill_factor
-    camera = probe_camera(design.camera, spec.probe_m, spec.pixel_m, measurement.window, fill)
-    model = ForwardModel(design.level_map.level, camera, prior, unknowns, tuple(image.depth_m for image in images))
+    probe = (Colour("probe", (spec.probe_m,), (1.0,)),)
+    camera = replace(design.camera, colours=probe, pixel_m=spec.pixel_m, window=measurement.window, fill=fill)
+    model = ForwardModel(design.level_map.level, camera, unknowns, tuple(image.depth_m for image in images))
     nominal = model.plate(unknowns.start)
     expected = [nominal.image(i, np.zeros(3)) for i in range(len(images))]
-    each = zip(images, expected, strict=True)
-    objective = FitObjective(model, tuple(target_of(image, measurement.window, like) for image, like in each))
-    fit = search(objective, evaluations=evaluations, polish=polish, seed=seed, on_model=on_model)
-    posterior = posterior_of(objective, fit)
+    targets = (target_of(image, measurement.window, like) for image, like in zip(images, expected, strict=True))
+    objective = FitObjective(model, tuple(targets))
+    fit = search(objective, evaluations=evaluations, polish=polish, seed=seed, on_model=counted)
+    posterior = posterior_of(fit)
     result = Calibration(
-        objective,
         fit,
         posterior,
-        _estimated(prior, unknowns, posterior, design.edge_moves_m),
-        left_out(objective, fit, posterior) if len(objective.targets) > 1 else [],
-        readings(objective, fit, posterior),
-        cost_rises(objective, fit, posterior),
+        _estimated(unknowns, posterior, design.edge_moves_m),
+        left_out(fit) if len(images) > 1 else [],
+        readings(fit, posterior),
+        cost_rises(fit, posterior),
         measurement,
+        next(models),
     )
-    return replace(result, remarks=tuple(_remarks(result, expected)))
+    return replace(result, remarks=tuple(_remarks(result, expected[0])))
 
 
 @contextlib.contextmanager
@@ -204,21 +204,20 @@ def models_meter(title: str, likely: int) -> Iterator[Callable[[str], None]]:
         yield lambda words: progress.advance(min(next(done), likely - 1), words)
 
 
-def _estimated(prior: Process, unknowns: Unknowns, posterior: Posterior, edge_moves_m: Sequence[float]) -> Process:
-    found = {
-        name: Normal(float(value), float(sigma))
-        for name, value, sigma in zip(unknowns.names, posterior.values, posterior.sigma, strict=True)
-    }
+def _estimated(unknowns: Unknowns, posterior: Posterior, edge_moves_m: Sequence[float]) -> Process:
+    prior = unknowns.process
+    each = zip(unknowns.names, posterior.values, posterior.sigma, strict=True)
+    found = {name: Normal(float(value), float(sigma)) for name, value, sigma in each}
     # The others' places are relative to mask 0.
     references = {f"{name.partition('[')[0]}[0]" for name in unknowns.names if relative(name)}
     still = {name: Normal(prior.spreads.get(name, Normal()).mean, 0.0) for name in references}
-    spreads = MappingProxyType({**prior.spreads, **still, **found})
-    process = replace(prior, spreads=spreads, name=f"{prior.name}, calibrated")
+    process = replace(prior, spreads={**prior.spreads, **still, **found}, name=f"{prior.name}, calibrated")
     # What was found is relative to the design; what the process does, to the masks.
     return with_edge_moves(process, [-move for move in edge_moves_m])
 
 
-def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> Iterator[str]:
+def _remarks(result: Calibration, expected: Float[np.ndarray, "y x"]) -> Iterator[str]:
+    """Remarks on a calibration, given the first image as it was expected."""
     posterior, unknowns = result.posterior, result.objective.unknowns
     if not result.explained:
         yield (
@@ -226,8 +225,14 @@ def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) 
             f"alone gives 1. Standard deviations are {posterior.inflation:.2g} times as wide for it, which covers what "
             "is random in the misfit and nothing else."
         )
-        yield from _turned_remarks(result, expected)
-    elif posterior.chi2_per_pixel < 1 / EXPLAINED:
+        turned = [(turns, mirrored) for mirrored in (False, True) for turns in range(4)]
+        ways = {way: likeness(result.objective.targets[0], expected, *way) for way in turned}
+        turns, mirrored = best = max(ways, key=lambda way: ways[way])
+        if ways[best] >= ways[0, False] + 0.02:
+            way = f"turned left by {turns} more quarter turns" + (" after mirroring them" if mirrored else "")
+            cure = "check quarter_turns and mirrored in the measurement"
+            yield f"The images look more like the design when {way}: {cure}."
+    elif posterior.chi2_per_pixel < 1 / _EXPLAINED:
         yield (
             f"The images are less noisy than stated: chi2 per pixel is {posterior.chi2_per_pixel:.3g} where noise "
             "alone gives 1. Check gain and read noise."
@@ -247,15 +252,3 @@ def _remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) 
         yield f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1."
     if any(relative(name) for name in unknowns.names):
         yield "Places of masks are relative to mask 0; a common shift cannot be seen."
-
-
-def _turned_remarks(result: Calibration, expected: Sequence[Float[np.ndarray, "y x"]]) -> Iterator[str]:
-    """Whether the images look more like the model when they are turned or mirrored."""
-    target, model = result.objective.targets[0], expected[0]
-    ways = {
-        (turns, mirrored): likeness(target, model, turns, mirrored) for mirrored in (False, True) for turns in range(4)
-    }
-    turns, mirrored = best = max(ways, key=lambda way: ways[way])
-    if ways[best] >= ways[0, False] + 0.02:
-        way = f"turned left by {turns} more quarter turns" + (" after mirroring them" if mirrored else "")
-        yield f"The images look more like the design when {way}: check quarter_turns and mirrored in the measurement."

@@ -23,9 +23,7 @@ _MOST_EXPLANATIONS = 14
 def plot_explanations(found: "ExplanationSet", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the ring:disc ratio along every error, and the explanations of the measured ratio in order.
 
-    Args:
-        found: the explanations.
-        ax: axes whose place the picture takes; a new figure by default.
+    `ax` are axes whose place the picture takes; a new figure by default.
     """
     shown = [*found.singles[:_MOST_EXPLANATIONS], *found.pairs[: _MOST_EXPLANATIONS // 2]]
     targets = found.targets
@@ -45,7 +43,7 @@ def _words(found: "ExplanationSet") -> str:
     throughput = found.targets.throughput
     if throughput is not None:
         words += f"; full bars: throughput within two standard deviations of the {100 * throughput:.3g} % measured"
-    alone = [error_label(one[0]) for one in found.none if len(one) == 1]
+    alone = list(map(error_label, found.unreached))
     return words + (f"; none within {found.reach:g} standard deviations: {'; '.join(alone)}" if alone else "")
 
 

@@ -15,7 +15,7 @@ effects added; where along it the ratio is met is then found with the model itse
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -25,6 +25,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from doedesign.calibration.estimate import models_meter
+from doedesign.calibration.explanation_plots import plot_explanations
+from doedesign.calibration.files import write_explanations
+from doedesign.calibration.objective import OnModel
 from doedesign.calibration.unknowns import chosen_names, definite_means, prior_sigma
 from doedesign.design.design import Design
 from doedesign.prediction import predict
@@ -34,7 +37,7 @@ from doedesign.runs.level_maps import open_design
 from doedesign.runs.results import results_folder
 from fab.errors import InputError
 from fab.figure import html_of
-from fab.process import Process, deviation_of, variation_of
+from fab.process import Normal, Process, deviation_of, variation_of
 from sim.camera import Colour
 
 if TYPE_CHECKING:
@@ -84,10 +87,7 @@ class Explanation(NamedTuple):
         values: the errors by flat name, SI units.
         scores: how many standard deviations each lies from its mean.
         distance: how many they lie from it together.
-        ring_to_disc: the model's ratio there.
-        throughput: its throughput.
-        zeroth_order: its zeroth order.
-        strehl: overlap with the field that the design means to make.
+        ring_to_disc, throughput, zeroth_order, strehl: the model's metrics there.
         fits: whether the throughput is within two standard deviations of that measured; None if none was.
     """
 
@@ -102,13 +102,7 @@ class Explanation(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """The ratio along one error.
-
-    Attributes:
-        scores: standard deviations from the mean, ascending.
-        ring_to_disc: the model's ratio there.
-        throughput: the model's throughput there.
-    """
+    """The model's ratio and throughput along one error; scores are standard deviations from the mean, ascending."""
 
     scores: tuple[float, ...]
     ring_to_disc: tuple[float, ...]
@@ -138,6 +132,11 @@ class ExplanationSet(NamedTuple):
     assumed: dict[str, float]
     reach: float
 
+    @property
+    def unreached(self) -> list[str]:
+        """Errors that do not reach the ratio alone."""
+        return [names[0] for names in self.none if len(names) == 1]
+
     def __str__(self) -> str:
         """The explanations as a table."""
         targets, nominal = self.targets, self.nominal
@@ -151,12 +150,14 @@ class ExplanationSet(NamedTuple):
             + ("" if targets.throughput is None else " (*: and the throughput, to two sigmas)"),
         ]
         for title, rows in (("one error", self.singles), ("two errors", self.pairs)):
-            if rows:
-                lines += [f"{title}:", *map(_line, rows)]
-        alone = [names[0] for names in self.none if len(names) == 1]
-        if alone:
+            lines += [f"{title}:"] if rows else []
+            for each in rows:
+                values = ", ".join(f"{error_label(name)} {value_text(name, v)}" for name, v in each.values.items())
+                light = f"{100 * each.throughput:8.1f} %{'*' if each.fits else ' '} {100 * each.zeroth_order:8.2f} %"
+                lines.append(f"{each.distance:6.2f}  {light}  {values}")
+        if self.unreached:
             lines.append(f"none within {self.reach:g} sigmas, where the ratio stays within:")
-        for name in alone:
+        for name in self.unreached:
             ratios = self.curves[name].ring_to_disc
             lines.append(f"  {min(ratios):5.3g} to {max(ratios):5.3g}  {error_label(name)}")
         if self.assumed:
@@ -168,13 +169,7 @@ class ExplanationSet(NamedTuple):
         return "\n".join(lines)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
-        """Draw the ratio along every error, and the explanations in order.
-
-        Args:
-            ax: axes whose place the picture takes; a new figure by default.
-        """
-        from doedesign.calibration.explanation_plots import plot_explanations
-
+        """Draw the ratio along every error, and the explanations in order, in the place of axes or a new figure."""
         return plot_explanations(self, ax)
 
     def _repr_html_(self) -> str:
@@ -183,12 +178,6 @@ class ExplanationSet(NamedTuple):
             for each in [*self.singles, *self.pairs]
         }
         return html_of(f"ring:disc {self.targets.ring_to_disc:.3g}", rows or {"none": "within reach"}, self.plot())
-
-
-def _line(each: Explanation) -> str:
-    values = ", ".join(f"{error_label(name)} {value_text(name, value)}" for name, value in each.values.items())
-    mark = "*" if each.fits else " "  # the throughput fits, too
-    return f"{each.distance:6.2f}  {100 * each.throughput:8.1f} %{mark} {100 * each.zeroth_order:8.2f} %  {values}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +189,12 @@ class _ScoredModel:
     sigma: Mapping[str, float]
     targets: Targets
     reach: float
-    on_model: Callable[[str], None]
+    on_model: OnModel
     computed: dict[tuple[tuple[str, float], ...], dict[str, Any] | None] = field(default_factory=dict)
 
     def values(self, scores: Mapping[str, float]) -> dict[str, float]:
-        spreads = self.process.spreads
-        return {n: (spreads[n].mean if n in spreads else 0.0) + z * self.sigma[n] for n, z in scores.items()}
+        means = self.process.spreads
+        return {name: means.get(name, Normal()).mean + z * self.sigma[name] for name, z in scores.items()}
 
     def row(self, scores: Mapping[str, float]) -> dict[str, Any] | None:
         """The model's metrics; None where it does not describe an error."""
@@ -219,13 +208,19 @@ class _ScoredModel:
         values = self.values(scores)
         if any(value < 0 and deviation_of(name).one_sided for name, value in values.items()):
             return None
-        means = definite_means(self.process)
+        variation = variation_of(self.process.masks, {**definite_means(self.process), **values})
         try:
-            return predict(self.design, self.process, variation_of(self.process.masks, {**means, **values})).rows[0]
+            return predict(self.design, self.process, variation).rows[0]
         except InputError:
             if not scores:
                 raise
             return None  # such as edges that move by more than half a cell
+
+    def means(self) -> dict[str, Any]:
+        """The model's metrics at the process's means."""
+        row = self.row({})
+        assert row is not None  # otherwise the model has refused it
+        return row
 
     def excess(self, scores: Mapping[str, float]) -> float:
         """Logarithm of the model's ratio over the measured one; NaN where the model does not describe an error."""
@@ -233,11 +228,9 @@ class _ScoredModel:
         return np.nan if row is None else float(np.log(max(row["ring_to_disc"], 1e-9) / self.targets.ring_to_disc))
 
     def crossing(self, direction: Mapping[str, float], start: float = 0.5) -> Mapping[str, float] | None:
-        """First scores along a ray at which the ratio is the measured one.
+        """First scores along a ray (a direction of length 1) at which the ratio is the measured one.
 
-        Args:
-            direction: of length 1.
-            start: where to look first; beyond it every standard deviation.
+        The ray is looked at where it starts, at `start`, and beyond it at every standard deviation.
         """
 
         def at(length: float) -> dict[str, float]:
@@ -268,12 +261,10 @@ class _ScoredModel:
 
     def curve(self, name: str) -> Curve:
         """All that was computed along one error."""
-        points = [(0.0, self.row({}))] + [
-            (key[0][1], row) for key, row in self.computed.items() if [n for n, _ in key] == [name]
-        ]
-        known = sorted((score, row) for score, row in points if row is not None)
-        columns = (tuple(row[quantity] for _, row in known) for quantity in ("ring_to_disc", "throughput"))
-        return Curve(tuple(score for score, _ in known), *columns)
+        along = [(key[0][1], row) for key, row in self.computed.items() if [n for n, _ in key] == [name]]
+        known = [(score, row) for score, row in [(0.0, self.means()), *along] if row is not None]
+        points = sorted((score, row["ring_to_disc"], row["throughput"]) for score, row in known)
+        return Curve(*zip(*points, strict=True))
 
 
 def explain_ratio(
@@ -320,16 +311,13 @@ def explain_ratio(
         sigma = {name: prior_sigma(prior, name) for name in names}
         found = _explained(_ScoredModel(probed, prior, sigma, targets, reach, on_model), pairs)
         if fresh is not None:
-            from doedesign.calibration.files import write_explanations
-
             write_explanations(fresh, design.name, found)
     log.info(str(found))
     return found
 
 
 def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:
-    nominal = model.row({})
-    assert nominal is not None  # otherwise the model has refused it
+    nominal = model.means()
     singles, none = [], []
     for name in model.sigma:
         crossings = [model.crossing({name: sign}) for sign in (1.0, -1.0)]
@@ -354,16 +342,17 @@ def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:
 def _pairs(
     model: _ScoredModel, curves: Mapping[str, Curve], singles: Sequence[Explanation]
 ) -> tuple[list[Explanation], list[tuple[str, ...]]]:
-    """Most plausible pairs of errors of different kinds."""
-    alone: dict[str, float] = {}
-    for each in singles:
-        (name,) = each.scores
-        alone[name] = min(each.distance, alone.get(name, np.inf))
+    """Most plausible pairs of errors of different kinds, and the pairs that do not reach the ratio."""
+
+    def promise(name: str) -> tuple[float, float]:
+        """Sort key: what explains most easily alone, then what changes the ratio most."""
+        alone = (each.distance for each in singles if name in each.scores)
+        return min(alone, default=np.inf), -float(np.ptp(np.log(curves[name].ring_to_disc)))
+
     best: dict[str, str] = {}
     for name in curves:
         kind = name.partition("[")[0]
-        if kind not in best or _promise(curves, alone, name) < _promise(curves, alone, best[kind]):
-            best[kind] = name
+        best[kind] = min(best.get(kind, name), name, key=promise)
     met, apart = [], []
     for one, other in combinations(best.values(), 2):
         mixtures = list(_mixtures(model, curves[one], curves[other]))
@@ -378,17 +367,10 @@ def _pairs(
     return met, apart
 
 
-def _promise(curves: Mapping[str, Curve], alone: Mapping[str, float], name: str) -> tuple[float, float]:
-    """Sort key: what explains most easily alone, then what changes the ratio most."""
-    ratios = np.log(curves[name].ring_to_disc)
-    return alone.get(name, np.inf), -float(np.ptp(ratios))
-
-
 def _mixtures(model: _ScoredModel, one: Curve, other: Curve) -> Iterator[tuple[float, float, float]]:
     """Cost, length and angle of mixtures that would reach the ratio if effects added."""
     lengths = np.linspace(0, model.reach, 81)[1:]
-    row = model.row({})
-    assert row is not None  # the model has not refused the means
+    row, targets = model.means(), model.targets
     base = {"ring_to_disc": np.log(row["ring_to_disc"]), "throughput": row["throughput"]}
 
     def effect(curve: Curve, scores: np.ndarray, quantity: str) -> np.ndarray:
@@ -397,21 +379,16 @@ def _mixtures(model: _ScoredModel, one: Curve, other: Curve) -> Iterator[tuple[f
         return np.interp(scores, curve.scores, values, left=np.nan, right=np.nan) - base[quantity]
 
     for angle in np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False):
-        shares = np.cos(angle), np.sin(angle)
-        if min(map(abs, shares)) < _LEAST_SHARE:
+        first, second = np.cos(angle) * lengths, np.sin(angle) * lengths
+        if min(abs(np.cos(angle)), abs(np.sin(angle))) < _LEAST_SHARE:
             continue
-        sums = {
-            quantity: base[quantity]
-            + effect(one, shares[0] * lengths, quantity)
-            + effect(other, shares[1] * lengths, quantity)
-            for quantity in base
-        }
-        excess = sums["ring_to_disc"] - np.log(model.targets.ring_to_disc)
-        start = base["ring_to_disc"] - np.log(model.targets.ring_to_disc)
-        crossed = np.flatnonzero(excess * start <= 0)
+        ratio, throughput = (base[q] + effect(one, first, q) + effect(other, second, q) for q in base)
+        start, measured = base["ring_to_disc"], np.log(targets.ring_to_disc)
+        crossed = np.flatnonzero((ratio - measured) * (start - measured) <= 0)
         if crossed.size:
-            length, throughput = float(lengths[crossed[0]]), float(sums["throughput"][crossed[0]])
+            length = float(lengths[crossed[0]])
             cost = length**2
-            if model.targets.throughput is not None:
-                cost += ((throughput - model.targets.throughput) / model.targets.throughput_sigma) ** 2
+            if targets.throughput is not None:
+                off = float(throughput[crossed[0]]) - targets.throughput
+                cost += (off / targets.throughput_sigma) ** 2
             yield cost, length, float(angle)

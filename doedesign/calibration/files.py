@@ -8,14 +8,12 @@ explanations.json/.txt  errors that would give a measured ring:disc ratio
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from doedesign.build import spec_from_process
-from doedesign.calibration.estimate import Calibration
 from doedesign.calibration.explanation_plots import plot_explanations
-from doedesign.calibration.explanations import ExplanationSet
 from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
 from doedesign.design.design import Design
 from doedesign.spec import load_process, process_to_toml, variation_to_toml
@@ -24,15 +22,28 @@ from fab.files import canonical_json
 from fab.process import Process
 from fab.stock import STOCK
 
+if TYPE_CHECKING:
+    from doedesign.calibration import Calibration, ExplanationSet
 
-def write_calibration(folder: Path, design: Design, result: Calibration, process: Process | str | Path | None) -> None:
+
+def write_calibration(
+    folder: Path, design: Design, result: "Calibration", process: Process | str | Path | None
+) -> None:
     """Write a calibration; the spec of the process says how far the chrome reaches, which a process does not know."""
-    record = {"run": design.name, "measurement_sha256": result.measurement.digests, **calibration_record(result)}
+    digests = result.measurement.digests
+    record = {"run": design.name, "measurement_sha256": digests, **_record(result)}
     (folder / "calibration.json").write_bytes(canonical_json(record))
     like = design.spec and design.spec.process
     if isinstance(process, str | Path) and process not in STOCK:
         like = load_process(process)
-    comments = _comments(result)
+    # Where the estimate comes from and how far it may be relied on.
+    comments = [
+        "Estimated from measured PSFs by doedesign calibrate.",
+        "Means of the errors below are the estimates for one plate, sigmas how well they are known.",
+        f"{result.posterior.chi2_per_pixel:.4g} chi2 per pixel (noise alone gives 1)",
+        *result.remarks,
+        *(f"{name}: sha256 {digest}" for name, digest in digests.items()),
+    ]
     estimate = process_to_toml(spec_from_process(result.process, like), comments)
     (folder / "process-estimate.toml").write_text(estimate, encoding="utf-8")
     doe = result.objective.unknowns.variation(result.posterior.values)
@@ -42,36 +53,24 @@ def write_calibration(folder: Path, design: Design, result: Calibration, process
     save(plot_check(result), folder / "check.png")
 
 
-def _comments(result: Calibration) -> list[str]:
-    """Head of the estimate: where it comes from and how far it may be relied on."""
-    return [
-        "Estimated from measured PSFs by doedesign calibrate.",
-        "Means of the errors below are the estimates for one plate, sigmas how well they are known.",
-        f"{result.posterior.chi2_per_pixel:.4g} chi2 per pixel (noise alone gives 1)",
-        *result.remarks,
-        *(f"{name}: sha256 {digest}" for name, digest in result.measurement.digests.items()),
-    ]
-
-
-def calibration_record(result: Calibration) -> dict[str, Any]:
+def _record(result: "Calibration") -> dict[str, Any]:
     """A calibration as plain values, SI units."""
     unknowns, posterior, at = result.objective.unknowns, result.posterior, result.fit.at
-    others = {one.name: one for one in result.left_out}
     images = []
-    for i, target in enumerate(result.objective.targets):
-        motion, found = result.objective.motion(at.scores, i), at.matches[i]
+    for i, found in enumerate(at.matches):
+        target, motion = found.target, result.objective.motion(at.scores, i)
         row = {
             "name": target.name,
-            "depth_m": None if math.isinf(target.depth_m) else target.depth_m,
-            "chi2_per_pixel": found.chi2 / max(target.pixels, 1),
+            "depth_m": None if math.isinf(target.image.depth_m) else target.image.depth_m,
+            "chi2_per_pixel": found.chi2_per_pixel,
             "pixels": target.pixels,
             "rate_per_unit_energy": found.gain * target.scale,
             "background": found.background * target.scale,
             "shift_px": [float(motion[0]), float(motion[1])],
             "defocus_per_m": float(motion[2]),
         }
-        if target.name in others:
-            row["chi2_per_pixel_from_the_others"] = others[target.name].predicted
+        if result.left_out:
+            row["chi2_per_pixel_from_the_others"] = result.left_out[i]
         images.append(row)
     return {
         "errors": [
@@ -93,12 +92,12 @@ def calibration_record(result: Calibration) -> dict[str, Any]:
         "images": images,
         "readings": [reading._asdict() for reading in result.readings],
         "rises": result.rises,
-        "models": result.fit.models,
+        "models": result.models,
         "remarks": list(result.remarks),
     }
 
 
-def write_explanations(folder: Path, design: str, found: ExplanationSet) -> None:
+def write_explanations(folder: Path, design: str, found: "ExplanationSet") -> None:
     """Write explanations as JSON, text and a picture."""
     record = {
         **found._asdict(),

@@ -11,8 +11,7 @@ Weights come from the measurement at first and from the model as soon as that ex
 
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 import nlopt
 import numpy as np
@@ -27,15 +26,10 @@ from doedesign.calibration.objective import (
     Jacobian,
     Linearization,
     OnModel,
-    Weights,
     difference_jacobian,
     difference_steps,
-    evaluate,
     evaluate_with_gradient,
-    image_jacobians,
-    image_residuals,
     linearised,
-    matched,
 )
 from doedesign.calibration.target import measured_weights, weights_at
 
@@ -49,25 +43,6 @@ _DOE_ERROR = 4e-3
 _EXPLAINED = 3.0  # chi2 per pixel below which the model knows the noise better than the pixels do
 
 
-class Fit(NamedTuple):
-    """Where the search ended.
-
-    Attributes:
-        linearization: the model at the best scores.
-        weights: inverse variance of every pixel.
-        models: fabricated DOEs that were computed; a central difference counts as one.
-    """
-
-    linearization: Linearization
-    weights: Weights
-    models: int
-
-    @property
-    def at(self) -> Evaluation:
-        """The model at the best scores."""
-        return self.linearization.at
-
-
 def search(
     objective: FitObjective,
     *,
@@ -75,7 +50,7 @@ def search(
     polish: int = 0,
     seed: int = 0,
     on_model: OnModel = lambda _: None,
-) -> Fit:
+) -> Linearization:
     """Find the errors.
 
     Args:
@@ -84,66 +59,45 @@ def search(
             0 to leave it out.
         polish: steps along the exact gradient at the end; 0 to leave it out.
         seed: seed of the global search.
-        on_model: called after every model, with words on how it goes.
+        on_model: called after every model (a central difference counts as one) from several threads, with words on how
+            it goes.
 
     Returns:
         the model at the best scores, linearised, with weights from the model itself where that explains the images.
     """
-    counted = count(1)
-
-    def tell(words: str) -> None:
-        next(counted)  # several threads count
-        on_model(words)
-
-    nominal = objective.model.plate(objective.unknowns.start)
-    errors = [float(np.hypot(nominal.expected_error(i), _DOE_ERROR)) for i in range(len(objective.targets))]
-    measured = tuple(measured_weights(t, e) for t, e in zip(objective.targets, errors, strict=True))
-    start = evaluate(objective, measured, objective.start(), nominal)
-    found, weights = _local(objective, errors, measured, start, tell)
+    model, unknowns, targets = objective.model, objective.unknowns, objective.targets
+    nominal = model.plate(unknowns.start)
+    transforms = (model.optic(i, nominal.grid).plan for i in range(len(targets)))
+    errors = [float(np.hypot(plan.expected_error, _DOE_ERROR)) for plan in transforms]
+    measured = tuple(map(measured_weights, targets, errors))
+    scores = np.concatenate([unknowns.scores(unknowns.start), np.zeros(len(objective.motions))])
+    start = objective.evaluate(measured, scores, nominal)
+    found = _local(start, errors, on_model)
     if evaluations and found.at.chi2 > _EXPLAINED * objective.pixels:
-        again = _global(objective, measured, start.scores, evaluations, seed, tell)
-        other = _local(objective, errors, measured, again, tell)
+        other = _local(_global(start, evaluations, seed, on_model), errors, on_model)
         # Compared under the weights that know nothing of either.
-        costs = [_reweighted(objective, measured, one.at).cost for one in (found, other[0])]
-        if costs[1] < costs[0]:
-            found, weights = other
+        found = min(found, other, key=lambda one: one.at.reweighted(measured).cost)
     if polish:
-        after = _polish(objective, weights, found, polish, tell)
+        after = _polish(found, polish, on_model)
         if after is not found.at:
-            jacobian = difference_jacobian(objective, after, difference_steps(found.sigma), tell)
-            found = linearised(objective, weights, after, jacobian)
-    return Fit(found, weights, next(counted) - 1)
+            jacobian = difference_jacobian(after, difference_steps(found.sigma), on_model)
+            found = linearised(after, jacobian)
+    return found
 
 
-def _reweighted(objective: FitObjective, weights: Weights, at: Evaluation) -> Evaluation:
-    return at._replace(matches=matched(objective, weights, at.images))
-
-
-def _model_weights(objective: FitObjective, errors: Sequence[float], at: Evaluation) -> Weights:
-    """Weights from the model's own images."""
-    each = zip(objective.targets, at.matches, at.images, errors, strict=True)
-    return tuple(weights_at(t, m.gain * image, e, max(m.background, 0.0)) for t, m, image, e in each)
-
-
-def _global(
-    objective: FitObjective,
-    weights: Weights,
-    scores: Float[np.ndarray, " s"],
-    evaluations: int,
-    seed: int,
-    tell: OnModel,
-) -> Evaluation:
+def _global(start: Evaluation, evaluations: int, seed: int, on_model: OnModel) -> Evaluation:
     """Best model of a controlled random search over the errors; images stay where they were found."""
+    objective = start.objective
     unknowns, errors = objective.unknowns, objective.errors
     best: list[Evaluation] = []
 
     def cost(point: np.ndarray, _: np.ndarray) -> float:
         # The range is a box in values; scores of related errors are not.
         value = np.clip(point, unknowns.low, unknowns.high)
-        at = evaluate(objective, weights, np.concatenate([unknowns.scores(value), scores[errors:]]))
+        at = objective.evaluate(start.weights, np.concatenate([unknowns.scores(value), start.scores[errors:]]))
         if not best or at.cost < best[0].cost:
             best[:] = [at]
-        tell(f"global, {best[0].cost / objective.pixels:.4g} per pixel")
+        on_model(f"global, {best[0].cost / objective.pixels:.4g} per pixel")
         return at.cost
 
     optimiser = nlopt.opt(nlopt.GN_CRS2_LM, errors)
@@ -156,25 +110,26 @@ def _global(
     optimiser.set_population(min(5 * (errors + 1), max(evaluations // 2, errors + 1)))
     optimiser.set_min_objective(cost)
     optimiser.set_maxeval(evaluations)
-    optimiser.optimize(np.clip(objective.values(scores), low, high))
+    optimiser.optimize(np.clip(objective.values(start.scores), low, high))
     return best[0]
 
 
-def _local(
-    objective: FitObjective, errors: Sequence[float], weights: Weights, at: Evaluation, tell: OnModel
-) -> tuple[Linearization, Weights]:
+def _local(at: Evaluation, errors: Sequence[float], on_model: OnModel) -> Linearization:
     """Least-squares fits from a model on, each with the weights of the last one's images."""
-    jacobian = difference_jacobian(objective, at, np.full(len(at.scores), WIDEST_STEP), tell)
+    most = _EXPLAINED * at.objective.pixels
+    jacobian = difference_jacobian(at, np.full(len(at.scores), WIDEST_STEP), on_model)
     for _ in range(_ROUNDS):
-        explained = at.chi2 < _EXPLAINED * objective.pixels
+        explained = at.chi2 < most
         if explained:
-            weights = _model_weights(objective, errors, at)
-            at = _reweighted(objective, weights, at)
-        fitting = _LeastSquares(objective, weights, linearised(objective, weights, at, jacobian), explained, tell)
+            each = zip(at.matches, errors, strict=True)
+            at = at.reweighted(
+                tuple(weights_at(m.target, m.gain * m.model, e, max(m.background, 0.0)) for m, e in each)
+            )
+        fitting = _LeastSquares(linearised(at, jacobian), explained, on_model)
         before, at, jacobian = at, *fitting.solve()
-        if not at.chi2 < _EXPLAINED * objective.pixels or _settled(fitting.found, before, at):
+        if not at.chi2 < most or _settled(fitting.found, before, at):
             break
-    return linearised(objective, weights, at, jacobian), weights
+    return linearised(at, jacobian)
 
 
 def _settled(around: Linearization, before: Evaluation, after: Evaluation) -> bool:
@@ -194,12 +149,10 @@ class _LeastSquares:
     images that are not yet explained ends as soon as they are, for then there are better weights.
     """
 
-    def __init__(
-        self, objective: FitObjective, weights: Weights, start: Linearization, explained: bool, tell: OnModel
-    ) -> None:
-        self.objective, self.weights, self.found, self.tell = objective, weights, start, tell
-        self.best, self.explained = start.at, explained
-        unknowns, motions = objective.unknowns, len(objective.motions)
+    def __init__(self, start: Linearization, explained: bool, on_model: OnModel) -> None:
+        self.found, self.best, self.explained, self.on_model = start, start.at, explained, on_model
+        self.objective = start.at.objective
+        unknowns, motions = self.objective.unknowns, len(self.objective.motions)
         errors = np.linalg.solve(unknowns.root, np.diag(unknowns.sigma))
         self.scores_per_x = np.asarray(block_diag(errors, np.eye(motions)), np.float64)
         ends = [(end - unknowns.mean) / unknowns.sigma for end in (unknowns.low, unknowns.high)]
@@ -219,38 +172,39 @@ class _LeastSquares:
         scores = self.scores_per_x @ (self.origin + x)
         at = self.best
         if not np.allclose(scores, at.scores, rtol=0, atol=1e-12):
-            at = evaluate(self.objective, self.weights, scores)
-            self.tell(f"{min(at.chi2, self.best.chi2) / self.objective.pixels:.4g} per pixel")
+            at = self.objective.evaluate(at.weights, scores)
+            self.on_model(f"{min(at.chi2, self.best.chi2) / self.objective.pixels:.4g} per pixel")
             if at.cost >= self.best.cost and _settled(self.found, self.best, at):
                 raise _Converged
         if at.cost < self.best.cost:
             self.best = at
-        return np.concatenate([*image_residuals(self.objective, self.weights, at), at.scores])
+        return np.concatenate([*(found.residuals() for found in at.matches), at.scores])
 
     def _jacobian(self, x: Float[np.ndarray, " x"]) -> Float[np.ndarray, "n x"]:
         """Derivatives at the best scores, for a step is taken only where the cost falls."""
         if (at := self.best) is not self.found.at:
             if _settled(self.found, self.found.at, at):
                 raise _Converged
-            jacobian = difference_jacobian(self.objective, at, difference_steps(self.found.sigma), self.tell)
-            self.found = linearised(self.objective, self.weights, at, jacobian)
+            jacobian = difference_jacobian(at, difference_steps(self.found.sigma), self.on_model)
+            self.found = linearised(at, jacobian)
             if not self.explained and at.chi2 < _EXPLAINED * self.objective.pixels:
                 raise _Converged
-        rows = image_jacobians(self.objective, self.weights, at, self.found.jacobian)
+        rows = self.found.residual_jacobians()
         return np.concatenate([*rows, np.eye(len(at.scores))], axis=1).T @ self.scores_per_x
 
 
-def _polish(objective: FitObjective, weights: Weights, found: Linearization, steps: int, tell: OnModel) -> Evaluation:
+def _polish(found: Linearization, steps: int, on_model: OnModel) -> Evaluation:
     """Follow the exact gradient, in scores turned so that the Hessian is the identity; within the errors' range."""
-    start, unknowns = found.at.scores, objective.unknowns
+    objective, start = found.at.objective, found.at.scores
+    unknowns = objective.unknowns
     turn = np.linalg.cholesky(np.linalg.inv(found.half_hessian))
     best = [found.at]
 
     def cost(point: np.ndarray) -> tuple[float, np.ndarray]:
-        at, gradient = evaluate_with_gradient(objective, weights, start + turn @ point)
+        at, gradient = evaluate_with_gradient(objective, found.at.weights, start + turn @ point)
         if at.cost < best[0].cost:
             best[0] = at
-        tell(f"{best[0].chi2 / objective.pixels:.4g} per pixel")
+        on_model(f"{best[0].chi2 / objective.pixels:.4g} per pixel")
         return at.cost / 2, turn.T @ gradient / 2
 
     # In prior standard deviations, so that all constraints are of a size.

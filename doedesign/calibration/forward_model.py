@@ -21,22 +21,16 @@ from jaxtyping import Array, Complex, Float, UInt8
 
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
-from fab.process import Process
-from sim.camera import Camera, Colour, source_path_m, wrapped_waves
+from sim.camera import Camera, source_path_m, wrapped_waves
 from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
 
-MOTIONS = ("shift_y", "shift_x", "defocus")  # pixels, pixels, 1/m
+Motion = Float[np.ndarray, "3"]  # of an image: shifts along y and x in pixels, defocus in 1/m
 
 
 class VariedDoe(NamedTuple):
-    """What light meets.
-
-    Attributes:
-        transmission: `[y, x]` at the probe's wavelength.
-        coverage: `[y, x]` open share of every cell.
-    """
+    """Transmission of the cells at the probe's wavelength, and the open share of each."""
 
     transmission: Complex[Array, "y x"]
     coverage: Float[Array, "y x"]
@@ -83,12 +77,6 @@ def _energy(optic: _Optic, plate: VariedDoe, motion: Float[Array, "3"]) -> Float
     return optic.factor * optic.plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion))
 
 
-def probe_camera(camera: Camera, wavelength_m: float, pixel_m: float, window: int, fill: float) -> Camera:
-    """The camera as the measurement used it: one colour, its own pixels."""
-    probe = Colour("probe", (wavelength_m,), (1.0,))
-    return replace(camera, colours=(probe,), pixel_m=pixel_m, window=window, fill=fill)
-
-
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
     """A plate in front of a camera, images of point sources at some depths.
@@ -96,14 +84,12 @@ class ForwardModel:
     Attributes:
         level: `[y, x]` levels as drawn.
         camera: optics and sensor, of one wavelength.
-        process: the process.
-        unknowns: which errors vary.
+        unknowns: which errors of the process vary.
         depths_m: depth of every image.
     """
 
     level: UInt8[np.ndarray, "y x"]
     camera: Camera
-    process: Process
     unknowns: Unknowns
     depths_m: tuple[float, ...]
     _optics: dict[Any, _Optic] = field(default_factory=dict)
@@ -114,23 +100,24 @@ class ForwardModel:
         return self.camera.colours[0].wavelengths_m[0]
 
     def _surface(self, values: Any) -> tuple[VariedDoe, Grid]:
-        variation = self.unknowns.variation(values)
-        surface = as_fabricated(self.level, self.camera, self.process, variation, (self.wavelength_m,))
+        process, variation = self.unknowns.process, self.unknowns.variation(values)
+        surface = as_fabricated(self.level, self.camera, process, variation, (self.wavelength_m,))
         return VariedDoe(surface.transmission[0], surface.coverage), surface.grid
 
     def plate(self, values: Float[np.ndarray, " p"]) -> "DoeImages":
         """The plate with some errors."""
         return DoeImages(self, *self._surface([float(v) for v in values]))
 
-    def plate_and_pull(
+    def plate_and_vjp(
         self, values: Float[np.ndarray, " p"]
     ) -> tuple["DoeImages", Callable[[VariedDoe], Float[np.ndarray, " p"]]]:
         """The plate, and the function that turns a gradient with respect to it into one with respect to the errors."""
         plate, pull, grid = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
         return DoeImages(self, plate, grid), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
 
-    def optic(self, depth_m: float, grid: Grid) -> _Optic:
-        """Plan and source of a depth for a plate of some cells; made once."""
+    def optic(self, index: int, grid: Grid) -> _Optic:
+        """Plan and source of an image for a plate of some cells; made once."""
+        depth_m = self.depths_m[index]
         key = (depth_m, grid)
         if key not in self._optics:
             camera, wavelength = replace(self.camera, grid=grid), self.wavelength_m
@@ -150,40 +137,30 @@ class ForwardModel:
 class DoeImages:
     """A plate and the images of it."""
 
-    bench: ForwardModel
+    model: ForwardModel
     plate: VariedDoe
     grid: Grid
 
-    def image(self, index: int, motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "y x"]:
+    def image(self, index: int, motion: Motion) -> Float[np.ndarray, "y x"]:
         """Energy in every pixel of an image, per unit power on the clear aperture, Fresnel loss included."""
-        return np.asarray(_energy(self._optic(index), self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
+        optic = self.model.optic(index, self.grid)
+        return np.asarray(_energy(optic, self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
 
-    def image_and_pull(
-        self, index: int, motion: Float[np.ndarray, "3"]
-    ) -> tuple[
-        Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[VariedDoe, Float[np.ndarray, "3"]]]
-    ]:
+    def image_and_vjp(
+        self, index: int, motion: Motion
+    ) -> tuple[Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[VariedDoe, Motion]]]:
         """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
-        image, pull = jax.vjp(partial(_energy, self._optic(index)), self.plate, jnp.asarray(motion, jnp.float32))
+        energy = partial(_energy, self.model.optic(index, self.grid))
+        image, pull = jax.vjp(energy, self.plate, jnp.asarray(motion, jnp.float32))
 
-        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[VariedDoe, Float[np.ndarray, "3"]]:
+        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[VariedDoe, Motion]:
             to_plate, to_motion = pull(jnp.asarray(gradient, jnp.float32))
             return to_plate, np.asarray(to_motion, np.float64)
 
         return np.asarray(image, np.float64), back
 
-    def expected_error(self, index: int) -> float:
-        """Relative error that the transform expects of itself."""
-        return self._optic(index).plan.expected_error
-
     def zeroth_order(self) -> float:
         """Share of the light that passes as if the plate were flat."""
-        return float(abs(self.mean(self.plate)) ** 2)
-
-    def mean(self, plate: VariedDoe) -> complex:
-        """Mean transmission over the clear aperture."""
-        light = np.asarray(jnp.sum(plate.transmission * self.plate.coverage, axis=1), np.complex128).sum()
-        return complex(light) / (np.pi * (self.bench.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
-
-    def _optic(self, index: int) -> _Optic:
-        return self.bench.optic(self.bench.depths_m[index], self.grid)
+        light = np.asarray(jnp.sum(self.plate.transmission * self.plate.coverage, axis=1), np.complex128).sum()
+        mean = complex(light) / (np.pi * (self.model.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
+        return float(abs(mean) ** 2)

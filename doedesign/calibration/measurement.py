@@ -22,7 +22,7 @@ Files are found relative to the folder of the TOML file. What a lab may say besi
 import logging
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -39,14 +39,7 @@ from fab.files import sha256_file
 from fab.units import MM
 from sim.camera import Camera
 from sim.frames import CameraFrame, Channel, read_frame
-from sim.measured import (
-    MeasuredPsf,
-    Noise,
-    centre_of_light,
-    cut_window,
-    merge_exposures,
-    without_background,
-)
+from sim.measured import MeasuredPsf, Noise, centre_of_light, cut_window, merge_exposures, without_background
 
 log = logging.getLogger("doedesign")
 
@@ -170,35 +163,28 @@ def load_measurement(path: Path) -> MeasurementSpec:
     return spec
 
 
-def _problems(spec: MeasurementSpec) -> list[InputError]:
-    found, names = [], [image.called for image in spec.image]
+def _problems(spec: MeasurementSpec) -> Iterator[InputError]:
+    names = [image.called for image in spec.image]
     for i, image in enumerate(spec.image):
         key, count = f"image[{i}]", len(image.files)
         if len(image.exposures) != count and not (count == 1 and not image.exposures):
             rule = f"must have one entry per file, {count} here"
-            found.append(InputError(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures."))
+            yield InputError(f"{key}.exposures", rule, str(len(image.exposures)), "Add or remove exposures.")
         if len(image.dark) not in (0, 1, count):
             rule = f"must name one dark frame per file, {count} here, or one for all"
-            found.append(InputError(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files."))
+            yield InputError(f"{key}.dark", rule, str(len(image.dark)), "Add or remove files.")
         if image.dark and image.black_level is not None:
-            found.append(InputError(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one."))
+            yield InputError(f"{key}.black_level", "must be left out beside `dark`", "both", "Remove one.")
         if names.index(image.called) != i:
-            cure = "Add `name` to one of them."
-            found.append(
-                InputError(f"{key}.name", "every image must have its own name", f'"{image.called}" twice', cure)
-            )
+            rule, cure = "every image must have its own name", "Add `name` to one of them."
+            yield InputError(f"{key}.name", rule, f'"{image.called}" twice', cure)
         if image.incident is not None and not image.exposures:
             rule = "counts per second mean nothing without an exposure"
-            found.append(InputError(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.'))
-    return found
+            yield InputError(f"{key}.exposures", rule, "none", 'Add `exposures = ["10 ms"]`.')
 
 
 def read_measurement(path: Path, camera: Camera) -> Measurement:
-    """Read a measurement with all its images.
-
-    Args:
-        path: the TOML file.
-        camera: the design's, for the window.
+    """Read a measurement with all its images; the window is that of the design's camera unless it says otherwise.
 
     Raises:
         InputError: a mistake in the file, or an image that cannot be used.
@@ -216,16 +202,15 @@ def read_measurement(path: Path, camera: Camera) -> Measurement:
     merged = [_merged(spec, image, read) for image in spec.image]
     smallest = min(min(psf.rate.shape) for psf in merged)
     window = spec.window or min(round(camera.window * camera.pixel_m / spec.pixel_m), smallest)
-    images = []
+    images, full = [], {}
     for image, psf in zip(spec.image, merged, strict=True):
         try:
             images.append(_measured_image(spec, image, psf, camera, window))
         except InputError as error:
             raise InputError(f"{path}: image {image.called}", error.rule, error.got, error.cure) from error
-    full = {image.called: int((~psf.valid).sum()) for image, psf in zip(spec.image, merged, strict=True)}
-    for name, pixels in full.items():
-        if pixels and spec.channel is None:
-            log.info(f"{name}: {pixels} pixels are full in every exposure and left out")
+        full[image.called] = int((~psf.valid).sum())
+        if full[image.called] and spec.channel is None:
+            log.info(f"{image.called}: {full[image.called]} pixels are full in every exposure and left out")
     return Measurement(spec, tuple(images), window, digests, full)
 
 
@@ -253,13 +238,10 @@ def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], Camer
 def _measured_image(
     spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int
 ) -> MeasuredImage:
-    if min(psf.rate.shape) < window:
-        rule = f"an image must have at least the window's {window} pixels per side"
-        raise InputError(image.called, rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
     clean, _ = without_background(psf)
     centre = _stated_centre(spec, image, psf.rate.shape) or centre_of_light(clean)
     # The rest of the frame has served; half a window to either side is kept for a better centre.
-    size = min(2 * window, *psf.rate.shape)
+    size = max(window, min(2 * window, *psf.rate.shape))
     cut, rest = cut_window(clean, centre, size)
     bend = image.depth_sigma_m / image.depth_m**2 if math.isfinite(image.depth_m) else 0.0
     return MeasuredImage(

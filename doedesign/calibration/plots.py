@@ -1,4 +1,7 @@
-"""Pictures of a calibration: measured images beside the model's, errors and their uncertainty, quality of the fit."""
+"""Pictures of a calibration: measured images beside the model's, errors and their uncertainty, quality of the fit.
+
+Each takes the place of axes `ax` of a subplot, or makes a new figure.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -40,15 +43,8 @@ _READINGS = {"ring_to_disc": "ring:disc", "far_spot": "far spot", "throughput": 
 
 
 def plot_fitted_psfs(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
-    """Draw every measured image beside the model's, and their difference in standard deviations.
-
-    Measured and model share a logarithmic scale. Pixels that were not used are grey.
-
-    Args:
-        result: the calibration.
-        ax: axes whose place the picture takes; a new figure by default.
-    """
-    count = len(result.objective.targets)
+    """Draw every measured image beside the model's, and their difference in standard deviations; grey: not used."""
+    count = len(result.fit.at.matches)
     words = (
         "measured and model: logarithmic, background taken off, in units of the model's light in the window; "
         "difference: measured - model in standard deviations of the noise; grey: no usable pixel"
@@ -64,27 +60,20 @@ def _draw_image(figure: "FigureBase", row: Sequence["Axes"], result: "Calibratio
     from matplotlib.colors import LogNorm, Normalize
 
     objective, at = result.objective, result.fit.at
-    target, found, weights = objective.targets[index], at.matches[index], result.fit.weights[index]
-    total = at.images[index].sum()
-    model = at.images[index] / total
+    found = at.matches[index]
+    target, total = found.target, found.model.sum()
+    model = found.model / total
     measured = (target.psf.rate - found.background) / (found.gain * total)
-    pulls = found.residual * np.sqrt(weights)
-    valid = weights > 0
+    valid, everywhere = found.weights > 0, np.ones(model.shape, dtype=bool)
     top = float(model.max())
     norm = LogNorm(max(float(np.quantile(model, 0.02)), 1e-6 * top), top, clip=True)
-    light = colormaps[LIGHT].with_extremes(bad=FAINT)
-    differences = colormaps["RdBu_r"].with_extremes(bad=FAINT)
+    pulls, ends = found.residual * np.sqrt(found.weights), Normalize(-_MOST_SIGMA, _MOST_SIGMA)
+    light, differences = (colormaps[name].with_extremes(bad=FAINT) for name in (LIGHT, "RdBu_r"))
     pixel_m = objective.model.camera.pixel_m
     images = (
-        (f"{target.name}, {length_text(target.depth_m)}: measured", measured, valid, light, norm),
-        ("model", model, np.ones_like(valid), light, norm),
-        (
-            f"difference, {found.chi2 / max(valid.sum(), 1):.3g} chi2 per pixel",
-            pulls,
-            valid,
-            differences,
-            Normalize(-_MOST_SIGMA, _MOST_SIGMA),
-        ),
+        (f"{target.name}, {length_text(target.image.depth_m)}: measured", measured, valid, light, norm),
+        ("model", model, everywhere, light, norm),
+        (f"difference, {found.chi2_per_pixel:.3g} chi2 per pixel", pulls, valid, differences, ends),
     )
     for axes, (title, values, there, colours, scale) in zip(row, images, strict=True):
         box = extent_of(model.shape, pixel_m)
@@ -108,12 +97,7 @@ def _masked(values: Float[np.ndarray, "y x"], valid: np.ndarray) -> np.ma.Masked
 
 
 def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
-    """Draw every error with its uncertainty against its prior, and the correlation of errors.
-
-    Args:
-        result: the calibration.
-        ax: axes whose place the picture takes; a new figure by default.
-    """
+    """Draw every error with its uncertainty against its prior, and the correlation of errors."""
     unknowns, posterior = result.objective.unknowns, result.posterior
     count = len(unknowns.names)
     height = max(_ROW * count, 1.4)
@@ -132,7 +116,8 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
             style: dict[str, Any] = {"color": LINE, "mec": LINE, "capsize": 3, "lw": 1.6, "ms": 5}
             fill = LINE if result.determined[name] else "white"
             errors.errorbar(centre[i], row, xerr=spread[i], fmt="o", mfc=fill, **style)
-            _beside(errors, float(row), value_text(name, posterior.values[i], posterior.sigma[i]))
+            words = value_text(name, posterior.values[i], posterior.sigma[i])
+            errors.annotate(words, (1.03, row), xycoords=("axes fraction", "data"), va="center", fontsize=SMALL)
         errors.set_yticks(rows, [error_label(name) for name in unknowns.names])
         errors.set_ylim(-0.6, count - 0.4)
         reach = max(1.3, float(np.max(np.abs(centre) + spread)) * 1.1)
@@ -148,18 +133,8 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
     return figure
 
 
-def _beside(axes: "Axes", row: float, words: str) -> None:
-    """Write words to the right of a row."""
-    axes.annotate(words, (1.03, row), xycoords=("axes fraction", "data"), va="center", fontsize=SMALL)
-
-
 def plot_check(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
-    """Draw the posterior check: residuals against the noise, images predicted from the others, numbers read off.
-
-    Args:
-        result: the calibration.
-        ax: axes whose place the picture takes; a new figure by default.
-    """
+    """Draw the posterior check: residuals against the noise, images predicted from the others, numbers read off."""
     words = (
         "left: residuals of all pixels in standard deviations, against the normal distribution (dashed); middle: "
         "chi2 per pixel of every image in the fit and as predicted from the other images; right: numbers read off "
@@ -175,10 +150,9 @@ def plot_check(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
 
 def _draw_residuals(axes: "Axes", result: "Calibration") -> None:
     bins = np.linspace(-6, 6, 61)
-    for i, target in enumerate(result.objective.targets):
-        weights = result.fit.weights[i]
-        pulls = (result.fit.at.matches[i].residual * np.sqrt(weights))[weights > 0]
-        style: dict[str, Any] = {"histtype": "step", "color": SERIES[i % len(SERIES)], "label": target.name}
+    for i, found in enumerate(result.fit.at.matches):
+        pulls = (found.residual * np.sqrt(found.weights))[found.weights > 0]
+        style: dict[str, Any] = {"histtype": "step", "color": SERIES[i % len(SERIES)], "label": found.target.name}
         axes.hist(np.clip(pulls, -5.999, 5.999), bins.tolist(), density=True, **style)
     middle = (bins[1:] + bins[:-1]) / 2
     axes.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color=INK, ls="--", lw=1)
@@ -190,14 +164,11 @@ def _draw_residuals(axes: "Axes", result: "Calibration") -> None:
 
 
 def _draw_left_out(axes: "Axes", result: "Calibration") -> None:
-    fitted = [
-        found.chi2 / max(int(target.psf.valid.sum()), 1)
-        for target, found in zip(result.objective.targets, result.fit.at.matches, strict=True)
-    ]
+    fitted = [found.chi2_per_pixel for found in result.fit.at.matches]
     rows = np.arange(len(fitted))[::-1]
     axes.barh(rows + 0.17, fitted, 0.3, color=LINE, label="fit of all")
     if result.left_out:
-        axes.barh(rows - 0.17, [one.predicted for one in result.left_out], 0.3, color=MARK, label="from the others")
+        axes.barh(rows - 0.17, result.left_out, 0.3, color=MARK, label="from the others")
     axes.axvline(1, color=INK, ls="--", lw=1)
     axes.set_yticks(rows, [target.name for target in result.objective.targets])
     axes.set_ylim(-0.6, len(fitted) - 0.4)

@@ -13,7 +13,7 @@ from scipy.fft import irfft2, rfft2
 from scipy.ndimage import gaussian_filter
 
 from fab.errors import InputError
-from sim.measured import MeasuredPsf, cut_window, smoothed
+from sim.measured import MeasuredPsf, cut_window, parabola_vertex, smoothed
 
 
 class MeasuredImage(NamedTuple):
@@ -41,84 +41,130 @@ class Target(NamedTuple):
     """A measured image in the window, in units in which its light adds up to about 1.
 
     Attributes:
-        name: what it is called.
-        depth_m: depth of the point source.
+        image: the image as it came.
         psf: the window.
         scale: rate of one unit.
         shift_px: where the chief ray lies, pixels from the window's middle (y, x), as found before the fit.
-        gain: what the gain should be and its standard deviation, or None.
-        defocus_sigma: standard deviation of the source's curvature, 1/m.
     """
 
-    name: str
-    depth_m: float
+    image: MeasuredImage
     psf: MeasuredPsf
     scale: float
     shift_px: tuple[float, float]
-    gain: tuple[float, float] | None
-    defocus_sigma: float
+
+    @property
+    def name(self) -> str:
+        """The image's name."""
+        return self.image.name
 
     @property
     def pixels(self) -> int:
         """Number of pixels that count."""
         return int(self.psf.valid.sum())
 
+    @property
+    def gain_sigma(self) -> float | None:
+        """Standard deviation of the gain, which should be 1 where the brightness is known."""
+        return self.image.brightness and self.image.brightness[1]
+
 
 class Match(NamedTuple):
-    """A model beside a measured image.
+    """A model's image beside a measured one.
 
     Attributes:
+        target: the measured image.
+        weights: inverse variances of its pixels; zero where a pixel says nothing.
+        model: the model's image.
         gain: what one unit of the model's energy is in the image.
         background: level of the image.
         residual: `[y, x]` image - gain * model - background.
         chi2: weighted sum of squares, with the gain's own term.
     """
 
+    target: Target
+    weights: Float[np.ndarray, "y x"]
+    model: Float[np.ndarray, "y x"]
     gain: float
     background: float
     residual: Float[np.ndarray, "y x"]
     chi2: float
 
+    @property
+    def chi2_per_pixel(self) -> float:
+        """Sum of squares over the pixels that count."""
+        return self.chi2 / max(self.target.pixels, 1)
 
-def target_of(measured: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
+    def residuals(self) -> Float[np.ndarray, " n"]:
+        """Residuals in standard deviations, last that of a gain that is known; their squares add up to `chi2`."""
+        pixels, sigma = (np.sqrt(self.weights) * self.residual).ravel(), self.target.gain_sigma
+        return np.append(pixels, (self.gain - 1.0) / sigma) if sigma else pixels
+
+    def residual_jacobian(self, columns: Float[np.ndarray, "p y x"]) -> Float[np.ndarray, "p n"]:
+        """Derivatives of `residuals` from those of the model's image, gain and background solved for.
+
+        After Kaufman, BIT 15, 49 (1975).
+        """
+        root, sigma = np.sqrt(self.weights).ravel(), self.target.gain_sigma
+        flat = self.gain * columns.reshape(len(columns), -1) * root
+        basis = np.stack([self.model.ravel(), np.ones(root.size)]) * root
+        normal = basis @ basis.T
+        if sigma:
+            normal[0, 0] += sigma**-2
+        shares = np.linalg.solve(normal, basis @ flat.T)
+        pixels = shares.T @ basis - flat
+        return np.column_stack([pixels, -shares[0] / sigma]) if sigma else pixels
+
+
+def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Match:
+    """Best gain and background, and what is left."""
+    rate, total, sigma = target.psf.rate, weights.sum(), target.gain_sigma
+    mean_model, mean_rate = (float((weights * v).sum() / total) for v in (model, rate))
+    centred = weights * (model - mean_model)
+    wanted, trust = (1.0, sigma**-2) if sigma else (0.0, 0.0)
+    against = float((centred * (rate - mean_rate)).sum()) + trust * wanted
+    gain = max(against / (float((centred * (model - mean_model)).sum()) + trust), np.finfo(float).tiny)
+    background = mean_rate - gain * mean_model
+    residual = np.where(weights > 0, rate - gain * model - background, 0.0)
+    chi2 = float((weights * residual**2).sum()) + trust * (gain - wanted) ** 2
+    return Match(target, weights, model, gain, background, residual, chi2)
+
+
+def target_of(image: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
     """Cut an image to the window and find its centre by comparison with a model.
 
     Args:
-        measured: the image.
+        image: the image.
         window: pixels per side.
         model: `[y, x]` what the image should look like, centred.
 
     Raises:
         InputError: the image is smaller than the window, or its middle is no light at all.
     """
-    psf, rest = _window(measured, measured.centre, window)
-    shift = _shift_px(smoothed(psf), model)
+    psf, rest = _window(image, image.centre, window)
+    centre, shift = image.centre, _shift_px(smoothed(psf), model)
     for _ in range(2):
         if max(map(abs, shift)) <= 1:
             break
         # From here on the place in the window is the model's word.
-        low_y, low_x = (c - r for c, r in zip(measured.centre, rest, strict=True))
-        measured = measured._replace(centre=(low_y + shift[0], low_x + shift[1]))
-        psf, rest = _window(measured, measured.centre, window)
+        low_y, low_x = (c - r for c, r in zip(centre, rest, strict=True))
+        centre = (low_y + shift[0], low_x + shift[1])
+        psf, rest = _window(image, centre, window)
         shift = _shift_px(smoothed(psf), model)
-    scale = measured.brightness[0] if measured.brightness else float(psf.rate[psf.valid].sum())
+    scale = image.brightness[0] if image.brightness else float(psf.rate[psf.valid].sum())
     if not scale > 0:
-        raise InputError(measured.name, "the light above the background must add up", f"{scale:.4g}", "Expose longer.")
+        raise InputError(image.name, "the light above the background must add up", f"{scale:.4g}", "Expose longer.")
     unit = MeasuredPsf(psf.rate / scale, psf.floor / scale**2, psf.slope / scale, psf.valid)
-    gain = (1.0, measured.brightness[1]) if measured.brightness else None
-    return Target(measured.name, measured.depth_m, unit, scale, shift, gain, measured.defocus_sigma)
+    return Target(image, unit, scale, shift)
 
 
-def _window(
-    measured: MeasuredImage, centre: tuple[float, float], window: int
-) -> tuple[MeasuredPsf, tuple[float, float]]:
+def _window(image: MeasuredImage, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
     try:
-        psf, rest = cut_window(measured.psf, centre, window)
+        psf, rest = cut_window(image.psf, centre, window)
     except InputError as error:
-        raise InputError(measured.name, error.rule, error.got, error.cure) from error
+        raise InputError(image.name, error.rule, error.got, error.cure) from error
     if not psf.valid.any():
         got = f"a centre at row {centre[0]:.0f}, column {centre[1]:.0f}"
-        raise InputError(measured.name, "its light must lie within the frame", got, "Check `centre`.")
+        raise InputError(image.name, "its light must lie within the frame", got, "Check `centre`.")
     return psf, rest
 
 
@@ -141,10 +187,7 @@ def _shift_px(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) 
     row, column = (int(i) for i in np.unravel_index(np.argmax(likeness), likeness.shape))
 
     def place(line: Float[np.ndarray, " n"], at: int) -> float:
-        low, peak, high = line[at - 1], line[at], line[(at + 1) % len(line)]
-        bend = low - 2 * peak + high
-        whole = at if at < len(line) // 2 else at - len(line)
-        return whole + (float((low - high) / (2 * bend)) if bend < 0 else 0.0)
+        return (at if at < len(line) // 2 else at - len(line)) + parabola_vertex(line, at)
 
     return place(likeness[:, column], row), place(likeness[row], column)
 
@@ -180,50 +223,3 @@ def weights_at(
     nearby = gaussian_filter(signal**2, 1.0)
     variance = target.psf.variance(signal + background) + model_error**2 * nearby
     return np.where(target.psf.valid, 1 / np.maximum(variance, np.finfo(float).tiny), 0.0)
-
-
-def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Match:
-    """Best gain and background, and what is left."""
-    rate, total = target.psf.rate, weights.sum()
-    mean_model, mean_rate = (float((weights * v).sum() / total) for v in (model, rate))
-    centred = weights * (model - mean_model)
-    wanted, trust = (target.gain[0], target.gain[1] ** -2) if target.gain else (0.0, 0.0)
-    against = float((centred * (rate - mean_rate)).sum()) + trust * wanted
-    gain = max(against / (float((centred * (model - mean_model)).sum()) + trust), np.finfo(float).tiny)
-    background = mean_rate - gain * mean_model
-    residual = np.where(weights > 0, rate - gain * model - background, 0.0)
-    chi2 = float((weights * residual**2).sum()) + trust * (gain - wanted) ** 2
-    return Match(gain, background, residual, chi2)
-
-
-def residuals(target: Target, weights: Float[np.ndarray, "y x"], found: Match) -> Float[np.ndarray, " n"]:
-    """Residuals in standard deviations, last that of a gain that is known; their squares add up to `Match.chi2`."""
-    pixels = (np.sqrt(weights) * found.residual).ravel()
-    return np.append(pixels, (found.gain - target.gain[0]) / target.gain[1]) if target.gain else pixels
-
-
-def residual_jacobian(
-    target: Target,
-    weights: Float[np.ndarray, "y x"],
-    model: Float[np.ndarray, "y x"],
-    found: Match,
-    columns: Float[np.ndarray, "p y x"],
-) -> Float[np.ndarray, "p n"]:
-    """Derivatives of `residuals`, gain and background solved for (Kaufman, BIT 15, 49, 1975).
-
-    Args:
-        target: the image.
-        weights: its weights.
-        model: the model's image.
-        found: their match.
-        columns: derivatives of the model's image.
-    """
-    root = np.sqrt(weights).ravel()
-    flat = found.gain * columns.reshape(len(columns), -1) * root
-    basis = np.stack([model.ravel(), np.ones(root.size)]) * root
-    normal = basis @ basis.T
-    if target.gain:
-        normal[0, 0] += target.gain[1] ** -2
-    shares = np.linalg.solve(normal, basis @ flat.T)
-    pixels = shares.T @ basis - flat
-    return np.column_stack([pixels, -shares[0] / target.gain[1]]) if target.gain else pixels

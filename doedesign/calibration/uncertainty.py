@@ -22,15 +22,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.fit import Fit
-from doedesign.calibration.objective import FitObjective, evaluate, image_jacobians, image_residuals
+from doedesign.calibration.objective import Linearization, Scores
 from doedesign.calibration.target import match
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.metrics import spot_radius_m
 
-DETERMINED = 0.5  # of the prior's standard deviation
-EXPLAINED = 1.5  # chi2 per pixel up to which images count as explained
+_DETERMINED = 0.5  # of the prior's standard deviation
 _DIRECTIONS = 2  # least known ones that are looked at
 _BLOCKS = 6  # per side of an image
 
@@ -39,8 +37,7 @@ class Posterior(NamedTuple):
     """Errors and their uncertainty after a fit.
 
     Attributes:
-        scores: best scores, errors first.
-        covariance: of all scores.
+        covariance: of all scores, errors first.
         values: best values of the errors, SI units.
         sigma: their standard deviations.
         correlation: of the errors.
@@ -49,7 +46,6 @@ class Posterior(NamedTuple):
         inflation: factor on the standard deviation of what the images determine.
     """
 
-    scores: Float[np.ndarray, " s"]
     covariance: Float[np.ndarray, "s s"]
     values: Float[np.ndarray, " p"]
     sigma: Float[np.ndarray, " p"]
@@ -58,27 +54,36 @@ class Posterior(NamedTuple):
     chi2_per_pixel: float
     inflation: float
 
+    @property
+    def determined(self) -> list[bool]:
+        """Whether the images, and not the prior, say what an error is."""
+        return (self.ratio < _DETERMINED).tolist()
 
-def posterior_of(objective: FitObjective, fit: Fit) -> Posterior:
+    def spread(self, gradient: Scores) -> float:
+        """Standard deviation of a number with this gradient with respect to the scores."""
+        return float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0)))
+
+
+def posterior_of(fit: Linearization) -> Posterior:
     """Covariance of the scores and the errors."""
-    found, unknowns, count = fit.linearization, objective.unknowns, objective.errors
-    images, prior = sum(found.hessians, np.zeros_like(found.half_hessian)), np.eye(len(found.at.scores))
+    objective, at = fit.at.objective, fit.at
+    unknowns, count = objective.unknowns, objective.errors
+    images, prior = sum(fit.hessians, np.zeros_like(fit.half_hessian)), np.eye(len(at.scores))
     # Motions, gains and backgrounds are fitted to the last; of the errors, what the images and not the prior determine.
-    determined = float(np.trace(np.linalg.solve(found.half_hessian, images)[:count, :count]))
+    determined = float(np.trace(np.linalg.solve(fit.half_hessian, images)[:count, :count]))
     free = len(objective.motions) + 2 * len(objective.targets) + determined
-    per_pixel = found.at.chi2 / max(objective.pixels - free, 1.0)
+    per_pixel = at.chi2 / max(objective.pixels - free, 1.0)
     inflation = max(per_pixel, 1.0)
     covariance = np.linalg.inv(images / inflation + prior)
     scatter = np.linalg.inv(images + prior)
-    scatter = scatter @ _scatter(objective, fit) @ scatter
+    scatter = scatter @ _scatter(fit) @ scatter
     larger = np.sqrt(np.maximum(np.diag(scatter) / np.diag(covariance), 1.0))
     covariance = covariance * np.outer(larger, larger)
     errors = unknowns.root @ covariance[:count, :count] @ unknowns.root.T
     sigma = np.sqrt(np.diag(errors))
     return Posterior(
-        scores=found.at.scores,
         covariance=covariance,
-        values=objective.values(found.at.scores),
+        values=objective.values(at.scores),
         sigma=sigma,
         correlation=errors / np.outer(sigma, sigma),
         ratio=sigma / unknowns.sigma,
@@ -87,55 +92,32 @@ def posterior_of(objective: FitObjective, fit: Fit) -> Posterior:
     )
 
 
-def _scatter(objective: FitObjective, fit: Fit) -> Float[np.ndarray, "s s"]:
+def _scatter(fit: Linearization) -> Float[np.ndarray, "s s"]:
     """Sum over blocks of pixels of the outer product of their gradients."""
-    total = np.zeros_like(fit.linearization.half_hessian)
-    rows = image_jacobians(objective, fit.weights, fit.at, fit.linearization.jacobian)
-    for image, j, left in zip(fit.at.images, rows, image_residuals(objective, fit.weights, fit.at), strict=True):
-        gradients = (j * left)[:, : image.size].reshape(-1, *image.shape)
-        side = -(-image.shape[0] // _BLOCKS)
-        pad = _BLOCKS * side - image.shape[0]
+    total = np.zeros_like(fit.half_hessian)
+    for found, j in zip(fit.at.matches, fit.residual_jacobians(), strict=True):
+        shape = found.model.shape
+        gradients = (j * found.residuals())[:, : found.model.size].reshape(-1, *shape)
+        side = -(-shape[0] // _BLOCKS)
+        pad = _BLOCKS * side - shape[0]
         parts = np.pad(gradients, ((0, 0), (0, pad), (0, pad))).reshape(len(j), _BLOCKS, side, _BLOCKS, side)
         blocks = parts.sum(axis=(2, 4)).reshape(len(j), -1)
         total += blocks @ blocks.T
     return total
 
 
-class LeftOut(NamedTuple):
-    """One image predicted from the others.
-
-    Attributes:
-        name: the image.
-        together: its chi2 per pixel in the fit of all images.
-        predicted: its chi2 per pixel at the errors that the others give.
-        moved: by how many standard deviations the error that moves most moves without it, and which that is.
-    """
-
-    name: str
-    together: float
-    predicted: float
-    moved: tuple[float, str]
-
-
-def left_out(objective: FitObjective, fit: Fit, posterior: Posterior) -> list[LeftOut]:
-    """Predict every image from the others: one Gauss-Newton step on their part of the objective.
+def left_out(fit: Linearization) -> list[float]:
+    """Chi2 per pixel of every image predicted from the others: one Gauss-Newton step on their part of the objective.
 
     Its own motion, gain and background stay what they were, for they are the image's and not the DOE's.
     """
-    found, at, count = fit.linearization, fit.at, objective.errors
-    out = []
-    for i, target in enumerate(objective.targets):
-        half = found.half_hessian - found.hessians[i]
-        step = np.linalg.solve(half, sum(found.descents, -at.scores) - found.descents[i])
+    objective, at, out = fit.at.objective, fit.at, []
+    for i, found in enumerate(at.matches):
+        step = np.linalg.solve(fit.half_hessian - fit.hessians[i], sum(fit.descents, -at.scores) - fit.descents[i])
         scores = at.scores.copy()
-        scores[:count] += step[:count]
+        scores[: objective.errors] += step[: objective.errors]
         image = objective.model.plate(objective.values(scores)).image(i, objective.motion(scores, i))
-        pixels = max(target.pixels, 1)
-        predicted = match(target, fit.weights[i], image).chi2 / pixels
-        moves = np.abs(objective.values(scores) - posterior.values) / posterior.sigma
-        most = int(np.argmax(moves))
-        moved = (float(moves[most]), objective.unknowns.names[most])
-        out.append(LeftOut(target.name, at.matches[i].chi2 / pixels, predicted, moved))
+        out.append(match(found.target, found.weights, image).chi2_per_pixel)
     return out
 
 
@@ -155,37 +137,37 @@ class Reading(NamedTuple):
     predicted: tuple[float, float]
 
 
-def readings(objective: FitObjective, fit: Fit, posterior: Posterior) -> list[Reading]:
+def readings(fit: Linearization, posterior: Posterior) -> list[Reading]:
     """What a lab reads off every image, and the DOE's zeroth order.
 
     Unusable pixels are taken from the model. Ring and disc are told apart as in `sim.metrics.ring_to_disc`, the spot as
     in `sim.metrics.spot_radius_m`, about where the fit finds the chief ray.
     """
-    at, out, jacobian = fit.at, [], fit.linearization.jacobian
+    at, out, jacobian, objective = fit.at, [], fit.jacobian, fit.at.objective
     camera = objective.model.camera
     grid = Grid((camera.window, camera.window), camera.pixel_m)
-    for i, target in enumerate(objective.targets):
-        image, found = at.images[i], at.matches[i]
-        disc_m = camera.defocus_radius_m(target.depth_m) + camera.pixel_m
-        spot_m = spot_radius_m(camera, objective.model.wavelength_m)
+    spot_m = spot_radius_m(camera, objective.model.wavelength_m)
+    for i, found in enumerate(at.matches):
+        target, image, weights = found.target, found.model, found.weights
+        disc_m = camera.defocus_radius_m(target.image.depth_m) + camera.pixel_m
         near = disc_m > spot_m
         y, x = (float(shift) * camera.pixel_m for shift in objective.motion(at.scores, i)[:2])
         inner = circle_coverage(grid, 2 * (disc_m if near else spot_m), (y, x)).astype(np.float64)
         light = np.where(target.psf.valid, (target.psf.rate - found.background) / found.gain, image)
-        noise = np.where(fit.weights[i] > 0, 1 / np.maximum(fit.weights[i], 1e-300), 0.0) / found.gain**2
-        background = posterior.inflation**2 / (fit.weights[i].sum() * found.gain**2)  # its variance
+        noise = np.where(weights > 0, 1 / np.maximum(weights, 1e-300), 0.0) / found.gain**2
+        background = posterior.inflation**2 / (weights.sum() * found.gain**2)  # its variance
         values, gradients = zip(*(_ratio(inner, picture, near) for picture in (light, image)), strict=True)
         variance = posterior.inflation**2 * float((gradients[0] ** 2 * noise).sum())
         measured = (values[0], float(np.sqrt(variance + background * float(gradients[0].sum()) ** 2)))
         columns = jacobian.images[i]
-        predicted = (values[1], _sigma(posterior, np.tensordot(columns, gradients[1], 2)))
+        predicted = (values[1], posterior.spread(np.tensordot(columns, gradients[1], 2)))
         out.append(Reading(target.name, "ring_to_disc" if near else "far_spot", measured, predicted))
-        total = (float(image.sum()), _sigma(posterior, columns.sum(axis=(1, 2))))
+        total = (float(image.sum()), posterior.spread(columns.sum(axis=(1, 2))))
         share = None
-        if target.gain:
-            share = (float(light.sum()) * found.gain, float(light.sum()) * target.gain[1])
+        if target.gain_sigma:
+            share = (float(light.sum()) * found.gain, float(light.sum()) * target.gain_sigma)
         out.append(Reading(target.name, "throughput", share, total))
-    order = (at.doe.zeroth_order(), _sigma(posterior, jacobian.zeroth_order))
+    order = (at.doe.zeroth_order(), posterior.spread(jacobian.zeroth_order))
     return [*out, Reading("plate", "zeroth_order", None, order)]
 
 
@@ -199,18 +181,15 @@ def _ratio(
     return inside / total, inner / total - inside / total**2
 
 
-def _sigma(posterior: Posterior, gradient: Float[np.ndarray, " s"]) -> float:
-    return float(np.sqrt(max(gradient @ posterior.covariance @ gradient, 0.0)))
-
-
-def cost_rises(objective: FitObjective, fit: Fit, posterior: Posterior) -> list[float]:
+def cost_rises(fit: Linearization, posterior: Posterior) -> list[float]:
     """Rises of the cost one standard deviation to either side along the least known directions.
 
     One everywhere if the posterior is the normal distribution that is claimed. Directions that end at the end of an
     error's range are left out.
     """
-    count, at, unknowns = objective.errors, fit.at, objective.unknowns
-    images = fit.linearization.half_hessian - np.eye(len(at.scores))
+    objective, at = fit.at.objective, fit.at
+    count, unknowns = objective.errors, objective.unknowns
+    images = fit.half_hessian - np.eye(len(at.scores))
     covariance = np.linalg.inv(images / posterior.inflation**2 + np.eye(len(images)))
     block = covariance[:count, :count]
     variances, directions = np.linalg.eigh(block)
@@ -225,5 +204,5 @@ def cost_rises(objective: FitObjective, fit: Fit, posterior: Posterior) -> list[
         for scores in (at.scores + step, at.scores - step):
             free = unknowns.values(scores[:count])
             if np.allclose(free, objective.values(scores), rtol=0, atol=1e-3 * unknowns.sigma.min()):
-                out.append(cost(evaluate(objective, fit.weights, scores).chi2, scores) - lowest)
+                out.append(cost(objective.evaluate(at.weights, scores).chi2, scores) - lowest)
     return out

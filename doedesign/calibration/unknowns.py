@@ -8,10 +8,9 @@ its mean; the others' places are relative to it, with the prior that follows.
 The search works on scores: independent standard normals a priori, value = mean + root @ score.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.process import DEVIATIONS, Normal, Process, Variation, deviation_of, error_names, short_name, variation_of
 
-DEFAULT = ("common_depth_scale", "common_cd_bias_m", "overlay_y_m", "overlay_x_m")
-
+_DEFAULT = ("common_depth_scale", "common_cd_bias_m", "overlay_y_m", "overlay_x_m")
 _KNOWABLE = tuple(key for key, error in DEVIATIONS.items() if error.prior_sigma)
 _REACH = 5.0  # standard deviations within which values are looked for
 # Shares of a cell that the model can follow while it is differentiated.
@@ -34,31 +32,32 @@ class Unknowns:
     """Errors to find, SI units.
 
     Attributes:
-        masks: number of masks.
+        process: the process; its other errors stay at their means (`definite_means`).
         names: flat names of the errors.
         mean: prior means.
         root: lower triangle that makes values of independent standard normals.
         low: smallest values looked at.
         high: largest ones.
         start: where the search begins.
-        fixed: the other errors of the process by flat name, at their means (`definite_means`).
-        assumed: those of `names` on whose standard deviation the process is silent.
     """
 
-    masks: int
+    process: Process
     names: tuple[str, ...]
     mean: NDArray[np.float64]
     root: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     start: NDArray[np.float64]
-    fixed: Mapping[str, float]
-    assumed: tuple[str, ...]
 
     @property
     def sigma(self) -> NDArray[np.float64]:
         """Prior standard deviations."""
         return np.sqrt(np.diag(self.root @ self.root.T)).astype(np.float64)
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Errors on whose standard deviation the process is silent."""
+        return tuple(name for name in self.names if not self.process.spreads.get(name, Normal()).sigma)
 
     def values(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values of the errors."""
@@ -70,7 +69,8 @@ class Unknowns:
 
     def variation(self, values: Any) -> Variation:
         """The DOE with these errors; `values` may be traced."""
-        return variation_of(self.masks, {**self.fixed, **{name: values[i] for i, name in enumerate(self.names)}})
+        found = {name: values[i] for i, name in enumerate(self.names)}
+        return variation_of(self.process.masks, {**definite_means(self.process), **found})
 
 
 def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = np.inf) -> Unknowns:
@@ -78,18 +78,17 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
 
     Args:
         process: the process, whose means and standard deviations are the prior.
-        errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names, or sources such as "overlay"; by
-            default depth and line width common to all masks, and overlay.
+        errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names such as "overlay_x[2]", or sources
+            such as "overlay"; by default depth and line width common to all masks, and overlay.
         pitch_m: pitch of the DOE's cells, which bounds what can be followed.
 
     Raises:
         InputError: an unknown error, or one that no single DOE has in a definite way (roughness).
     """
-    names = tuple(n for n in chosen_names(process.masks, errors or DEFAULT) if not (relative(n) and n.endswith("[0]")))
+    names = tuple(n for n in chosen_names(process.masks, errors or _DEFAULT) if not (relative(n) and n.endswith("[0]")))
     if not names:
         cure = "Choose another error: a process of one mask has no overlay."
         raise InputError("errors", "something must be left to find", ", ".join(errors), cure)
-    assumed = tuple(name for name in names if not process.spreads.get(name, Normal()).sigma)
     sigma = np.array([prior_sigma(process, name) for name in names])
     mean = np.array([process.spreads.get(name, Normal()).mean for name in names])
     covariance = np.diag(sigma**2)
@@ -105,8 +104,7 @@ def unknowns_of(process: Process, errors: Sequence[str] = (), pitch_m: float = n
     low = np.where(one_sided, np.maximum(low, 0.0), low)
     # What a rounded corner does grows with its radius squared: at zero nothing says which way is better.
     start = np.clip(np.where(one_sided & (mean < sigma / 2), sigma / 2, mean), low, high)
-    fixed = {name: mean for name, mean in definite_means(process).items() if name not in names}
-    return Unknowns(process.masks, names, mean, root, low, high, start, MappingProxyType(fixed), assumed)
+    return Unknowns(process, names, mean, root, low, high, start)
 
 
 def prior_sigma(process: Process, name: str) -> float:
@@ -132,24 +130,8 @@ def _key(name: str) -> str:
     return name.partition("[")[0]
 
 
-def _keys(error: str) -> tuple[str, ...]:
-    """Keys of `DEVIATIONS` that are meant by one word."""
-    bare = _key(error)
-    keys = tuple(k for k in _KNOWABLE if bare in (k, short_name(k), DEVIATIONS[k].source))
-    if not keys:
-        choices = [short_name(k) for k in _KNOWABLE] + sorted({DEVIATIONS[k].source for k in _KNOWABLE})
-        close = get_close_matches(bare, choices, n=1)
-        cure = f"Did you mean {close[0]}?" if close else f"One of {', '.join(choices)}."
-        raise InputError("errors", "must be an error that a plate has in a definite way", error, cure)
-    return keys
-
-
 def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
-    """Flat names of the errors that are meant by some words, in the order of `DEVIATIONS`.
-
-    Args:
-        masks: number of masks.
-        errors: names of `fab.process.DEVIATIONS`, with or without unit, flat names such as "overlay_x[2]", or sources.
+    """Flat names of the errors that some words mean (`unknowns_of`), in the order of `DEVIATIONS`.
 
     Raises:
         InputError: an unknown error, one that no single DOE has in a definite way, or a mask that is not there.
@@ -157,12 +139,18 @@ def chosen_names(masks: int, errors: Sequence[str]) -> tuple[str, ...]:
     known = error_names(masks, *_KNOWABLE)
     chosen: set[str] = set()
     for error in errors:
-        _, bracket, mask = error.partition("[")
-        names = [f"{key}[{mask}" for key in _keys(error)] if bracket else list(error_names(masks, *_keys(error)))
+        word, bracket, mask = error.partition("[")
+        keys = [k for k in _KNOWABLE if word in (k, short_name(k), DEVIATIONS[k].source)]
+        if not keys:
+            choices = [short_name(k) for k in _KNOWABLE] + sorted({DEVIATIONS[k].source for k in _KNOWABLE})
+            close = get_close_matches(word, choices, n=1)
+            cure = f"Did you mean {close[0]}?" if close else f"One of {', '.join(choices)}."
+            raise InputError("errors", "must be an error that a plate has in a definite way", error, cure)
+        names = [f"{key}[{mask}" for key in keys] if bracket else error_names(masks, *keys)
         if not set(names) <= set(known):
             rule = f"must be an error of the plate, or of one of the masks 0 to {masks - 1}"
             raise InputError("errors", rule, error, "Correct the number in brackets.")
-        chosen |= set(names)
+        chosen.update(names)
     return tuple(name for name in known if name in chosen)
 
 

@@ -18,28 +18,10 @@ Reading order (`fab.draws` says which draws there are; each has a key from which
     studies       questions to one design and one process
     results       the usual questions behind one function
     result_files  its files; plots draws its pictures
+
+Names are loaded when they are used: a worker that imports `pool` or `cluster` sets up its threads before jax is loaded.
 """
 
-from doedesign.tolerancing.analysis import QUANTITIES, SampleTable, Yield, limit_from_text, limit_text
-from doedesign.tolerancing.budget import Budget
-from doedesign.tolerancing.results import ToleranceResult, tolerance
-from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, VarianceShare, source_shares
-from doedesign.tolerancing.studies import Sample, Study, study
+import lazy_loader
 
-__all__ = [
-    "QUANTITIES",
-    "Budget",
-    "Effect",
-    "Sample",
-    "SampleTable",
-    "SensitivityIndex",
-    "Study",
-    "ToleranceResult",
-    "VarianceShare",
-    "Yield",
-    "limit_from_text",
-    "limit_text",
-    "source_shares",
-    "study",
-    "tolerance",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -67,7 +67,7 @@ def light_of(
     unknowns = unknowns_of(replace(process, spreads={n: Normal(v, 0.0) for n, v in hidden.items()}), ["etch_lag"])
     probe = Colour("probe", (PROBE_M,), (1.0,))
     camera = replace(design.camera, colours=(probe,), window=design.camera.window + margin)
-    seen = ForwardModel(design.level_map.level, camera, process, unknowns, tuple(depths_m)).plate(np.zeros(1))
+    seen = ForwardModel(design.level_map.level, camera, unknowns, tuple(depths_m)).plate(np.zeros(1))
     whole = [round(s) for s in SHIFT]
     part = np.array([s - w for s, w in zip(SHIFT, whole, strict=True)] + [0.0])
     # The frame is wider still; what little light falls there is left out.

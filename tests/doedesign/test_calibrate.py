@@ -13,13 +13,12 @@ from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.objective import (
     FitObjective,
     difference_jacobian,
-    evaluate,
     evaluate_with_gradient,
     linearised,
 )
 from doedesign.calibration.target import measured_weights
 from doedesign.calibration.uncertainty import posterior_of
-from doedesign.calibration.unknowns import unknowns_of
+from doedesign.calibration.unknowns import definite_means, unknowns_of
 from doedesign.design.design import Design
 from fab.errors import InputError
 from fab.process import Normal, Process
@@ -98,9 +97,9 @@ def test_the_posterior_check_finds_nothing_wrong(loop: Calibration):
     assert 0.6 < loop.posterior.chi2_per_pixel < 1.2
     # An error of 1 is expected for each; central differences and curvature leave a little.
     assert loop.rises == pytest.approx([1.0] * len(loop.rises), abs=0.4)
-    for one in loop.left_out:
+    for predicted, together in zip(loop.left_out, loop.fit.at.matches, strict=True):
         # Eight errors hardly matter among ten thousand pixels, whether they come from this image or from the others.
-        assert one.predicted == pytest.approx(one.together, rel=0.05)
+        assert predicted == pytest.approx(together.chi2_per_pixel, rel=0.05)
     numbers = {(r.image, r.quantity): r for r in loop.readings}
     for image, quantity in (("near0", "ring_to_disc"), ("far1", "far_spot")):
         reading = numbers[image, quantity]
@@ -115,9 +114,9 @@ def test_the_estimate_predicts_the_fitted_images(loop: Calibration):
     """The process that comes out, used as any process is, makes the images that were fitted."""
     model, at = loop.objective.model, loop.fit.at
     nothing = unknowns_of(replace(loop.process, spreads=loop.process.spreads), ["etch_lag"])
-    assert dict(nothing.fixed) == {name: spread.mean for name, spread in loop.process.spreads.items()}
-    again = ForwardModel(model.level, model.camera, loop.process, nothing, model.depths_m).plate(np.zeros(1))
-    for i, image in enumerate(at.images):
+    assert definite_means(nothing.process) == {name: spread.mean for name, spread in loop.process.spreads.items()}
+    again = ForwardModel(model.level, model.camera, nothing, model.depths_m).plate(np.zeros(1))
+    for i, image in enumerate(found.model for found in at.matches):
         predicted = again.image(i, loop.objective.motion(at.scores, i))
         np.testing.assert_allclose(predicted, image, rtol=0, atol=1e-5 * image.max())  # single precision
     assert loop.process.spreads["overlay_x_m[0]"] == Normal(0.0, 0.0)  # the reference
@@ -246,12 +245,12 @@ def test_slopes_of_the_objective(objective: FitObjective):
     """Gauss-Newton's half gradient is that of the objective."""
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
     scores = scores_near_the_truth(objective)
-    at = evaluate(objective, weights, scores)
-    linear = linearised(objective, weights, at, difference_jacobian(objective, at, np.full(len(scores), 0.01)))
+    at = objective.evaluate(weights, scores)
+    linear = linearised(at, difference_jacobian(at, np.full(len(scores), 0.01)))
     gradient = 2 * (scores - sum(linear.descents))
     for k in range(len(scores)):
         step = 0.005 * np.eye(len(scores))[k]
-        high, low = (evaluate(objective, weights, scores + sign * step).cost for sign in (1, -1))
+        high, low = (objective.evaluate(weights, scores + sign * step).cost for sign in (1, -1))
         # Differences of the objective, whose third derivative is felt at this step.
         assert gradient[k] == pytest.approx((high - low) / 0.01, rel=0.02, abs=0.02 * np.abs(gradient).max())
 
@@ -262,13 +261,13 @@ def test_the_exact_gradient_agrees_and_polishes_nothing_away(objective: FitObjec
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
     scores = scores_near_the_truth(objective)
     at, gradient = evaluate_with_gradient(objective, weights, scores)
-    linear = linearised(objective, weights, at, difference_jacobian(objective, at, np.full(len(scores), 0.005)))
+    linear = linearised(at, difference_jacobian(at, np.full(len(scores), 0.005)))
     expected = 2 * (scores - sum(linear.descents))
     np.testing.assert_allclose(gradient, expected, rtol=0.01, atol=0.01 * np.abs(expected).max())
     plain, polished = search(objective), search(objective, polish=4)
     assert polished.at.cost <= plain.at.cost
     moved = objective.values(polished.at.scores) - objective.values(plain.at.scores)
-    assert (np.abs(moved) < posterior_of(objective, plain).sigma).all()
+    assert (np.abs(moved) < posterior_of(plain).sigma).all()
 
 
 def test_errors_are_named_as_users_name_them():

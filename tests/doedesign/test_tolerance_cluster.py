@@ -38,7 +38,7 @@ class Cluster:
         self.scheduler = self._start(
             "scheduler", "--port", "0", "--scheduler-file", str(file), "--idle-timeout", f"{LIFETIME_S} s"
         )
-        self._wait(file.exists)
+        self._wait(lambda: file.exists() and file.stat().st_size > 0)
         self.address = json.loads(file.read_text())["address"]
 
     def _start(self, kind: str, *arguments: str) -> subprocess.Popen[bytes]:

@@ -1,0 +1,15 @@
+from .analysis import QUANTITIES as QUANTITIES
+from .analysis import SampleTable as SampleTable
+from .analysis import Yield as Yield
+from .analysis import limit_from_text as limit_from_text
+from .analysis import limit_text as limit_text
+from .budget import Budget as Budget
+from .results import ToleranceResult as ToleranceResult
+from .results import tolerance as tolerance
+from .sensitivity import Effect as Effect
+from .sensitivity import SensitivityIndex as SensitivityIndex
+from .sensitivity import VarianceShare as VarianceShare
+from .sensitivity import source_shares as source_shares
+from .studies import Sample as Sample
+from .studies import Study as Study
+from .studies import study as study
