@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from doedesign.build import camera_from_spec
-from doedesign.calibration import ExplanationSet, Targets, explain_ratio
+from doedesign.calibration.explanations import ExplanationSet, Targets, explain_ratio
 from doedesign.design.design import Design
 from doedesign.prediction import Prediction, predict
 from doedesign.runs.folder import Run

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.tolerancing import Budget, study
+from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_budget
+from doedesign.tolerancing.studies import study
 from fab.figure import save
 from fab.units import format_length
 

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
-from doedesign.tolerancing import Effect, Sample, Study, study
 from doedesign.tolerancing.plots import plot_effects, plot_histograms
+from doedesign.tolerancing.sensitivity import Effect
+from doedesign.tolerancing.studies import Sample, Study, study
 from fab.figure import save
 
 HERE = Path(__file__).parent

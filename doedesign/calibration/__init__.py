@@ -1,8 +1,8 @@
 """Calibration: the process errors behind measured PSFs, how well they are known, and what two numbers alone may mean.
 
-    result = calibrate(design, "measurement.toml")
+    result = dd.calibrate(design, "measurement.toml")
     result.process                  # the estimate, usable everywhere a process is
-    explain_ratio(design, Targets(520e-9, 0.1, ring_to_disc=1.0))      # where only a ring:disc ratio was measured
+    dd.explain_ratio(design, dd.Targets(520e-9, 0.1, ring_to_disc=1.0))      # where only a ring:disc ratio was measured
 
 Reading order:
 
@@ -19,20 +19,3 @@ Reading order:
 
 The model is `sim.surface.as_fabricated` and the far-field path, the same that design, tolerance and prediction use.
 """
-
-from doedesign.calibration.estimate import Calibration, calibrate
-from doedesign.calibration.explanations import Explanation, ExplanationSet, Targets, explain_ratio
-from doedesign.calibration.measurement import Measurement, MeasurementSpec, load_measurement, read_measurement
-
-__all__ = [
-    "Calibration",
-    "Explanation",
-    "ExplanationSet",
-    "Measurement",
-    "MeasurementSpec",
-    "Targets",
-    "calibrate",
-    "explain_ratio",
-    "load_measurement",
-    "read_measurement",
-]

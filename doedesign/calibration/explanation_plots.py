@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-    from doedesign.calibration import Explanation, ExplanationSet
+    from doedesign.calibration.explanations import Explanation, ExplanationSet
 
 __all__ = ["plot_explanations"]
 

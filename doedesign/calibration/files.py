@@ -23,7 +23,8 @@ from fab.process import Process
 from fab.stock import STOCK
 
 if TYPE_CHECKING:
-    from doedesign.calibration import Calibration, ExplanationSet
+    from doedesign.calibration.estimate import Calibration
+    from doedesign.calibration.explanations import ExplanationSet
 
 
 def write_calibration(

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-    from doedesign.calibration import Calibration
+    from doedesign.calibration.estimate import Calibration
 
 __all__ = ["plot_check", "plot_estimates", "plot_fitted_psfs"]
 

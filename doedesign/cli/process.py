@@ -55,7 +55,7 @@ def tolerance(
         print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
     from doedesign.runs.folder import open_run
-    from doedesign.tolerancing import tolerance as study
+    from doedesign.tolerancing.results import tolerance as study
 
     opened = open_run(run)
     folder = out or opened.path("tolerance")
@@ -150,7 +150,7 @@ def calibrate(
 
     opened = open_run(run)
     if measurement is not None:
-        from doedesign.calibration import calibrate as fit
+        from doedesign.calibration.estimate import calibrate as fit
 
         folder = out or opened.path("calibration")
         settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
@@ -158,7 +158,7 @@ def calibrate(
         estimate = str(folder / "process-estimate.toml")
         print_paths([folder, *sorted(folder.iterdir())], json_, estimate=estimate, explained=result.explained)
         return
-    from doedesign.calibration import Targets, explain_ratio
+    from doedesign.calibration.explanations import Targets, explain_ratio
 
     lengths = {}
     for option, text, example in (("--probe", probe, "520 nm"), ("--depth", depth, "10 cm")):

@@ -1,10 +1,8 @@
 """Tolerance analysis: yield of a design under process errors, sensitivities, and how large errors may be.
 
-    from doedesign.tolerancing import study, tolerance
-
-    result = tolerance(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"], draws=64)
+    result = dd.tolerance(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"], draws=64)
     result.yield_, result.plot()
-    asked = study(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"])    # one question at a time
+    asked = dd.study(design, errors={"overlay_x": "0.5 um"}, limits=["zeroth_order <= 5 %"])    # one question at a time
     print(asked.budget("overlay_x", 0.9, draws=64))
 
 Reading order (`fab.draws` says which draws there are; each has a key from which it can be made again alone):
@@ -19,9 +17,5 @@ Reading order (`fab.draws` says which draws there are; each has a key from which
     results       the usual questions behind one function
     result_files  its files; plots draws its pictures
 
-Names are loaded when they are used: a worker that imports `pool` or `cluster` sets up its threads before jax is loaded.
+Nothing is imported here: a worker that imports `pool` or `cluster` must set up its threads before jax is loaded.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

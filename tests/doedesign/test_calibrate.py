@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from doedesign.calibration import Calibration, calibrate, read_measurement
+from doedesign.calibration.estimate import Calibration, calibrate
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import ForwardModel
+from doedesign.calibration.measurement import read_measurement
 from doedesign.calibration.objective import (
     FitObjective,
     difference_jacobian,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from doedesign.calibration import ExplanationSet, Targets, explain_ratio
+from doedesign.calibration.explanations import ExplanationSet, Targets, explain_ratio
 from doedesign.design.design import Design
 from doedesign.prediction import predict
 from fab.errors import InputError

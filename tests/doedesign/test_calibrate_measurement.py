@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from doedesign.calibration import load_measurement, read_measurement
+from doedesign.calibration.measurement import load_measurement, read_measurement
 from fab.errors import InputError
 from tests.doedesign.calibration_fakes import (
     PIXEL_M,

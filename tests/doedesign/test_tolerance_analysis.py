@@ -11,10 +11,21 @@ import numpy as np
 import pytest
 
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing import QUANTITIES, Study, limit_from_text, limit_text, source_shares, study
-from doedesign.tolerancing.analysis import good_draws, obeys, statistics, table_of, worst_draw, yield_of
+from doedesign.tolerancing.analysis import (
+    QUANTITIES,
+    good_draws,
+    limit_from_text,
+    limit_text,
+    obeys,
+    statistics,
+    table_of,
+    worst_draw,
+    yield_of,
+)
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
+from doedesign.tolerancing.sensitivity import source_shares
+from doedesign.tolerancing.studies import Study, study
 from fab.errors import InputError
 from fab.process import Normal, Process, Variation
 

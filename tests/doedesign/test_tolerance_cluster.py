@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from doedesign.tolerancing import Study, study
 from doedesign.tolerancing.pool import DrawModel, Rows
+from doedesign.tolerancing.studies import Study, study
 from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import Variation, variation_of
@@ -190,7 +190,7 @@ import sys
 sys.modules["distributed"] = None
 sys.path.insert(0, {str(HERE)!r})
 import tolerance_fakes as fakes
-from doedesign.tolerancing import study
+from doedesign.tolerancing.studies import study
 study(fakes.design(), process=fakes.process(), evaluate=fakes.rows, scheduler="tcp://127.0.0.1:9").monte_carlo(1)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

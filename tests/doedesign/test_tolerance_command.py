@@ -11,8 +11,8 @@ import pytest
 import doedesign.optimization
 import doedesign.tolerancing.result_files
 from doedesign.spec import load_variation
-from doedesign.tolerancing import study
 from doedesign.tolerancing.results import plain
+from doedesign.tolerancing.studies import study
 from fab.files import sha256_file
 from tests.doedesign.small_runs import call, finished_run
 from tests.pictures import leave_out_pictures

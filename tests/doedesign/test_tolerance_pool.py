@@ -20,8 +20,8 @@ from typing import Any
 
 import pytest
 
-from doedesign.tolerancing import Study, study
 from doedesign.tolerancing.pool import default_workers
+from doedesign.tolerancing.studies import Study, study
 from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import variation_of
@@ -183,7 +183,7 @@ SCRIPT = """
 import sys
 sys.path.insert(0, {here!r})
 import tolerance_fakes as fakes
-from doedesign.tolerancing import study
+from doedesign.tolerancing.studies import study
 asked = study(fakes.design({name!r}), process=fakes.process(), evaluate=fakes.marked_rows, workers=2, out={out!r})
 asked.monte_carlo(400)
 """

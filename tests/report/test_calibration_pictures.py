@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from doedesign.calibration import Calibration, Explanation, ExplanationSet, Targets, calibrate
+from doedesign.calibration.estimate import Calibration, calibrate
 from doedesign.calibration.explanation_plots import plot_explanations
-from doedesign.calibration.explanations import Curve
+from doedesign.calibration.explanations import Curve, Explanation, ExplanationSet, Targets
 from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
 from doedesign.report.labels import value_text
 from fab.figure import png_bytes

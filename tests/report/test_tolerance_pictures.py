@@ -9,9 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from doedesign.report.labels import error_label
-from doedesign.tolerancing import Budget, Effect, SampleTable, SensitivityIndex, VarianceShare, limit_from_text
-from doedesign.tolerancing.analysis import yield_of
+from doedesign.tolerancing.analysis import SampleTable, limit_from_text, yield_of
+from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_budget, plot_effects, plot_histograms, plot_variance_shares, plot_yield
+from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, VarianceShare
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
