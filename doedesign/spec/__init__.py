@@ -76,8 +76,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
         path: the file.
         overrides: changes such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key (list entries
             by their number) and a TOML value; quotes round text may be left out.
-        values: further changes, as they read best in Python: a key of ``[optimize]`` (``steps=60``), or of another
-            table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``).
+        values: further changes, as they read best in Python: a key of ``[optimize]`` (``steps=60``), one of another
+            table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``), or a whole table.
 
     Returns:
         The spec with every default filled in. Files it names are not opened (see `input_files`), but for a spectral
@@ -89,8 +89,9 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     path = Path(path)
     raw = read_toml(path, *_FILES[Spec][:2])
     keys = [_override(raw, text) for text in overrides]
+    tables = {field.alias for field in Spec.model_fields.values()}
     for name, value in values.items():
-        keys.append(key := name.replace("__", ".") if "__" in name else f"optimize.{name}")
+        keys.append(key := name.replace("__", ".") if "__" in name or name in tables else f"optimize.{name}")
         _put(raw, key, value)
     spec = _checked(Spec, with_response(raw, path), str(path), keys)
     spec._file = path  # pyright: ignore[reportAttributeAccessIssue]
