@@ -79,7 +79,8 @@ assert relief_of(process, Variation(bath_drift=0.1)).depth_m == pytest.approx(1.
 import doedesign as dd
 spec = dd.load_spec(QUICK, objective=[{"name": "far_peak", "options": {"power": 2.0}}], steps=2)
 design = dd.optimize(spec)
-assert design.history[-1]["far_peak"] == design.history[-1]["loss"] > 0
+assert design.history[-1]["names"] == ["far_peak"]
+assert 0 < design.history[-1]["loss"] < 1
 """,
     "An obstruction": """
 import sim

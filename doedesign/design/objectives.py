@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from doedesign.design.patterns import target_image
 from doedesign.spec import Spec
+from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from sim.camera import Camera
 from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_radius_m
@@ -117,9 +118,7 @@ def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     return jnp.mean(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
 
 
-BUILT_IN: dict[str, Callable[..., Array]] = {
-    function.__name__: function for function in (far_spot, near_spread, window_loss, handcrafted, target_pattern)
-}
+BUILT_IN: dict[str, Callable[..., Array]] = {name: globals()[name] for name in OBJECTIVES}
 
 
 def terms_from_spec(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:

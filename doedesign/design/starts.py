@@ -130,7 +130,7 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     return lens(setup, float(best[0]) * limit)
 
 
-BUILT_IN = {start.__name__: start for start in (flat, random, fresnel, ring)}
+BUILT_IN = {name: globals()[name] for name in STARTS}
 
 
 def start_heights(name: str, options: Mapping[str, Any], setup: StartSetup) -> Heights:
