@@ -18,7 +18,7 @@ from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour, SpectralLine
 from sim.optic import CellOptic
-from sim.tracing import is_traced, total
+from sim.tracing import is_traced, stacked, total
 
 if TYPE_CHECKING:
     from sim.psf_bank import PsfBank
@@ -299,7 +299,7 @@ class Evaluation:
     def concentration_bound(self, colour: int) -> Any:
         """Square of the largest far-spot energy, or None without a far depth."""
         far = [d for d, depth in enumerate(self.bank.depths_m) if depth not in self.near_m]
-        return max(self.far_spot(colour, d) for d in far) ** 2 if far else None
+        return stacked([self.far_spot(colour, d) for d in far]).max() ** 2 if far else None
 
 
 @dataclass(frozen=True)

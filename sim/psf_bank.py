@@ -120,7 +120,7 @@ class PsfBank(eqx.Module):
         energy = jnp.asarray(self.energy[:, order].swapaxes(0, 1))
         return BankOptic(energy, jnp.asarray(inverse), self.colours, self.pixel_m, self.camera)
 
-    def at(self, depth_m: float) -> Float[np.ndarray, "c y x"]:
+    def at(self, depth_m: float) -> Float[np.ndarray, "c y x"] | Float[Array, "c y x"]:
         """PSFs of every colour at a depth, mixed linearly in 1/z from the two nearest.
 
         Raises:

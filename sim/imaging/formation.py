@@ -27,6 +27,7 @@ from sim.imaging.occlusion import (
 )
 from sim.imaging.scene import Depth, Scene
 from sim.psf_bank import PsfBank
+from sim.tracing import stacked
 
 
 class Optics(eqx.Module):
@@ -58,7 +59,7 @@ class Optics(eqx.Module):
         Raises:
             InputError: a depth beyond the bank's.
         """
-        psf = np.stack([bank.at(depth) for depth in depths_m])
+        psf = stacked([bank.at(depth) for depth in depths_m])
         return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m, shadow_px)
 
     @property
