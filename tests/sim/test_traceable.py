@@ -112,7 +112,7 @@ def test_a_doe_as_fabricated():
 def test_all_metrics_of_a_height_map():
     """The whole table; lengths, and the light that the chrome takes, are constants here."""
     depths_m = (np.inf, 1.0, NEAR_M)
-    lens, nominal = psf(HeightOptic.of(ONE), depths=depths_m), HeightOptic.of(CAMERA, HEIGHT_M)
+    lens, nominal = psf(HeightOptic.of(ONE), depths=depths_m), HeightOptic.of(ONE, HEIGHT_M)
 
     def metrics(height: Any) -> list[Any]:
         doe = HeightOptic.of(ONE, height)
