@@ -78,12 +78,7 @@ def _expanded(mean: Array, w: Array) -> Array:
 
 @eqx.filter_jit
 def photon_noise(
-    key: Key[Array, ""],
-    signal: Float[Array, "*s"],
-    sigma: float,
-    *,
-    scale: float = 1.0,
-    most: float = np.inf,
+    key: Key[Array, ""], signal: Float[Array, "*s"], sigma: float, *, scale: float = 1.0, most: float = np.inf
 ) -> Float[Array, "*s"]:
     """Shot noise and Gaussian noise: `scale` Poisson(signal / scale), saturated, plus a normal of deviation `sigma`.
 

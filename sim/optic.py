@@ -55,11 +55,7 @@ class Optic(eqx.Module):
 
     @abstractmethod
     def plan(
-        self,
-        line: SpectralLine,
-        depth_m: float,
-        propagation: Propagation = "far_field",
-        sampling: float | None = None,
+        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
     ) -> Any:
         """Operators of one wavelength and source depth (metres), made on the host.
 
@@ -138,11 +134,7 @@ class CellOptic(CameraOptic):
         """Height in metres and transmission besides it, both `[y, x]`; None where there is none."""
 
     def plan(
-        self,
-        line: SpectralLine,
-        depth_m: float,
-        propagation: Propagation = "far_field",
-        sampling: float | None = None,
+        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
     ) -> FarField | DirectPath:
         """Operators of the far field, or of a direct kernel (which serves every depth)."""
         if propagation == "far_field":
@@ -268,11 +260,7 @@ class RingOptic(CameraOptic):
     profile_m: Float[Array, " ring"]
 
     def plan(
-        self,
-        line: SpectralLine,
-        depth_m: float,
-        propagation: Propagation = "far_field",
-        sampling: float | None = None,
+        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
     ) -> Hankel:
         """Operators of the Hankel transform, for every depth."""
         if propagation != "far_field":

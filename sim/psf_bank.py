@@ -166,11 +166,7 @@ class BankOptic(Optic):
         return tuple(SpectralLine(number, 0.0, 1.0) for number in range(len(self.colours)))
 
     def plan(
-        self,
-        line: SpectralLine,
-        depth_m: float,
-        propagation: Propagation = "far_field",
-        sampling: float | None = None,
+        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
     ) -> None:
         """Nothing is propagated."""
 

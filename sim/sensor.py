@@ -33,15 +33,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from fab.errors import InputError
-from sim.noise import (
-    RELEASE_WIDTH,
-    TSENG_SCALE,
-    TSENG_SIGMA,
-    clipped,
-    photon_noise,
-    rounded,
-    uniform_noise,
-)
+from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA, clipped, photon_noise, rounded, uniform_noise
 
 NoiseModel = Literal["physical", "tseng", "release", "none"]
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]

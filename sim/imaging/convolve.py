@@ -207,10 +207,7 @@ def _tile_convolved(patch: Array, otf: Otf) -> Array:
 
 
 def convolve_tiled(
-    image: Float[np.ndarray, "y x"],
-    kernel: Float[np.ndarray, "*k ky kx"],
-    border: Border,
-    length: Window | None = None,
+    image: Float[np.ndarray, "y x"], kernel: Float[np.ndarray, "*k ky kx"], border: Border, length: Window | None = None
 ) -> Float[np.ndarray, "*k v u"]:
     """`convolve` of a frame too large for one transform, by overlap-save.
 

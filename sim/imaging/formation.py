@@ -112,12 +112,7 @@ class Prepared(eqx.Module):
 
 
 def capture(
-    scene: Scene,
-    optics: Optics | Prepared,
-    model: Model,
-    *,
-    border: Border = "reflect",
-    outside: Outside = "scene",
+    scene: Scene, optics: Optics | Prepared, model: Model, *, border: Border = "reflect", outside: Outside = "scene"
 ) -> Float[Array, "c v u"]:
     """Light on the sensor, relative to a white scene through a lossless lens of the same aperture; no noise.
 

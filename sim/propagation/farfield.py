@@ -100,12 +100,7 @@ class FarField(eqx.Module):
 
 @lru_cache(maxsize=32)
 def plan_far_field(
-    camera: Camera,
-    wavelength_m: float,
-    *,
-    depth_m: float = np.inf,
-    sampling: float | None = None,
-    cell: bool = True,
+    camera: Camera, wavelength_m: float, *, depth_m: float = np.inf, sampling: float | None = None, cell: bool = True
 ) -> FarField:
     """Prepare the transform of one wavelength and depth.
 
@@ -228,10 +223,7 @@ def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
     cells = jnp.arange(plan.cells) - (plan.cells - 1) / 2
     waves = cells / (plan.length * plan.spacing_m)
     return eqx.tree_at(
-        lambda p: p.tilt,
-        plan,
-        (cis(waves * offset_m[0]), cis(waves * offset_m[1])),
-        is_leaf=lambda leaf: leaf is None,
+        lambda p: p.tilt, plan, (cis(waves * offset_m[0]), cis(waves * offset_m[1])), is_leaf=lambda leaf: leaf is None
     )
 
 

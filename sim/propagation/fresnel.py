@@ -96,10 +96,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
     first = int(np.floor(middle)) - kept // 2
     weights = pixel_weights(
-        camera.axis_m() / pitch + middle - first,
-        width,
-        camera.aperture_m * pitch / (wavelength_m * distance),
-        kept,
+        camera.axis_m() / pitch + middle - first, width, camera.aperture_m * pitch / (wavelength_m * distance), kept
     )
     area = np.pi * camera.aperture_m**2 / 4
     matrix = weights.matrix * (pitch / np.sqrt(area))

@@ -18,9 +18,7 @@ from sim.camera import Camera
 
 SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
 jax.tree_util.register_dataclass(
-    Variation,
-    data_fields=[f.name for f in fields(Variation) if f.name not in SETTINGS],
-    meta_fields=list(SETTINGS),
+    Variation, data_fields=[f.name for f in fields(Variation) if f.name not in SETTINGS], meta_fields=list(SETTINGS)
 )
 
 _BAND = 0.46  # waves per cell up to which second moments and their filters do
@@ -185,10 +183,7 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
             rule = f"must have one value per mask, {masks}"
             raise InputError(f"variation.{name}", rule, len(value), "Add or remove values.")
     relief = relief_of(process, variation)
-    limits = {
-        "cd_bias": float(jnp.abs(effective_bias(relief)).max()),
-        "corner_radius": variation.corner_radius_m,
-    }
+    limits = {"cd_bias": float(jnp.abs(effective_bias(relief)).max()), "corner_radius": variation.corner_radius_m}
     for name, value in limits.items():
         if value >= pitch_m / 2 * (1 + 1e-9):
             rule = f"must stay below half a cell, {format_length(pitch_m / 2)}"

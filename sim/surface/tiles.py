@@ -7,15 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, UInt8
 
-from sim.surface.cell import (
-    DEGREES,
-    FILTER_REACH,
-    axis_moments,
-    cuts,
-    moment_filter,
-    plane_moments,
-    whole_cell,
-)
+from sim.surface.cell import DEGREES, FILTER_REACH, axis_moments, cuts, moment_filter, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
 from sim.surface.pieces import PRECISION, STATES, TILE, light_of, mask_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
