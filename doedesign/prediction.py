@@ -10,7 +10,7 @@ from doedesign.design.design import Design
 from fab.level_map import LevelMap
 from fab.process import Process, Variation
 from sim.camera import Camera
-from sim.metrics import Evaluation, metric_rows
+from sim.metrics import metric_rows
 from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 
@@ -37,7 +37,7 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
 def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[dict[str, Any]]:
     """Numbers of a DOE as fabricated, one row per depth and colour (`sim.metrics.METRICS`, table "fabricated")."""
     nominal = _nominal(design.camera, design.level_map)
-    return metric_rows(Evaluation(bank, design.near_m, surface, nominal), "fabricated")
+    return metric_rows(bank.metric_inputs(design.near_m, surface, nominal), "fabricated")
 
 
 @lru_cache(maxsize=1)

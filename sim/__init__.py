@@ -10,13 +10,12 @@ Reading order, from the substance to the picture:
     farfield    pupil -> pixel energies, the default path (eqs. 7-9 of the paper)
     hankel      the same for rotationally symmetric pupils
     fresnel     the direct path (eq. 5): reference for the other two
-    surface     the plate as a process with errors makes it (`as_fabricated`)
+    surface     the DOE as a process with errors makes it (`as_fabricated`), its leaked and its diffracted light
     psf         PSF banks: every colour and depth of one height map
     transfer    MTF of lens, DOE and pixel
-    leakage     0th order, Strehl ratio, leaked and diffracted light of a plate
     frames      a camera's image files, whatever their format
     measured    measured PSFs from camera files
-    light       sRGB and linear light, lens shading
+    light       sRGB and linear light
     scene       what a camera looks at: a background and obstructions before it
     obstruction fences, raindrops, dirt and masks of a user, drawn from physical parameters
     disc        the aperture's shadow disc on pixels

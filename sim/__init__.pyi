@@ -7,8 +7,6 @@ from .imaging.formation import Optics as Optics
 from .imaging.formation import capture as capture
 from .imaging.scene import Obstruction as Obstruction
 from .imaging.scene import Scene as Scene
-from .leakage import SplitPsf as SplitPsf
-from .leakage import split_psf as split_psf
 from .light import linear_from_srgb as linear_from_srgb
 from .light import srgb_from_linear as srgb_from_linear
 from .material import MATERIALS as MATERIALS
@@ -45,5 +43,7 @@ from .store import write_bank as write_bank
 from .store import write_height as write_height
 from .surface import FabricatedDoe as FabricatedDoe
 from .surface import as_fabricated as as_fabricated
+from .surface.leakage import SplitPsf as SplitPsf
+from .surface.leakage import split_psf as split_psf
 from .transfer import TransferBank as TransferBank
 from .transfer import mtf as mtf

@@ -32,7 +32,7 @@ class CameraFrame(NamedTuple):
     Attributes:
         counts: `[y, x]` values, row 0 at the lowest y.
         valid: `[y, x]` pixels that carry the chosen colour.
-        clipped_at: value at which the file says its pixels are full; None if it does not say.
+        clipped_at: value at which the file says its pixels are full, or None.
         black: value that the file gives to no light at all.
         step: smallest difference of two values; 0 for floats.
     """
@@ -108,11 +108,7 @@ def _read_picture(path: Path, channel: Channel | None, allow_8bit: bool) -> Came
 
 @contextmanager
 def open_raw(path: Path) -> Iterator[Any]:
-    """Open a camera's RAW file with rawpy.
-
-    Raises:
-        InputError: rawpy is not installed, or the file is missing or damaged.
-    """
+    """Open a camera's RAW file with rawpy; an InputError where that is missing, or the file missing or damaged."""
     try:
         import rawpy
     except ImportError as error:
@@ -163,10 +159,7 @@ def _frame(
 
 
 def _implied_clip(values: Num[np.ndarray, "y x"], valid: Bool[np.ndarray, "y x"] | None) -> float:
-    """Value at which unsigned counts are full: that of their type, or of a converter with fewer bits if many are there.
-
-    A dozen pixels at exactly 4095, or at 4095 x 16, are no accident.
-    """
+    """Value at which unsigned counts are full: their type's, or that of fewer bits if a dozen pixels reach it."""
     full = float(np.iinfo(values.dtype).max)
     highest = int(values.max())
     bits = highest >> ((highest & -highest).bit_length() - 1) if highest else 0

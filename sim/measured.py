@@ -27,12 +27,7 @@ _SEARCH = 1024  # samples per side on which the light is looked for
 
 
 class Noise(NamedTuple):
-    """What a pixel adds by itself.
-
-    Attributes:
-        gain_e: electrons per count.
-        read_e: electrons, standard deviation of a reading.
-    """
+    """What a pixel adds by itself: electrons per count, and the standard deviation of a reading in electrons."""
 
     gain_e: float
     read_e: float
@@ -45,7 +40,7 @@ class MeasuredPsf(NamedTuple):
         rate: `[y, x]` counts per unit of exposure.
         floor: variance of `rate` without light.
         slope: variance of `rate` per unit of light.
-        valid: pixels that say something.
+        valid: pixels that carry information.
     """
 
     rate: Float[np.ndarray, "y x"]
@@ -171,12 +166,9 @@ def without_background(psf: MeasuredPsf) -> tuple[MeasuredPsf, float]:
 
 
 def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
-    """Where the point about which the light is most symmetric lies: row and column, pixel centres at whole numbers.
+    """Row and column of the point about which the light is most symmetric, good to a few pixels.
 
-    The peak of the image's convolution with itself. Good to a few pixels; a comparison with the model does the rest.
-
-    Raises:
-        InputError: no light above the noise.
+    The peak of the image's convolution with itself. An InputError where no light exceeds the noise.
     """
     factor = max(1, -(-max(psf.rate.shape) // _SEARCH))
     there = (np.where(psf.valid, values, 0.0) for values in (psf.rate, psf.floor, psf.valid))
@@ -205,10 +197,9 @@ def smoothed(psf: MeasuredPsf) -> Float[np.ndarray, "y x"]:
 def _without_holes(
     light: Float[np.ndarray, "y x"], share: Float[np.ndarray, "y x"], factor: int
 ) -> Float[np.ndarray, "y x"]:
-    """Sums over bins as a blurred image; `share` counts the pixels that are there, of `factor` squared.
+    """Sums over bins, of which `share` counts the pixels that are there, as a blurred image.
 
-    Pixels of another colour lie among their neighbours. Where a whole region is missing it is the brightest of all, or,
-    if it reaches the border, beyond the frame.
+    A missing region counts as the brightest of all or, if it reaches the border, as beyond the frame.
     """
     seen = gaussian_filter(share, 1.5)
     there = seen > 0.02 * factor**2
@@ -235,12 +226,7 @@ def parabola_vertex(values: Float[np.ndarray, " n"], at: int) -> float:
 
 
 def cut_window(psf: MeasuredPsf, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
-    """Cut a square of whole pixels whose middle is nearest to a point.
-
-    Args:
-        psf: the image.
-        centre: row and column of the point, pixel centres at whole numbers.
-        window: pixels per side.
+    """Cut a square of whole pixels whose middle is nearest to a point, in pixels (row, column).
 
     Returns:
         the square, pixels beyond the frame not valid, and where in it the point lies: pixels from its middle (y, x).
@@ -267,11 +253,7 @@ def _square(values: Any, starts: Sequence[int], window: int) -> Any:
 
 
 def binned(psf: MeasuredPsf, factor: int) -> MeasuredPsf:
-    """Add squares of `factor` x `factor` pixels; one that lacks a pixel is not valid.
-
-    Raises:
-        ValueError: the sides are no multiple of `factor`.
-    """
+    """Add squares of `factor` x `factor` pixels, which must divide the sides; one that lacks a pixel is not valid."""
     if any(size % factor for size in psf.rate.shape):
         raise ValueError(f"the sides must be multiples of {factor}, but the shape is {psf.rate.shape}")
     whole = _sums((~psf.valid).astype(np.float64), factor) == 0

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +19,6 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour, SpectralLine
 from sim.optic import CellOptic
 from sim.tracing import is_traced, stacked, total
-
-if TYPE_CHECKING:
-    from sim.psf_bank import PsfBank
 
 Psf = Float[np.ndarray, "y x"] | Float[Array, "y x"]
 Number = float | Float[Array, ""]
@@ -49,10 +46,7 @@ def mean_wavelength_m(colour: Colour) -> float:
 
 
 def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
-    """Radius that counts as the far spot: the first dark ring plus one pixel.
-
-    The pixel is there so that the spot is caught wherever it falls on the pixel grid.
-    """
+    """Radius that counts as the far spot: the first dark ring, and one pixel to catch it anywhere on the pixel grid."""
     return airy_radius_m(camera, wavelength_m) + camera.pixel_m
 
 
@@ -68,12 +62,9 @@ def encircled_energy(
     pixel_m: float,
     radii_m: Sequence[float] | np.ndarray,
 ) -> Float[np.ndarray, "*bank r"] | Float[Array, "*bank r"]:
-    """Energy of every PSF inside centred discs (not divided by the total), partly covered pixels counted by area.
+    """Energy `[..., radius]` of PSFs `[..., y, x]` inside centred discs (radii and pitch in metres).
 
-    Args:
-        psfs: `[..., y, x]` energies.
-        pixel_m: pixel pitch, metres.
-        radii_m: radii of the discs, metres.
+    Not divided by the total; partly covered pixels count by area.
     """
     y, x = psfs.shape[-2:]
     discs = [disc_weights((y, x), pixel_m, float(radius)) for radius in radii_m]
@@ -143,11 +134,9 @@ def zeroth_order(doe: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]
 
 
 def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
-    """Overlap |<t conj(t_nominal)>|^2 with the field the design means to make, for `doe.wavelengths_m`.
+    """Overlap |<t conj(t_nominal)>|^2 with the field of the DOE exactly as drawn, for `doe.wavelengths_m`.
 
-    Args:
-        doe: the DOE.
-        nominal: the DOE exactly as drawn, on its own grid; where `doe` is finer, its cells are repeated.
+    Where `doe` has finer cells, those of `nominal` are repeated.
     """
     parts = doe.camera.grid.shape[0] // nominal.camera.grid.shape[0]
     xp = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np
@@ -176,8 +165,8 @@ class EnergyBudget(NamedTuple):
 def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
     """Energy of square cells within the band of their grid, lit from a direction of `slope` waves per cell and cell.
 
-    The factor sinc(nu - slope x) of a cell is interpolated between three directions (exact to 1e-3 for directions up to
-    a sixth of the band, and a single one for a distant source), so nine transforms take the place of one sum per cell.
+    The factor sinc(nu - slope x) of a cell is interpolated between three directions, exact to 1e-3 up to a sixth of the
+    band, so nine transforms take the place of one sum per cell.
     """
     cells = field.shape[0]
     x, nu = np.arange(cells) - (cells - 1) / 2, np.fft.fftfreq(cells)
@@ -220,33 +209,26 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class MetricInputs:
     """A DOE and its PSFs, from which metrics are computed.
 
     Attributes:
-        bank: the PSFs, with their camera.
-        near_m: which of their depths are obstructions, metres.
+        energy: `[colour, depth, y, x]` PSFs, as in a `PsfBank`.
+        depths_m: their depths, metres.
+        camera: lens, sensor and substrate.
+        near_m: which of the depths are obstructions, metres.
         doe: the DOE.
         nominal: the DOE exactly as drawn, to compare with.
-        lens: PSFs of the bare lens at the same depths, to compare with.
+        lens: PSFs of the bare lens, to compare with.
     """
 
-    bank: "PsfBank"
+    energy: Any
+    depths_m: Sequence[float]
+    camera: Camera
     near_m: Sequence[float] = ()
     doe: CellOptic | None = None
     nominal: CellOptic | None = None
-    lens: "PsfBank | None" = None
-
-    @property
-    def camera(self) -> Camera:
-        """Lens, sensor and substrate.
-
-        Raises:
-            ValueError: the bank has none.
-        """
-        if self.bank.camera is None:
-            raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
-        return self.bank.camera
+    lens: Any = None
 
     def of_colours(self, values: Any) -> list[Any]:
         """Values for `doe.wavelengths_m` as their weighted sums for every colour."""
@@ -283,22 +265,22 @@ class Evaluation:
 
     def far_spot(self, colour: int, depth: int) -> Any:
         """Far-spot energy of one PSF."""
-        return far_spot(self.bank.energy[colour, depth], self.camera, self.camera.colours[colour])
+        return far_spot(self.energy[colour, depth], self.camera, self.camera.colours[colour])
 
     @cached_property
     def lens_participation(self) -> Any:
         """Participation `[colour, depth]` of the bare lens."""
         assert self.lens is not None
-        return participation(self.lens.energy)
+        return participation(self.lens)
 
     def concentration(self, colour: int, depth: int) -> Any:
         """Participation of one PSF over that of the bare lens."""
-        own, lens = participation(self.bank.energy[colour, depth]), self.lens_participation[colour, depth]
+        own, lens = participation(self.energy[colour, depth]), self.lens_participation[colour, depth]
         return own / lens if is_traced(own, lens) else float(own) / float(lens)
 
     def concentration_bound(self, colour: int) -> Any:
         """Square of the largest far-spot energy, or None without a far depth."""
-        far = [d for d, depth in enumerate(self.bank.depths_m) if depth not in self.near_m]
+        far = [d for d, depth in enumerate(self.depths_m) if depth not in self.near_m]
         return stacked([self.far_spot(colour, d) for d in far]).max() ** 2 if far else None
 
 
@@ -307,16 +289,16 @@ class Metric:
     """One number per colour and depth.
 
     Attributes:
-        label: what it is called in pictures and tables.
-        of: value for (evaluation, colour, depth), the latter two as positions in the bank.
-        tables: which tables list it: that of a "design", that of a DOE as "fabricated".
-        depths: whether it is meant for near depths, far ones, or all.
+        label: its name in pictures and tables.
+        of: value for (inputs, colour, depth), the latter two as positions in the bank.
+        tables: which tables list it.
+        depths: for which depths it is meant.
         worse: on which side a DOE is bad, for limits and yield; None for a number without limits.
-        unit: "1", or "m"; a share of something is shown in per cent.
+        unit: "1", "m", or "%" for a share, which is shown in per cent.
     """
 
     label: str
-    of: Callable[[Evaluation, int, int], Any]
+    of: Callable[[MetricInputs, int, int], Any]
     tables: tuple[Literal["design", "fabricated"], ...]
     depths: Literal["all", "near", "far"] = "all"
     worse: Literal["high", "low"] | None = None
@@ -324,7 +306,7 @@ class Metric:
 
     @property
     def share(self) -> bool:
-        """Whether it is a share of something, shown in per cent."""
+        """Whether it is shown in per cent."""
         return self.unit == "%"
 
 
@@ -334,10 +316,10 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
     {
         "zeroth_order": Metric("0th order", lambda e, c, d: e.orders[c], _BOTH, worse="high", unit="%"),
         "strehl": Metric("Strehl ratio", lambda e, c, d: e.strehls[c], ("fabricated",), worse="low"),
-        "throughput": Metric("throughput", lambda e, c, d: total(e.bank.energy[c, d]), _BOTH, worse="low", unit="%"),
+        "throughput": Metric("throughput", lambda e, c, d: total(e.energy[c, d]), _BOTH, worse="low", unit="%"),
         "outside_window": Metric(
             "light outside the window",
-            lambda e, c, d: e.passed(c) * e.opening - total(e.bank.energy[c, d]),
+            lambda e, c, d: e.passed(c) * e.opening - total(e.energy[c, d]),
             ("fabricated",),
             worse="high",
             unit="%",
@@ -345,14 +327,14 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "chrome": Metric("light by chrome", lambda e, c, d: e.passed(c) * (e.opening - 1), ("fabricated",), unit="%"),
         "ring_to_disc": Metric(
             "ring:disc",
-            lambda e, c, d: ring_to_disc(e.bank.energy[c, d], e.camera, e.bank.depths_m[d]).ratio,
+            lambda e, c, d: ring_to_disc(e.energy[c, d], e.camera, e.depths_m[d]).ratio,
             _BOTH,
             "near",
             worse="low",
         ),
         "disc_radius_m": Metric(
             "radius of the defocus disc",
-            lambda e, c, d: e.camera.defocus_radius_m(e.bank.depths_m[d]) + e.camera.pixel_m,
+            lambda e, c, d: e.camera.defocus_radius_m(e.depths_m[d]) + e.camera.pixel_m,
             ("design",),
             "near",
             unit="m",
@@ -373,19 +355,19 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 )
 
 
-def metric_rows(evaluation: Evaluation, table: Literal["design", "fabricated"]) -> list[dict[str, Any]]:
+def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) -> list[dict[str, Any]]:
     """One row per depth and colour: `colour`, `depth_m` (None for infinity) and the metrics of a table.
 
     A ring:disc ratio without any light in the disc is infinite.
     """
     rows = []
-    for d, depth in enumerate(evaluation.bank.depths_m):
-        shown = ("all", "near" if depth in evaluation.near_m else "far")
-        for c, colour in enumerate(evaluation.camera.colours):
+    for d, depth in enumerate(inputs.depths_m):
+        shown = ("all", "near" if depth in inputs.near_m else "far")
+        for c, colour in enumerate(inputs.camera.colours):
             row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
             for name, metric in METRICS.items():
                 if table in metric.tables and metric.depths in shown:
-                    value = metric.of(evaluation, c, d)
+                    value = metric.of(inputs, c, d)
                     row[name] = None if value is None else float(value)
             rows.append(row)
     return rows

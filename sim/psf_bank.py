@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from fab.errors import InputError
 from fab.units import metres
 from sim.camera import Camera, SpectralLine
-from sim.metrics import METRICS, Evaluation, encircled_energy, near_and_far, participation
+from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
 from sim.optic import ON_AXIS, CellOptic, HasOptic, HeightOptic, Optic, Propagation
 from sim.tracing import on_host, stacked
 
@@ -54,15 +54,27 @@ class PsfBank(eqx.Module):
         """The same PSFs with the camera they were computed for or measured with, which metrics and pictures need."""
         return replace(self, camera=camera)
 
-    def metric(self, name: str) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
-        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs, `[wavelength, depth]`.
+    def metric_inputs(
+        self,
+        near_m: Sequence[float] = (),
+        doe: CellOptic | None = None,
+        nominal: CellOptic | None = None,
+        lens: "PsfBank | None" = None,
+    ) -> MetricInputs:
+        """These PSFs for metrics, with the DOE that makes them, as it is and as drawn, and those of the bare lens.
 
         Raises:
             ValueError: the camera is not known.
         """
-        evaluation, of = Evaluation(self), METRICS[name].of
+        if self.camera is None:
+            raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
+        return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy)
+
+    def metric(self, name: str) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+        """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`."""
+        inputs, of = self.metric_inputs(), METRICS[name].of
         depths = range(len(self.depths_m))
-        return stacked([stacked([of(evaluation, c, d) for d in depths]) for c in range(len(self.colours))])
+        return stacked([stacked([of(inputs, c, d) for d in depths]) for c in range(len(self.colours))])
 
     def throughput(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
         """Energy in the window, `[wavelength, depth]`."""
@@ -85,14 +97,10 @@ class PsfBank(eqx.Module):
         return encircled_energy(self.energy, self.pixel_m, radii_m)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
-        """Draw the PSFs, near depths (a defocus disc beyond the far spot) and far ones each on a scale of their own.
-
-        Raises:
-            ValueError: the camera is not known.
-        """
+        """Draw the PSFs, near depths (a defocus disc beyond the far spot) and far ones each on a scale of their own."""
         from sim.plots.psfs import plot_psfs
 
-        camera = Evaluation(self).camera
+        camera = self.metric_inputs().camera
         near, far = near_and_far(camera, self.depths_m)
         return plot_psfs(self, camera, near, far, ax)
 

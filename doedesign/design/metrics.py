@@ -11,7 +11,6 @@ from doedesign.spec import Spec
 from fab.units import parse_length
 from sim.camera import Camera
 from sim.metrics import (
-    Evaluation,
     airy_radius_m,
     energy_budget,
     mean_wavelength_m,
@@ -33,7 +32,7 @@ def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], l
         near_m: which of the bank's depths are obstructions.
         lens: PSFs of the plain lens at the same depths.
     """
-    rows = without_infinities(metric_rows(Evaluation(bank, near_m, optic, lens=lens), "design"))
+    rows = without_infinities(metric_rows(bank.metric_inputs(near_m, optic, lens=lens), "design"))
     places = ((d, c) for d in range(len(bank.depths_m)) for c in range(len(bank.colours)))
     for row, (d, c) in zip(rows, places, strict=True):
         colour = optic.camera.colours[c]

@@ -17,13 +17,13 @@ from fab.errors import CheckFailed
 from fab.figure import save
 from fab.files import canonical_json
 from fab.process import Process, Variation
-from sim.leakage import SplitPsf, split_psf
 from sim.metrics import without_infinities
 from sim.plots.leakage import plot_split
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, psf
 from sim.store import write_bank
 from sim.surface import as_fabricated
+from sim.surface.leakage import SplitPsf, split_psf
 
 # Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand.
 _MOST_EXCESS = 1e-3

@@ -12,7 +12,6 @@ shadow of a rectangle is a product of two differences of Fresnel integrals, and 
 exact within the Fresnel approximation, whatever the fringes are, with no raster that they would have to fit.
 """
 
-from collections.abc import Sequence
 from typing import Literal
 
 import jax.numpy as jnp
@@ -82,10 +81,7 @@ def _runs(mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 def _fresnel_shares(
     crossing_m: Float[np.ndarray, " x"], lines_m: Float[np.ndarray, " line"], distance_m: float, wavelength_m: float
 ) -> Complex[np.ndarray, "x strip"]:
-    """Amplitude that passes each strip between two lines, of that which passes an open plane.
-
-    The strips run toward -x. All strips of an axis together give 1.
-    """
+    """Amplitude that passes each strip between two lines, toward -x, of that which passes an open plane."""
     from scipy.special import fresnel
 
     tau = (lines_m[None, :] - crossing_m[:, None]) * np.sqrt(2.0 / (wavelength_m * distance_m))
@@ -103,20 +99,20 @@ def shadowed_psf(
     point: Point,
     border: Border = "edge",
 ) -> Float[np.ndarray, "c window window"]:
-    """PSF of a scene point behind an obstruction, for every colour.
+    """PSF `[colour, y, x]` of a scene point behind an obstruction; the DOE is taken as it is on the axis.
 
     Args:
         camera: lens, sensor, substrate and grid.
         height_m: `[y, x]` DOE height, metres.
-        mask: see `shadow`.
+        mask: see `shadow`, as for all that follows.
         depth_m: distance of the obstruction, metres.
         background_depth_m: distance of the scene point, metres.
-        point: where in the view the scene point is, pixels (row, column).
-        border: see `shadow`.
+        point: pixels (row, column) of the scene point in the view.
+        border: what lies beyond the mask.
 
     Returns:
-        `[colour, y, x]` energy per pixel per unit power that would reach the clear aperture without the obstruction,
-        the chief ray in the middle of the window. The DOE is taken as it is on the axis.
+        energy per pixel per unit power that would reach the clear aperture without the obstruction, the chief ray in
+        the middle of the window.
     """
     height = jnp.asarray(height_m, jnp.float32)
     fields = []
@@ -126,43 +122,3 @@ def shadowed_psf(
         fields.append(jnp.asarray(passed, jnp.complex64) * doe)
     optic = HeightOptic(camera, HeightOptic.of(camera).coverage, None, jnp.stack(fields))
     return np.asarray(psf(optic, depths=background_depth_m).energy[:, 0])
-
-
-def pupil_shadow(
-    camera: Camera,
-    height_m: Float[np.ndarray, "y x"],
-    mask: Float[np.ndarray, "v u"],
-    depth_m: float,
-    points: Sequence[tuple[int, int]],
-    radiance: Float[np.ndarray, "point c"],
-    background_depth_m: float,
-    border: Border = "edge",
-) -> Float[np.ndarray, "c v u"]:
-    """Picture of some scene points behind an obstruction; the obstruction itself sends no light here.
-
-    Args:
-        camera: lens, sensor, substrate and grid; an odd window.
-        height_m: `[y, x]` DOE height, metres.
-        mask: `[y, x]` blocked share of every pixel of the view; the picture has its shape.
-        depth_m: distance of the obstruction, metres.
-        points: row and column of every scene point.
-        radiance: its light, `[point, colour]`.
-        background_depth_m: distance of the scene points, metres.
-        border: see `shadow`.
-
-    Returns:
-        `[colour, y, x]`; light that lands beyond the picture, or farther from its point than half a window, is left
-        out.
-
-    Raises:
-        ValueError: an even window, whose PSFs lie half a pixel off.
-    """
-    if camera.window % 2 == 0:
-        raise ValueError(f"`camera.window` must be odd, but got {camera.window}")
-    half = camera.window // 2
-    height, width = mask.shape
-    wide = np.zeros((len(camera.colours), height + 2 * half, width + 2 * half))
-    for (row, column), light in zip(points, radiance, strict=True):
-        image = shadowed_psf(camera, height_m, mask, depth_m, background_depth_m, (row, column), border)
-        wide[:, row : row + camera.window, column : column + camera.window] += light[:, None, None] * image
-    return wide[:, half : half + height, half : half + width].astype(np.float32)

@@ -4,6 +4,7 @@ The paper (section 3.2): Perlin noise, low-pass filtered with a Gaussian, cut at
 colour, at 5 to 12 cm. Here every length is one of the dirt itself, so its picture grows as it comes nearer (eq. 11).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +13,7 @@ from jaxtyping import Float
 
 from sim.imaging.scene import Obstruction
 from sim.obstruction.noise import layered_noise
-from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 __all__ = ["SOILS", "Dirt"]
@@ -27,7 +28,7 @@ SOILS = {
 
 
 @dataclass(frozen=True)
-class Dirt:
+class Dirt(WithLimits):
     """Clumps of soil. Lengths are those of the dirt itself, in metres; a range is drawn from uniformly.
 
     Attributes:
@@ -60,24 +61,22 @@ class Dirt:
     grain: float = 0.2
 
     name: ClassVar[str] = "dirt"
-
-    def __post_init__(self) -> None:
-        """Check every parameter.
-
-        Raises:
-            InputError: one of them cannot be meant.
-        """
-        require_depth(self.name, self.depth_m)
-        lengths = {"clump_m": (10e-6, 0.1), "blur_m": (0.0, 0.01), "edge_m": (0.0, 0.01)}
-        shares = {"coverage": (0.001, 0.999), "opacity": (0.0, 1.0), "light": (0.0, 1.0)}
-        for name, (low, high) in (lengths | shares).items():
-            require_range(f"{self.name}: {name}", getattr(self, name), low, high)
-        require_number(f"{self.name}: octaves", self.octaves, 1, 10)
-        for name in ("persistence", "colour_jitter", "grain"):
-            require_number(f"{self.name}: {name}", getattr(self, name), 0.0, 1.0)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "clump_m": (10e-6, 0.1),
+        "blur_m": (0.0, 0.01),
+        "edge_m": (0.0, 0.01),
+        "coverage": (0.001, 0.999),
+        "opacity": (0.0, 1.0),
+        "light": (0.0, 1.0),
+        "octaves": (1, 10),
+        "persistence": (0.0, 1.0),
+        "colour_jitter": (0.0, 1.0),
+        "grain": (0.0, 1.0),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one dirty glass (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Draw one dirty glass."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         cell, blur, edge = (
@@ -96,15 +95,9 @@ class Dirt:
 
 
 def layer(field: Float[np.ndarray, "y x"], coverage: float, edge: float) -> Float[np.ndarray, "y x"]:
-    """Opacity of a layer that lies where a field is high.
+    """Opacity 1 - exp(-d / edge), float32, at about `d` pixels inside the share `coverage` where a field is highest.
 
-    Args:
-        field: `[y, x]` smooth field.
-        coverage: share of the frame that the layer covers.
-        edge: length over which it thickens, pixels; at least half a pixel, which keeps the edge smooth.
-
-    Returns:
-        float32, 1 - exp(-d / edge) at about d from the edge, as of an absorbing layer that thickens inward.
+    An edge of less than half a pixel counts as that, which keeps it smooth.
     """
     threshold = np.quantile(field, 1 - coverage)
     slope = np.sqrt(np.mean(np.square(np.diff(field, axis=0))) + np.mean(np.square(np.diff(field, axis=1))))

@@ -13,6 +13,7 @@ Chain-link (the shape, not its numbers, of ASTM A392): every wire is a flat spir
 bends, hooked into its neighbours' bends. Mesh widths are distances of parallel wires.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, pi, radians, sin, tan
 from typing import ClassVar, Literal, NamedTuple, get_args
@@ -23,7 +24,7 @@ from jaxtyping import Float
 from fab.errors import InputError
 from sim.imaging.scene import Obstruction
 from sim.obstruction.noise import layered_noise
-from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 __all__ = ["Fence", "Pattern"]
@@ -36,7 +37,7 @@ _NOISE_RMS = 0.2157  # of one scale of Perlin's noise, the mean over a cell
 
 
 @dataclass(frozen=True)
-class Fence:
+class Fence(WithLimits):
     """Round wires in a plane. Lengths are those of the fence itself, in metres; a range is drawn from uniformly.
 
     Attributes:
@@ -68,33 +69,32 @@ class Fence:
     colour_jitter: float = 0.08
 
     name: ClassVar[str] = "fence"
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "wire_m": (1e-5, 0.5),
+        "mesh_m": (1e-4, 5.0),
+        "sag_m": (0.0, 0.1),
+        "bend_m": (0.0, 0.1),
+        "diamond_rad": (0.1, 1.47),
+        "rotation_rad": (-2 * pi, 2 * pi),
+        "tilt_rad": (0.0, 1.2),
+        "light": (0.0, 1.0),
+        "ambient": (0.0, 1.0),
+        "colour_jitter": (0.0, 1.0),
+    }
 
     def __post_init__(self) -> None:
-        """Check every parameter.
-
-        Raises:
-            InputError: one of them cannot be meant.
-        """
+        """Check every parameter, and raise an InputError for one that cannot be meant."""
         if not self.patterns or not set(self.patterns) <= set(get_args(Pattern)):
             rule = f"must name patterns out of {', '.join(get_args(Pattern))}"
             raise InputError(f"{self.name}: patterns", rule, self.patterns, "Name at least one.")
-        require_depth(self.name, self.depth_m)
-        lengths = {"wire_m": (1e-5, 0.5), "mesh_m": (1e-4, 5.0), "sag_m": (0.0, 0.1), "bend_m": (0.0, 0.1)}
-        angles = {"diamond_rad": (0.1, 1.47), "rotation_rad": (-2 * pi, 2 * pi), "tilt_rad": (0.0, 1.2)}
-        shares = {"light": (0.0, 1.0), "ambient": (0.0, 1.0)}
-        for name, (low, high) in (lengths | angles | shares).items():
-            require_range(f"{self.name}: {name}", getattr(self, name), low, high)
-        require_number(f"{self.name}: colour_jitter", self.colour_jitter, 0.0, 1.0)
+        super().__post_init__()
         if self.mesh_m[0] <= self.wire_m[1]:
             rule = f"must be wider than the widest wire, {self.wire_m[1]:g} m"
             raise InputError(f"{self.name}: mesh_m", rule, self.mesh_m, "Give a wider mesh or a thinner wire.")
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one fence (see `sim.obstruction.parameters.ObstructionKind`).
-
-        Raises:
-            InputError: the view is too wide for the tilt.
-        """
+        """Draw one fence, or raise an InputError where the view is too wide for the tilt."""
         view.require(background)
         pattern = self.patterns[rng.integers(len(self.patterns))]
         depth_m, wire_m, mesh_m = (draw_from(rng, given) for given in (self.depth_m, self.wire_m, self.mesh_m))
@@ -150,13 +150,9 @@ class Fence:
 
 
 class _Plane(NamedTuple):
-    """Where every pixel's direction meets the fence.
+    """Where every pixel's direction meets the fence: (u, v) in the plane in metres.
 
-    Attributes:
-        u: first coordinate in the plane, metres.
-        v: second coordinate.
-        away: distance along the axis over that of the plane's middle.
-        pixel_m: width of a pixel at the middle, metres.
+    `away` is the distance along the axis over that of the plane's middle, `pixel_m` a pixel's width there.
     """
 
     u: Float[np.ndarray, "y x"]
@@ -166,13 +162,7 @@ class _Plane(NamedTuple):
 
 
 class _Wires(NamedTuple):
-    """A family of wires that do not cross.
-
-    Attributes:
-        off: signed distance of every pixel from the nearest wire's centre line, metres.
-        normal_u: direction of growing `off` along u.
-        normal_v: the same along v.
-    """
+    """Wires that do not cross: every pixel's signed distance from the nearest (metres), and its gradient by u and v."""
 
     off: Float[np.ndarray, "y x"]
     normal_u: float
@@ -190,16 +180,13 @@ class _Lamp(NamedTuple):
 
 
 def tilted_plane(view: CameraView, depth_m: float, tilt_rad: float, towards_rad: float) -> _Plane:
-    """Meet every pixel's direction with a plane through the axis at `depth_m`.
+    """Meet every pixel's direction with a plane through the axis at `depth_m`; u runs along +x and v along +y.
 
     Args:
         view: the frame.
         depth_m: distance of the plane on the axis.
         tilt_rad: angle between its normal and the axis.
         towards_rad: direction, from +x to +y, in which it comes nearer.
-
-    Returns:
-        The meeting points, with u along +x and v along +y if there is no tilt.
 
     Raises:
         InputError: so wide a view does not meet a plane so tilted everywhere.
@@ -225,13 +212,7 @@ def turned(plane: _Plane, angle_rad: float, *, mirrored: bool) -> _Plane:
 
 
 def rods(across: Float[np.ndarray, "y x"], mesh_m: float, *, along_u: bool) -> _Wires:
-    """Straight wires at equal distances.
-
-    Args:
-        across: coordinate across them, metres.
-        mesh_m: their distance.
-        along_u: whether they run along u.
-    """
+    """Straight wires at equal distances; `across` is the coordinate across them, metres."""
     off = across - np.float32(mesh_m) * np.round(across / np.float32(mesh_m))
     return _Wires(off, 0.0 if along_u else 1.0, 1.0 if along_u else 0.0)
 

@@ -10,7 +10,7 @@ or from the parameter `width_m`. The first row of a picture is its top; it is tu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -24,7 +24,7 @@ from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import UM
 from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb
-from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 __all__ = ["MASK_FILES", "MaskFolder", "MaskPicture", "read_mask"]
@@ -39,8 +39,8 @@ class MaskPicture(NamedTuple):
 
     Attributes:
         mask: `[y, x]` 0 where the view is free, 1 where it is covered, float32; row 0 at the lowest y.
-        colour: `[c, y, x]` linear light of what covers; None if the file does not say.
-        pitch_m: width of one pixel on the obstruction, metres; None if no file says.
+        colour: `[c, y, x]` linear light of what covers, or None.
+        pitch_m: width of one pixel on the obstruction, metres, or None.
     """
 
     mask: Float[np.ndarray, "y x"]
@@ -49,7 +49,7 @@ class MaskPicture(NamedTuple):
 
 
 @dataclass(frozen=True)
-class MaskFolder:
+class MaskFolder(WithLimits):
     """Obstructions out of a folder, one of its masks at each draw, mirrored and shifted at random.
 
     Every file is read once when the folder is named, so that a bad one is known before the work begins.
@@ -73,6 +73,11 @@ class MaskFolder:
     files: tuple[Path, ...] = field(init=False)
 
     name: ClassVar[str] = "folder"
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "light": (0.0, 1.0),
+        "width_m": (1e-5, 1e3),
+    }
 
     def __post_init__(self) -> None:
         """Check the parameters and read every picture once.
@@ -81,12 +86,10 @@ class MaskFolder:
             InputError: a parameter cannot be meant, the folder holds no picture that can be used, or one of its
                 pictures cannot be used and `on_skip` is not given.
         """
-        require_depth(self.name, self.depth_m)
-        require_range(f"{self.name}: light", self.light, 0.0, 1.0)
+        super().__post_init__()
         for value in self.colour:
-            require_number(f"{self.name}: colour", value, 0.0, 1.0)
-        if self.width_m is not None:
-            require_number(f"{self.name}: width_m", self.width_m, 1e-5, 1e3)
+            if not 0 <= value <= 1:
+                raise InputError(f"{self.name}: colour", "must lie from 0 to 1", value, "Give a number within.")
         object.__setattr__(self, "files", tuple(self._usable()))
 
     def _usable(self) -> list[Path]:
@@ -119,13 +122,9 @@ class MaskFolder:
         return self.width_m / picture.mask.shape[1]
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one obstruction (see `sim.obstruction.parameters.ObstructionKind`).
+        """Draw one obstruction, or raise an InputError where its picture can no longer be read.
 
-        A picture that is wider than the frame is shifted within itself, a smaller one within the frame; beyond a
-        picture's edge the view is free.
-
-        Raises:
-            InputError: the picture can no longer be read.
+        A picture wider than the frame is shifted within itself, a smaller one within the frame; beyond it all is free.
         """
         view.require(background)
         path = self.files[rng.integers(len(self.files))]
@@ -151,17 +150,10 @@ class MaskFolder:
 def resized(
     picture: Float[np.ndarray, "n m"], shape: tuple[int, int], scale: float, corner: tuple[float, float]
 ) -> Float[np.ndarray, "y x"]:
-    """Cut a frame out of a picture.
+    """Cut a frame out of a picture whose pixel is `scale` pixels wide; `corner` (y, x) is in pixels of the picture.
 
-    Args:
-        picture: `[y, x]` values.
-        shape: pixels of the frame.
-        scale: pixels of the frame per pixel of the picture.
-        corner: (y, x) place of the frame's corner, pixels of the picture.
-
-    Returns:
-        `[y, x]` float32: area averages where it shrinks, so that areas are kept; linear between the middles of the
-        picture's pixels where it grows; zero beyond the picture.
+    Area averages where it shrinks, so that areas are kept; linear between the middles of the picture's pixels where it
+    grows; zero beyond the picture.
     """
     down = _averages(picture, shape[0], 1 / scale, corner[0])
     return _averages(down.T, shape[1], 1 / scale, corner[1]).T.astype(np.float32)
@@ -182,9 +174,6 @@ def _averages(rows: Float[np.ndarray, "n m"], count: int, step: float, start: fl
 
 def read_mask(path: Path) -> MaskPicture:
     """Read a mask and what is known of its size.
-
-    Args:
-        path: the picture.
 
     Raises:
         InputError: the file is missing, broken, too large, or no picture; it covers nothing; or its size is no length.

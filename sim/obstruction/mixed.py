@@ -1,5 +1,6 @@
 """A glass that carries one of two things, by the toss of a coin."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -8,7 +9,7 @@ from jaxtyping import Float
 
 from sim.imaging.scene import Obstruction
 from sim.obstruction.dirt import Dirt
-from sim.obstruction.parameters import require_number
+from sim.obstruction.parameters import Range, WithLimits
 from sim.obstruction.raindrop import Raindrop
 from sim.obstruction.view import CameraView
 
@@ -16,7 +17,7 @@ __all__ = ["DirtRaindrop"]
 
 
 @dataclass(frozen=True)
-class DirtRaindrop:
+class DirtRaindrop(WithLimits):
     """Dirt or raindrops, as the paper's network for windshields was trained.
 
     Attributes:
@@ -30,16 +31,11 @@ class DirtRaindrop:
     dirt_share: float = 0.5
 
     name: ClassVar[str] = "dirt_raindrop"
-
-    def __post_init__(self) -> None:
-        """Check the share.
-
-        Raises:
-            InputError: it is no share.
-        """
-        require_number(f"{self.name}: dirt_share", self.dirt_share, 0.0, 1.0)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "dirt_share": (0.0, 1.0),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Toss the coin and draw (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Toss the coin and draw."""
         kind = self.dirt if rng.uniform() < self.dirt_share else self.raindrop
         return kind.draw(rng, view, background)

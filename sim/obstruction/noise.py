@@ -50,15 +50,9 @@ def _factors(
 def perlin(
     lattice: Float[np.ndarray, "2 j i"], y: Float[np.ndarray, " n"], x: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n m"]:
-    """Noise at the crossings of rows and columns.
+    """Noise at the crossings of rows and columns: -1 to 1, mostly within 0.5.
 
-    Args:
-        lattice: gradients of the corners.
-        y: places of the rows in cells, from 0 to below the lattice's last corner.
-        x: the same of the columns.
-
-    Returns:
-        Values between -1 and 1, most of them within 0.5.
+    Places are counted in cells, from 0 to below the last corner of the lattice of gradients.
     """
     return _product(*_factors(lattice, _weights(y, lattice.shape[1]), _weights(x, lattice.shape[2])))
 
@@ -76,18 +70,15 @@ def layered_noise(
     persistence: float = 0.5,
     blur: float = 0.0,
 ) -> Float[np.ndarray, "y x"]:
-    """Noise of several scales, each half as wide as the one before, low-pass filtered.
+    """Noise of several scales, each half as wide as the one before, low-pass filtered; float32.
 
     Args:
         rng: randomness.
         shape: (y, x) pixels.
-        cell: width of the widest cells, pixels.
+        cell: width of the widest cells, pixels; their scale has Perlin's amplitude.
         octaves: number of scales; those with cells below two pixels are left out.
         persistence: amplitude of a scale over that of the one before.
         blur: sigma of the Gaussian, pixels.
-
-    Returns:
-        float32, zero in the mean over many draws; the widest scale has Perlin's amplitude.
     """
     margin = int(np.ceil(_REACH * blur))
 

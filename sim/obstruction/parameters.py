@@ -1,7 +1,8 @@
-"""What all kinds of obstruction share: ranges that a value is drawn from, their checks, and the way to draw."""
+"""What kinds of obstruction share: ranges that a value is drawn from, their limits, and the way to draw."""
 
 import math
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -10,12 +11,12 @@ from fab.errors import InputError
 from sim.imaging.scene import Obstruction
 from sim.obstruction.view import CameraView
 
-__all__ = ["ObstructionKind", "Range", "draw_from", "require_depth", "require_number", "require_range"]
+__all__ = ["DEPTHS_M", "ObstructionKind", "Range", "WithLimits", "draw_from"]
 
 # A value is drawn uniformly from here to there; twice the same number is that number.
 Range = tuple[float, float]
 
-_FARTHEST_M = 100.0
+DEPTHS_M: Range = (1e-3, 100.0)  # before the lens
 
 
 @runtime_checkable
@@ -23,61 +24,40 @@ class ObstructionKind(Protocol):
     """A kind of obstruction: its parameters, and a way to draw one."""
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one obstruction.
+        """Draw one: a sharp picture of it, float32.
 
         Args:
             rng: where the randomness comes from; the same state gives the same bytes.
             view: the frame.
             background: `[c, y, x]` linear light, red, green and blue, behind it.
-
-        Returns:
-            A sharp picture of it, float32.
         """
         ...
 
 
 def draw_from(rng: np.random.Generator, given: Range) -> float:
-    """Draw a number from a range."""
+    """A number from a range."""
     return float(rng.uniform(*given))
 
 
-def require_range(where: str, given: Range, low: float, high: float) -> None:
-    """Check a range that a user gave.
+class WithLimits:
+    """Parameters of which every one is checked when it is given.
 
-    Args:
-        where: "kind: parameter".
-        given: the range.
-        low: the smallest value that can be meant.
-        high: the largest.
-
-    Raises:
-        InputError: the range runs backwards or leaves what can be meant.
+    Attributes:
+        name: the kind's name.
+        limits: smallest and largest value that can be meant, by parameter; a range lies within and runs upward.
     """
-    if len(given) != 2 or not all(math.isfinite(value) for value in given) or not low <= given[0] <= given[1] <= high:
-        rule = f"must be two numbers, the smaller first, from {low:g} to {high:g}"
-        raise InputError(where, rule, given, "Give the same number twice for a fixed value.")
 
+    name: ClassVar[str]
+    limits: ClassVar[Mapping[str, Range]]
 
-def require_number(where: str, given: float, low: float, high: float) -> None:
-    """Check a number that a user gave.
-
-    Args:
-        where: "kind: parameter".
-        given: the number.
-        low: the smallest value that can be meant.
-        high: the largest.
-
-    Raises:
-        InputError: the number leaves what can be meant.
-    """
-    if not low <= given <= high:
-        raise InputError(where, f"must lie from {low:g} to {high:g}", given, "Give a number within.")
-
-
-def require_depth(kind: str, depth_m: Range) -> None:
-    """Check the range of an obstruction's distance.
-
-    Raises:
-        InputError: it is not in front of the lens.
-    """
-    require_range(f"{kind}: depth_m", depth_m, 1e-3, _FARTHEST_M)
+    def __post_init__(self) -> None:
+        """Check every parameter, and raise an InputError for one that leaves its limits."""
+        for parameter, (low, high) in self.limits.items():
+            given, where = getattr(self, parameter), f"{self.name}: {parameter}"
+            if np.ndim(given):
+                finite = len(given) == 2 and all(math.isfinite(value) for value in given)
+                if not finite or not low <= given[0] <= given[1] <= high:
+                    rule = f"must be two numbers, the smaller first, from {low:g} to {high:g}"
+                    raise InputError(where, rule, given, "Give the same number twice for a fixed value.")
+            elif given is not None and not low <= given <= high:
+                raise InputError(where, f"must lie from {low:g} to {high:g}", given, "Give a number within.")

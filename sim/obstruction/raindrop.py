@@ -20,6 +20,7 @@ A camera sees a few degrees and a drop the whole front: the picture stands in fo
 `surroundings_rad` and mirrored at its edges. Air drag, sagging and the absorption of water are left out.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, pi, radians, sin
 from typing import ClassVar, NamedTuple
@@ -29,7 +30,7 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
 from sim.imaging.scene import Obstruction
-from sim.obstruction.parameters import Range, draw_from, require_depth, require_number, require_range
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 __all__ = ["Drop", "Raindrop"]
@@ -39,7 +40,7 @@ _MOST_DROPS = 10_000
 
 
 @dataclass(frozen=True)
-class Raindrop:
+class Raindrop(WithLimits):
     """Drops on one glass. Lengths are those of the drops themselves, in metres; a range is drawn from uniformly.
 
     Attributes:
@@ -70,30 +71,21 @@ class Raindrop:
     surroundings_rad: float = radians(60)
 
     name: ClassVar[str] = "raindrop"
-
-    def __post_init__(self) -> None:
-        """Check every parameter.
-
-        Raises:
-            InputError: one of them cannot be meant.
-        """
-        require_depth(self.name, self.depth_m)
-        limits = {
-            "radius_m": (1e-5, 0.02),
-            "elongation": (0.2, 5.0),
-            "per_m2": (0.0, 1e7),
-            "airflow_rad": (-2 * pi, 2 * pi),
-            "contact_rad": (0.02, 1.55),
-            "tilt_rad": (0.0, 1.2),
-            "rim": (0.0, 10.0),
-            "contrast": (0.0, 3.0),
-        }
-        for name, (low, high) in limits.items():
-            require_range(f"{self.name}: {name}", getattr(self, name), low, high)
-        require_number(f"{self.name}: surroundings_rad", self.surroundings_rad, 0.01, pi)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "radius_m": (1e-5, 0.02),
+        "elongation": (0.2, 5.0),
+        "per_m2": (0.0, 1e7),
+        "airflow_rad": (-2 * pi, 2 * pi),
+        "contact_rad": (0.02, 1.55),
+        "tilt_rad": (0.0, 1.2),
+        "rim": (0.0, 10.0),
+        "contrast": (0.0, 3.0),
+        "surroundings_rad": (0.01, pi),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw a glass with drops (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Draw a glass with drops."""
         view.require(background)
         depth_m, tilt, airflow = (draw_from(rng, given) for given in (self.depth_m, self.tilt_rad, self.airflow_rad))
         contrast = draw_from(rng, self.contrast)
@@ -137,13 +129,9 @@ class Raindrop:
     def surroundings(
         self, background: Float[np.ndarray, "c y x"], rays: "Rays", turn_per_pixel: float
     ) -> Float[np.ndarray, "c n m"]:
-        """Light of the surroundings along refracted rays.
+        """Light of the surroundings, for which the background stands in, along refracted rays.
 
-        Args:
-            background: the picture that stands in for them.
-            rays: directions.
-            turn_per_pixel: turn of the cap's normal from pixel to pixel; how much a drop shrinks the picture, and over
-                how many of its pixels one of the drop's is averaged, follows from it.
+        The turn of the cap's normal from pixel to pixel says how much a drop shrinks them, and what a pixel averages.
         """
         from skimage.transform import downscale_local_mean
 
@@ -163,12 +151,8 @@ class Raindrop:
 class Drop(NamedTuple):
     """Outline of one drop, in pixels of the frame.
 
-    Attributes:
-        y: row of its middle, between its two halves.
-        x: column of it.
-        radius: radius of its round half.
-        length: half axis of its oval half along the airflow.
-        airflow: direction of the oval half, from +x to +y.
+    Its middle, the radius of its round half and the half axis of its oval half, whose direction `airflow` runs from +x
+    to +y.
     """
 
     y: float
@@ -236,13 +220,7 @@ class Drop(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Where the light of every pixel comes from.
-
-    Attributes:
-        elevation: angle above the axis, radians.
-        azimuth: angle towards +x, radians.
-        passed: share of light that the cap passes.
-    """
+    """Where each pixel's light comes from, radians above the axis and towards +x, and the share the cap passes."""
 
     elevation: Float[np.ndarray, "n m"]
     azimuth: Float[np.ndarray, "n m"]

@@ -5,6 +5,7 @@ ones, and their colours were meant as display values: they are turned into linea
 meant for a frame of 512 x 512 behind 8 mm (or 50 mm) of focal length.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
@@ -17,7 +18,7 @@ from sim.imaging.scene import Obstruction
 from sim.light import linear_from_srgb, srgb_from_linear
 from sim.obstruction.fence import Fence
 from sim.obstruction.noise import gradients, perlin
-from sim.obstruction.parameters import Range, draw_from, require_depth, require_range
+from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
 __all__ = ["ReleaseDirt", "ReleaseFence", "ReleaseRaindrop"]
@@ -27,7 +28,7 @@ _CELL_M = 64 * 3.7e-6 * 0.12 / 8e-3  # their width on the glass: 64 pixels of 3.
 
 
 @dataclass(frozen=True)
-class ReleaseDirt:
+class ReleaseDirt(WithLimits):
     """Dirt as in the release: no low-pass, a fixed threshold, and most of it in the middle.
 
     One scale of noise with cells of 3.55 mm on a tile of 8 x 8 of them, stretched to 0 to 1, emptied below 0.55, faded
@@ -42,17 +43,12 @@ class ReleaseDirt:
     depth_m: Range = (0.05, 0.12)
 
     name: ClassVar[str] = "release_dirt"
-
-    def __post_init__(self) -> None:
-        """Check the distance.
-
-        Raises:
-            InputError: it is not in front of the lens.
-        """
-        require_depth(self.name, self.depth_m)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one dirty glass (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Draw one dirty glass."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         spans = [n / view.pixels(_CELL_M, depth_m) for n in view.shape]
@@ -77,7 +73,7 @@ def _fading(shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
 
 
 @dataclass(frozen=True)
-class ReleaseRaindrop:
+class ReleaseRaindrop(WithLimits):
     """Raindrops as in the release: a window that magnifies the scene and stays upright.
 
     Between 5 and 7 drops at 12 cm, fewer in proportion as the glass comes nearer; radius of 1 to 3 mm, but never above
@@ -96,18 +92,13 @@ class ReleaseRaindrop:
     radius_m: Range = (1e-3, 3e-3)
 
     name: ClassVar[str] = "release_raindrop"
-
-    def __post_init__(self) -> None:
-        """Check both ranges.
-
-        Raises:
-            InputError: one of them cannot be meant.
-        """
-        require_depth(self.name, self.depth_m)
-        require_range(f"{self.name}: radius_m", self.radius_m, 1e-5, 0.02)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "radius_m": (1e-5, 0.02),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw a glass with drops (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Draw a glass with drops."""
         view.require(background)
         depth_m = draw_from(rng, self.depth_m)
         display = srgb_from_linear(background.astype(np.float32))
@@ -143,7 +134,7 @@ def _fish_eye(
 
 
 @dataclass(frozen=True)
-class ReleaseFence:
+class ReleaseFence(WithLimits):
     """Fences as in the release: wires of 5 to 15 mm where the paper has 4 mm, turned by up to 90 degrees either way.
 
     The release scales photographed masks that were not published; here `Fence` takes their place, neither tilted nor
@@ -158,18 +149,13 @@ class ReleaseFence:
     wire_m: Range = (5e-3, 15e-3)
 
     name: ClassVar[str] = "release_fence"
-
-    def __post_init__(self) -> None:
-        """Check both ranges.
-
-        Raises:
-            InputError: one of them cannot be meant.
-        """
-        require_depth(self.name, self.depth_m)
-        require_range(f"{self.name}: wire_m", self.wire_m, 1e-5, 0.1)
+    limits: ClassVar[Mapping[str, Range]] = {
+        "depth_m": DEPTHS_M,
+        "wire_m": (1e-5, 0.1),
+    }
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
-        """Draw one fence (see `sim.obstruction.parameters.ObstructionKind`)."""
+        """Draw one fence."""
         wire_m, mesh = draw_from(rng, self.wire_m), rng.uniform(8, 14)
         fence = Fence(
             depth_m=self.depth_m,

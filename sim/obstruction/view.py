@@ -11,24 +11,14 @@ __all__ = ["CameraView"]
 
 @dataclass(frozen=True)
 class CameraView:
-    """A frame of pixels behind a lens, in central perspective through the middle of the aperture.
-
-    Attributes:
-        shape: (y, x) pixels of the frame.
-        pixel_m: pixel pitch, metres.
-        focal_m: focal length, metres.
-    """
+    """A frame of (y, x) pixels behind a lens, in perspective through the middle of the aperture; lengths in metres."""
 
     shape: tuple[int, int]
     pixel_m: float
     focal_m: float
 
     def __post_init__(self) -> None:
-        """Refuse a frame that cannot be.
-
-        Raises:
-            ValueError: the frame is no area, or a length is not a positive number.
-        """
+        """Raise a ValueError for a frame without area, or a length that is not positive."""
         if len(self.shape) != 2 or not all(isinstance(n, int) and n > 1 for n in self.shape):
             raise ValueError(f"`shape` must be two numbers of pixels, each at least 2, but got {self.shape}")
         for name, value in (("pixel_m", self.pixel_m), ("focal_m", self.focal_m)):
@@ -36,11 +26,7 @@ class CameraView:
                 raise ValueError(f"`{name}` must be a positive length, but got {value}")
 
     def pixels(self, length_m: float, depth_m: float) -> float:
-        """Size in pixels of something `length_m` wide at `depth_m`: s f / (z pixel), eq. 11.
-
-        Raises:
-            ValueError: the depth is not positive.
-        """
+        """Size in pixels of something `length_m` wide at `depth_m`: s f / (z pixel), eq. 11."""
         if not depth_m > 0:
             raise ValueError(f"`depth_m` must be positive, but got {depth_m}")
         return length_m * self.focal_m / (depth_m * self.pixel_m)
@@ -60,10 +46,6 @@ class CameraView:
         return y[:, None].astype(np.float32), x[None, :].astype(np.float32)
 
     def require(self, background: Float[np.ndarray, "c y x"]) -> None:
-        """Check that a background fills this frame in red, green and blue.
-
-        Raises:
-            ValueError: it does not.
-        """
+        """Raise a ValueError unless a background fills this frame in red, green and blue."""
         if background.shape != (3, *self.shape):
             raise ValueError(f"`background` must have the shape {(3, *self.shape)}, but got {background.shape}")

@@ -15,13 +15,14 @@ from fab.units import MM, UM
 from sim.camera import Camera
 from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, line_colours
-from sim.psf_bank import PsfBank
-from sim.transfer import TransferBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
     from matplotlib.lines import Line2D
+
+    import sim.psf_bank
+    import sim.transfer
 
 __all__ = ["plot_encircled", "plot_mtf"]
 
@@ -37,11 +38,11 @@ _Finish = Callable[["Axes", int, str], None]
 
 
 def plot_mtf(
-    transfer: TransferBank,
+    transfer: "sim.transfer.TransferBank",
     camera: Camera,
     near_m: Sequence[float],
     far_m: Sequence[float],
-    lens: TransferBank | None = None,
+    lens: "sim.transfer.TransferBank | None" = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
     """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
@@ -75,11 +76,11 @@ def plot_mtf(
 
 
 def plot_encircled(
-    bank: PsfBank,
+    bank: "sim.psf_bank.PsfBank",
     camera: Camera,
     near_m: Sequence[float],
     far_m: Sequence[float],
-    lens: PsfBank | None = None,
+    lens: "sim.psf_bank.PsfBank | None" = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
     """Draw the share of the incident light inside centred circles of growing radius.

@@ -7,13 +7,14 @@ import numpy as np
 
 from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, scale_bar, shrunk
 from sim.camera import Camera
-from sim.leakage import SplitPsf
 from sim.plots.colours import colour_label
-from sim.psf_bank import PsfBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
+
+    import sim.psf_bank
+    import sim.surface.leakage
 
 __all__ = ["plot_split"]
 
@@ -21,8 +22,8 @@ _SIDE, _MOST_ROWS = 2.2, 4
 
 
 def plot_split(
-    nominal: PsfBank,
-    splits: Mapping[tuple[int, int], SplitPsf],
+    nominal: "sim.psf_bank.PsfBank",
+    splits: Mapping[tuple[int, int], "sim.surface.leakage.SplitPsf"],
     camera: Camera,
     depth: int,
     orders: Sequence[tuple[float, float]],

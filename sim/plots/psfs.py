@@ -12,12 +12,15 @@ from fab.units import UM
 from sim.camera import Camera
 from sim.metrics import energy_within, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, wavelength_order
-from sim.psf_bank import PsfBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import LogNorm
     from matplotlib.figure import FigureBase
+
+    import sim.psf_bank
+
+    Bank = sim.psf_bank.PsfBank
 
 __all__ = ["plot_psfs"]
 
@@ -44,7 +47,7 @@ class _Group(NamedTuple):
 
 
 def plot_psfs(
-    bank: PsfBank, camera: Camera, near_m: Sequence[float], far_m: Sequence[float], ax: "Axes | None" = None
+    bank: "Bank", camera: Camera, near_m: Sequence[float], far_m: Sequence[float], ax: "Axes | None" = None
 ) -> "FigureBase":
     """Draw the PSFs of a bank: a row per colour, near depths on the left and far ones on the right.
 
@@ -94,7 +97,7 @@ def plot_psfs(
     return figure
 
 
-def _group(bank: PsfBank, name: str, depths: list[int], dots: int) -> _Group:
+def _group(bank: "Bank", name: str, depths: list[int], dots: int) -> _Group:
     energy = np.asarray(bank.energy)[:, depths]
     images = np.stack([[shrunk(image, dots) for image in row] for row in energy])
     return _Group(name, depths, images, _scale(images, float(energy.max())))
@@ -130,7 +133,7 @@ def _shade(images: Float[np.ndarray, "w v u"], group: _Group) -> np.ndarray:
 
 
 def _draw_group(
-    figure: "FigureBase", panes: np.ndarray, camera: Camera, bank: PsfBank, group: _Group, rows: list[list[int]]
+    figure: "FigureBase", panes: np.ndarray, camera: Camera, bank: "Bank", group: _Group, rows: list[list[int]]
 ) -> None:
     """Draw the columns of a group and its colour scale."""
     from matplotlib.cm import ScalarMappable
@@ -146,7 +149,7 @@ def _draw_group(
     bar.ax.minorticks_off()
 
 
-def _draw_panel(axes: "Axes", camera: Camera, bank: PsfBank, group: _Group, column: int, picked: list[int]) -> None:
+def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, column: int, picked: list[int]) -> None:
     """Draw one depth in one colour, or in three."""
     _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m)
     depth = group.depths[column]
@@ -189,7 +192,7 @@ def _spot_radius_m(camera: Camera, colour: int) -> float:
     return spot_radius_m(camera, mean_wavelength_m(camera.colours[colour]))
 
 
-def _inset_pixels(camera: Camera, bank: PsfBank) -> int:
+def _inset_pixels(camera: Camera, bank: "Bank") -> int:
     """Pixels on each side of the centre that the inset shows: three radii of the largest far spot."""
     radius = max(_spot_radius_m(camera, i) for i in range(len(camera.colours)))
     return min(math.ceil(3 * radius / bank.pixel_m), bank.energy.shape[-1] // 2)
@@ -202,12 +205,12 @@ def _middle(energy: Float[np.ndarray, "w y x"], pixels: int) -> Float[np.ndarray
     return energy[:, cut, cut]
 
 
-def _least_disc_m(bank: PsfBank) -> float:
+def _least_disc_m(bank: "Bank") -> float:
     """Radius below which a circle would hide what it surrounds, or not be seen at all."""
     return bank.energy.shape[-1] * bank.pixel_m / 80
 
 
-def _notes(camera: Camera, bank: PsfBank, shown: dict[str, list[int]]) -> str:
+def _notes(camera: Camera, bank: "Bank", shown: dict[str, list[int]]) -> str:
     """Meaning of the marks in the panels."""
     words = []
     depths = [bank.depths_m[i] for positions in shown.values() for i in positions]

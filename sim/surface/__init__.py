@@ -24,7 +24,7 @@ How each error enters:
 
 Reading order: `cell` (where lines cut a cell, and what a lens sees of its pieces), `roughness`, `relief` (the errors as
 numbers), `pieces` (what is open where, and its light), `edges` (walls and corners), `tiles` (the whole plate), `plate`
-(the way in).
+(the way in), `leakage` (where its light goes).
 """
 
 from sim.surface.plate import FabricatedDoe, as_fabricated

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bench.reference import YELLOW_M, make_camera
-from sim.imaging.shadow import pupil_shadow, shadow, shadowed_psf
+from sim.camera import Camera
+from sim.imaging.shadow import Border, shadow, shadowed_psf
 from sim.psf_bank import psf
 
 NEAR_M = 0.05
@@ -31,6 +32,28 @@ def disc_overlap(share: float) -> float:
     """What a strip through the middle leaves open of a disc, its width over the diameter given."""
     a = min(share, 1.0)
     return 1 - 2 / np.pi * (np.arcsin(a) + a * np.sqrt(1 - a * a))
+
+
+def pupil_shadow(
+    camera: Camera,
+    height_m: np.ndarray,
+    mask: np.ndarray,
+    depth_m: float,
+    points: list[tuple[int, int]],
+    radiance: np.ndarray,
+    background_depth_m: float,
+    border: Border = "edge",
+) -> np.ndarray:
+    """Picture `[colour, y, x]` of some scene points (light `[point, colour]`) behind an obstruction that sends none."""
+    if camera.window % 2 == 0:
+        raise ValueError(f"`camera.window` must be odd, but got {camera.window}")
+    half = camera.window // 2
+    height, width = mask.shape
+    wide = np.zeros((len(camera.colours), height + 2 * half, width + 2 * half))
+    for (row, column), light in zip(points, radiance, strict=True):
+        image = shadowed_psf(camera, height_m, mask, depth_m, background_depth_m, (row, column), border)
+        wide[:, row : row + camera.window, column : column + camera.window] += light[:, None, None] * image
+    return wide[:, half : half + height, half : half + width].astype(np.float32)
 
 
 def test_nothing_in_the_way_and_everything():

@@ -11,11 +11,11 @@ from fab.grid import Grid
 from fab.levels import Levels, height_of
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
-from sim.leakage import SplitPsf, split_psf
 from sim.metrics import mean_transmission, strehl, zeroth_order
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
+from sim.surface.leakage import SplitPsf, split_psf
 
 PITCH_M = 2e-6
 CELLS = 48

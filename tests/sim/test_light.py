@@ -1,9 +1,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from sim.light import lens_shading, linear_from_srgb, srgb_from_linear
+from sim.light import linear_from_srgb, srgb_from_linear
 
 
 def test_values_of_the_standard():
@@ -32,21 +31,3 @@ def test_gradients_are_finite_at_black():
         gradient = jax.vmap(jax.grad(curve))(jnp.array([0.0, -0.01, 0.5]))
         np.testing.assert_allclose(gradient[:2], slope, rtol=1e-6)
         assert np.isfinite(gradient).all()
-
-
-def test_shading_is_the_fourth_power_of_the_cosine():
-    """At 45 degrees, a focal length off the axis, a quarter of the light arrives."""
-    gain = lens_shading((1, 2001), 1e-6, 1e-3)[0]
-    assert gain.dtype == np.float32
-    assert gain[1000] == 1
-    assert gain[[0, 2000]] == pytest.approx([0.25, 0.25], rel=1e-6)
-
-
-def test_shading_of_a_cut_out_and_of_a_measured_lens():
-    whole = lens_shading((40, 60), 5e-6, 1e-3)
-    part = lens_shading((20, 30), 5e-6, 1e-3, centre_m=(10 * 5e-6, -15 * 5e-6))
-    np.testing.assert_allclose(part, whole[20:, :30], rtol=1e-6)
-    darker = lens_shading((40, 60), 5e-6, 1e-3, radial=(-0.2, -0.1))
-    y, x = 39.0 / 2, 59.0 / 2
-    q = (y**2 + x**2) / (20**2 + 30**2)
-    assert darker[-1, -1] / whole[-1, -1] == pytest.approx(1 - 0.2 * q - 0.1 * q**2, rel=1e-6)

@@ -14,7 +14,6 @@ from fab.errors import InputError
 from fab.figure import png_bytes, save
 from fab.grid import Grid
 from sim.camera import Camera, Colour
-from sim.leakage import SplitPsf
 from sim.material import full_wave_height_m
 from sim.plots.colours import colour_label, depth_positions, line_colours
 from sim.plots.curves import plot_encircled, plot_mtf
@@ -22,6 +21,7 @@ from sim.plots.leakage import plot_split
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, psf
+from sim.surface.leakage import SplitPsf
 from sim.transfer import TransferBank
 from tests.pictures import panel, panel_dots, require_place_of_axes, require_whole
 

@@ -18,7 +18,7 @@ from sim.camera import Camera, Colour
 from sim.imaging.formation import Optics, capture
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Obstruction, Scene
-from sim.metrics import METRICS, Evaluation, mean_transmission, strehl, zeroth_order
+from sim.metrics import METRICS, mean_transmission, strehl, zeroth_order
 from sim.optic import HeightOptic, RingOptic
 from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
@@ -116,8 +116,8 @@ def test_all_metrics_of_a_height_map():
 
     def metrics(height: Any) -> list[Any]:
         doe = HeightOptic.of(ONE, height)
-        evaluation = Evaluation(psf(doe, depths=depths_m), (NEAR_M,), doe, nominal, lens)
-        return [metric.of(evaluation, 0, 0 if metric.depths == "far" else 2) for metric in METRICS.values()]
+        inputs = psf(doe, depths=depths_m).metric_inputs((NEAR_M,), doe, nominal, lens)
+        return [metric.of(inputs, 0, 0 if metric.depths == "far" else 2) for metric in METRICS.values()]
 
     start = HEIGHT_M + 1e-8 * np.random.default_rng(6).normal(size=HEIGHT_M.shape)
     sizes = [

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from sim.camera import Colour
 from sim.metrics import mean_transmission
 from sim.psf_bank import psf
-from sim.surface import FabricatedDoe
+from sim.surface.plate import FabricatedDoe
 
 
 class SplitPsf(NamedTuple):
     """One PSF by origin, energies per pixel.
 
     Attributes:
-        total: of the plate.
+        total: of the DOE.
         leaked: of the 0th order alone: |c0|^2 times the PSF of the bare lens.
         diffracted: of everything else.
     """
@@ -37,10 +37,7 @@ class SplitPsf(NamedTuple):
         return self.total - self.leaked - self.diffracted
 
     def excess(self) -> float:
-        """How far interference goes beyond what two fields can do, 2 sqrt(leaked diffracted), per brightest pixel.
-
-        Zero up to rounding, or the three do not belong together.
-        """
+        """How far interference exceeds its bound 2 sqrt(leaked diffracted), per brightest pixel; rounding, if right."""
         most = 2 * np.sqrt(np.maximum(self.leaked, 0) * np.maximum(self.diffracted, 0))
         return float(np.max(np.abs(self.interference) - most) / np.max(self.total))
 
@@ -54,8 +51,8 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
         colour: colour channel.
 
     Returns:
-        energies per unit power incident on the clear aperture, Fresnel loss included. The three transforms are taken
-        independently of each other: that they fit (`SplitPsf.excess`) is a check, not an assumption.
+        energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms:
+        that they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
     chosen = [doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m]
     whole = doe.transmission[np.array(chosen)]
