@@ -17,9 +17,10 @@ from pathlib import Path
 
 from doedesign.cli import exit_code
 from doedesign.optimization import optimize
+from doedesign.tolerancing.analysis import Sample
 from doedesign.tolerancing.plots import plot_effects, plot_histograms
 from doedesign.tolerancing.sensitivity import Effect
-from doedesign.tolerancing.studies import Sample, Study, study
+from doedesign.tolerancing.studies import Study, study
 from fab.figure import save
 
 HERE = Path(__file__).parent
@@ -54,10 +55,10 @@ def overlay(run: Path, draws: int = 40, sigma: str = "0.25 um", workers: int | N
     drawn = asked.sample(["expected"])  # without a mean error, the plate as drawn
     pictures = draw(run / "overlay", asked, plates, drawn, changes)
     lines = [f"yield of {draws} plates: {plates.yield_}", "", "quantity        as drawn     mean    worst plate"]
-    for quantity in plates.table.values:
+    for quantity in plates.values:
         found = next(s for s in plates.statistics() if s["quantity"] == quantity and s["colour"] is None)
         worst = found["max" if quantity in ("zeroth_order", "outside_window") else "min"]
-        lines.append(f"{quantity:<15} {drawn.table.worst(quantity)[0]:8.4f} {found['mean']:8.4f} {worst:14.4f}")
+        lines.append(f"{quantity:<15} {drawn.worst(quantity)[0]:8.4f} {found['mean']:8.4f} {worst:14.4f}")
     lines += ["", f"what {sigma} along x does to the Strehl ratio", "mask  one sigma left  one sigma right"]
     lines += [f"{k:<4} {low:15.4f} {high:16.4f}" for k, (low, high) in enumerate(strehl_by_mask(changes))]
     return "\n".join([*lines, "", *map(str, pictures)])
@@ -72,7 +73,7 @@ def strehl_by_mask(changes: list[Effect]) -> list[tuple[float, float]]:
 def draw(folder: Path, asked: Study, plates: Sample, drawn: Sample, changes: list[Effect]) -> list[Path]:
     """Histograms of the plates, and what every mask does alone."""
     files = [folder / "histograms.png", folder / "masks.png"]
-    save(plot_histograms(plates.table, drawn.table, asked.design.camera, asked.limits), files[0])
+    save(plot_histograms(plates, drawn, asked.design.camera), files[0])
     save(plot_effects(changes), files[1])
     return files
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
 from doedesign.prediction import Prediction, plate_rows, predict
-from doedesign.tolerancing.analysis import table_of
+from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at
 from fab.errors import InputError
@@ -110,7 +110,7 @@ def rank_importance(design: Design, process: Process, wavelength_m: float) -> tu
     nominal = made(Process(kept.levels), Variation())
     draws = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
     variances: dict[str, dict[str, float]] = {"strehl": {}, "zeroth_order": {}}
-    for change in one_at_a_time(kept, table_of(draws)):
+    for change in one_at_a_time(kept, sample_of(draws)):
         if change.colour is None and change.quantity in variances:
             of = variances[change.quantity]
             name = _measured(change.error)

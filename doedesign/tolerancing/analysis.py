@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,124 +17,9 @@ from sim.metrics import METRICS, Metric
 
 CONFIDENCE = 0.95
 
-
-# The metrics that limits can be set for.
+# The metrics that limits can be set for, and their worst values.
 QUANTITIES: Mapping[str, Metric] = {name: metric for name, metric in METRICS.items() if metric.worse is not None}
-
-
-_WORST = {"high": math.inf, "low": -math.inf}
-
-
-@dataclass(frozen=True)
-class SampleTable:
-    """Metrics of some draws.
-
-    Attributes:
-        keys: the draws.
-        places: colour and depth of every row; depths in metres, `inf` for a star.
-        values: `[draw, row]` of every quantity; NaN where a row has no such metric, and infinitely bad for a draw
-            beyond the model.
-    """
-
-    keys: tuple[str, ...]
-    places: tuple[tuple[str, float], ...]
-    values: Mapping[str, Float[np.ndarray, "draw row"]]
-
-    @property
-    def colours(self) -> tuple[str, ...]:
-        """Colours, in the order of the camera."""
-        return tuple(dict.fromkeys(colour for colour, _ in self.places))
-
-    def rows_of(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> list[int]:
-        """Rows that have this quantity, of one colour and depth or of all."""
-        has = np.any(~np.isnan(self.values[quantity]), axis=0)
-        return [
-            i
-            for i, (name, depth) in enumerate(self.places)
-            if has[i] and colour in (None, name) and (depth_m is None or math.isclose(depth, depth_m, rel_tol=1e-6))
-        ]
-
-    def worst(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> Float[np.ndarray, " d"]:
-        """The worst value of every draw over the rows of a colour and depth, or over all of them."""
-        chosen = self.values[quantity][:, self.rows_of(quantity, colour, depth_m)]
-        return chosen.max(axis=1) if QUANTITIES[quantity].worse == "high" else chosen.min(axis=1)
-
-    @property
-    def within(self) -> Bool[np.ndarray, " draw"]:
-        """Draws that the model describes."""
-        beyond = np.zeros(len(self.keys), dtype=bool)
-        for name, values in self.values.items():
-            beyond |= np.any(values == _WORST[str(QUANTITIES[name].worse)], axis=1)
-        return ~beyond
-
-    def of(self, keys: Sequence[str]) -> "SampleTable":
-        """Subset of the draws."""
-        positions = {key: i for i, key in enumerate(self.keys)}
-        chosen = [positions[key] for key in keys]
-        return SampleTable(tuple(keys), self.places, {name: values[chosen] for name, values in self.values.items()})
-
-
-def table_of(draws: Mapping[str, Rows | OutOfModel]) -> SampleTable:
-    """Table of the results of some draws.
-
-    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
-
-    Raises:
-        ValueError: no draws with rows, or draws with different rows.
-    """
-    first = next((found for found in draws.values() if not isinstance(found, OutOfModel)), None)
-    if first is None:
-        raise ValueError("`draws` must hold at least one draw with rows, but there is none")
-    places = tuple((str(row["colour"]), _depth(row["depth_m"])) for row in first)
-    present = [name for name in QUANTITIES if any(name in row for row in first)]
-    values = {name: np.full((len(draws), len(places)), np.nan) for name in present}
-    for i, (key, rows) in enumerate(draws.items()):
-        if isinstance(rows, OutOfModel):
-            for name in present:
-                has = [name in row for row in first]
-                values[name][i, has] = _WORST[str(QUANTITIES[name].worse)]
-            continue
-        if [(row["colour"], _depth(row["depth_m"])) for row in rows] != list(places):
-            raise ValueError(f"all draws must have the same rows, but {key} has others")
-        for j, row in enumerate(rows):
-            for name in present:
-                if name in row:
-                    values[name][i, j] = math.inf if row[name] is None else row[name]
-    return SampleTable(tuple(draws), places, values)
-
-
-def _depth(depth_m: float | None) -> float:
-    return math.inf if depth_m is None else float(depth_m)
-
-
-def statistics(table: SampleTable) -> list[dict[str, Any]]:
-    """Mean, spread and percentiles of every quantity: of the worst row of every draw, and of every row by itself.
-
-    Draws beyond the model are left out.
-
-    Returns:
-        rows with quantity, colour and depth_m (both None for the worst row), mean, std, min, p05, median, p95, max.
-    """
-    table = table.of([key for key, one in zip(table.keys, table.within, strict=True) if one])
-    out = []
-    for name in table.values:
-        places: list[tuple[str | None, float | None]] = [(None, None), *(table.places[i] for i in table.rows_of(name))]
-        for colour, depth in places:
-            out.append(
-                {"quantity": name, "colour": colour, "depth_m": depth, **_moments(table.worst(name, colour, depth))}
-            )
-    return out
-
-
-def _moments(values: Float[np.ndarray, " draw"]) -> dict[str, float]:
-    with np.errstate(invalid="ignore"):  # an infinite ratio has no mean
-        p05, median, p95 = np.percentile(values, [5, 50, 95])
-        mean, std = values.mean(), values.std(ddof=1) if len(values) > 1 else 0.0
-    found = {
-        **{"mean": mean, "std": std, "min": values.min()},
-        **{"p05": p05, "median": median, "p95": p95, "max": values.max()},
-    }
-    return {name: float(value) for name, value in found.items()}
+_WORST = {name: math.inf if metric.worse == "high" else -math.inf for name, metric in QUANTITIES.items()}
 
 
 class Yield(NamedTuple):
@@ -174,54 +59,178 @@ def yield_of(good: Bool[np.ndarray, " draw"]) -> Yield:
     return Yield(count / len(good), float(interval.low), float(interval.high), count, len(good))
 
 
-def obeys(table: SampleTable, limit: LimitSpec) -> Bool[np.ndarray, " draw"]:
-    """Whether every row of a draw that a limit concerns obeys it.
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Metrics of some draws, and the limits that a good DOE obeys.
+
+    Attributes:
+        keys: the draws.
+        places: colour and depth of every row; depths in metres, `inf` for a star.
+        values: `[draw, row]` of every quantity; NaN where a row has no such metric, and infinitely bad for a draw
+            beyond the model.
+        limits: what a good DOE obeys.
+    """
+
+    keys: tuple[str, ...]
+    places: tuple[tuple[str, float], ...]
+    values: Mapping[str, Float[np.ndarray, "draw row"]]
+    limits: tuple[LimitSpec, ...] = ()
+
+    @property
+    def colours(self) -> tuple[str, ...]:
+        """Colours, in the order of the camera."""
+        return tuple(dict.fromkeys(colour for colour, _ in self.places))
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A dictionary per draw, colour and depth (`depth_m`, metres); metrics that a row does not have are missing."""
+        within = self.within
+        return [
+            {"key": key, "colour": colour, "depth_m": depth}
+            | {name: float(values[i, j]) for name, values in self.values.items() if not math.isnan(values[i, j])}
+            for i, key in enumerate(self.keys)
+            for j, (colour, depth) in enumerate(self.places)
+            if within[i]
+        ]
+
+    def rows_of(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> list[int]:
+        """Rows that have this quantity, of one colour and depth or of all."""
+        has = np.any(~np.isnan(self.values[quantity]), axis=0)
+        return [
+            i
+            for i, (name, depth) in enumerate(self.places)
+            if has[i] and colour in (None, name) and (depth_m is None or math.isclose(depth, depth_m, rel_tol=1e-6))
+        ]
+
+    def worst(self, quantity: str, colour: str | None = None, depth_m: float | None = None) -> Float[np.ndarray, " d"]:
+        """The worst value of every draw over the rows of a colour and depth, or over all of them."""
+        chosen = self.values[quantity][:, self.rows_of(quantity, colour, depth_m)]
+        return chosen.max(axis=1) if QUANTITIES[quantity].worse == "high" else chosen.min(axis=1)
+
+    @property
+    def within(self) -> Bool[np.ndarray, " draw"]:
+        """Draws that the model describes."""
+        beyond = np.zeros(len(self.keys), dtype=bool)
+        for name, values in self.values.items():
+            beyond |= np.any(values == _WORST[name], axis=1)
+        return ~beyond
+
+    def of(self, keys: Sequence[str]) -> "Sample":
+        """Subset of the draws."""
+        positions = {key: i for i, key in enumerate(self.keys)}
+        chosen = [positions[key] for key in keys]
+        values = {name: values[chosen] for name, values in self.values.items()}
+        return Sample(tuple(keys), self.places, values, self.limits)
+
+    def obeys(self, limit: LimitSpec) -> Bool[np.ndarray, " draw"]:
+        """Whether every row of a draw that a limit concerns obeys it.
+
+        Raises:
+            InputError: the limit concerns no row.
+        """
+        rows = self.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in self.values else []
+        if not rows:
+            rule = "must match a colour and depth"
+            places = ", ".join(f"{c} at {_depth_text(z)}" for c, z in self.places)
+            raise InputError(f"limit on {limit.quantity}", rule, limit_text(limit), f"One of {places}.")
+        values = self.values[limit.quantity][:, rows]
+        low, high = -math.inf if limit.min is None else limit.min, math.inf if limit.max is None else limit.max
+        return np.all((values >= low) & (values <= high), axis=1)
+
+    @property
+    def good(self) -> Bool[np.ndarray, " draw"]:
+        """Whether a draw obeys every limit; one beyond the model does not.
+
+        Raises:
+            InputError: a limit that concerns no row.
+        """
+        return np.logical_and.reduce([self.within, *map(self.obeys, self.limits)])
+
+    @property
+    def yield_(self) -> Yield | None:
+        """Share of draws that obey every limit; None where there are no limits.
+
+        Raises:
+            InputError: a limit that concerns no colour and depth of the design.
+        """
+        return yield_of(self.good) if self.limits else None
+
+    @property
+    def worst_draw(self) -> str:
+        """Key of the draw farthest beyond a limit, or nearest to one; of the lowest Strehl ratio without limits.
+
+        Draws beyond the model are passed over.
+        """
+        margins = np.full(len(self.keys), np.inf)
+        if not self.limits:
+            quantity = "strehl" if "strehl" in self.values else next(iter(self.values))
+            margins = self.worst(quantity) * (1 if QUANTITIES[quantity].worse == "low" else -1)
+        for limit in self.limits:
+            values = self.values[limit.quantity][:, self.rows_of(limit.quantity, limit.colour, limit.depth_m)]
+            for bound, sign in ((limit.min, 1.0), (limit.max, -1.0)):
+                if bound is not None:
+                    # Against the size of the bound, so that limits of different quantities can be compared.
+                    margin = sign * (values - bound) / (abs(bound) or 1.0)
+                    margins = np.minimum(margins, margin.min(axis=1))
+        return self.keys[int(np.argmin(np.where(self.within, margins, np.inf)))]
+
+    def statistics(self) -> list[dict[str, Any]]:
+        """Mean, spread and percentiles of every quantity: of the worst row of every draw, and of every row by itself.
+
+        Draws beyond the model are left out.
+
+        Returns:
+            rows with quantity, colour and depth_m (both None for the worst row), mean, std, min, p05, median, p95, max.
+        """
+        found = self.of([key for key, one in zip(self.keys, self.within, strict=True) if one])
+        rows = []
+        for name in found.values:
+            for colour, depth in [(None, None), *(found.places[i] for i in found.rows_of(name))]:
+                place = {"quantity": name, "colour": colour, "depth_m": depth}
+                rows.append({**place, **_moments(found.worst(name, colour, depth))})
+        return rows
+
+
+def sample_of(draws: Mapping[str, Rows | OutOfModel], limits: Sequence[LimitSpec] = ()) -> Sample:
+    """Sample of the results of some draws.
+
+    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
 
     Raises:
-        InputError: the limit concerns no row.
+        ValueError: no draws with rows, or draws with different rows.
     """
-    rows = table.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in table.values else []
-    if not rows:
-        places = ", ".join(f"{c} at {_depth_text(z)}" for c, z in table.places)
-        raise InputError(
-            f"limit on {limit.quantity}", "must match a colour and depth", limit_text(limit), f"One of {places}."
-        )
-    values = table.values[limit.quantity][:, rows]
-    low, high = -math.inf if limit.min is None else limit.min, math.inf if limit.max is None else limit.max
-    return np.all((values >= low) & (values <= high), axis=1)
+    first = next((found for found in draws.values() if not isinstance(found, OutOfModel)), None)
+    if first is None:
+        raise ValueError("`draws` must hold at least one draw with rows, but there is none")
+    places = _places(first)
+    present = [name for name in QUANTITIES if any(name in row for row in first)]
+    values = {name: np.full((len(draws), len(places)), np.nan) for name in present}
+    for i, (key, found) in enumerate(draws.items()):
+        beyond = isinstance(found, OutOfModel)
+        if not beyond and _places(found) != places:
+            raise ValueError(f"all draws must have the same rows, but {key} has others")
+        for j, row in enumerate(first if beyond else found):
+            for name in present:
+                if name in row:
+                    values[name][i, j] = _WORST[name] if beyond else math.inf if row[name] is None else row[name]
+    return Sample(tuple(draws), places, values, tuple(limits))
 
 
-def good_draws(table: SampleTable, limits: Iterable[LimitSpec]) -> Bool[np.ndarray, " draw"]:
-    """Whether a draw obeys every limit; one beyond the model does not."""
-    good = table.within
-    for limit in limits:
-        good &= obeys(table, limit)
-    return good
+def _places(rows: Rows) -> tuple[tuple[str, float], ...]:
+    """Colour and depth of every row."""
+    depths = (math.inf if row["depth_m"] is None else float(row["depth_m"]) for row in rows)
+    return tuple((str(row["colour"]), depth) for row, depth in zip(rows, depths, strict=True))
 
 
-def worst_draw(table: SampleTable, limits: Sequence[LimitSpec]) -> str:
-    """Key of the draw farthest beyond a limit, or nearest to one; of the lowest Strehl ratio without limits.
-
-    Draws beyond the model are passed over.
-    """
-    if not limits:
-        quantity = "strehl" if "strehl" in table.values else next(iter(table.values))
-        sign = 1 if QUANTITIES[quantity].worse == "low" else -1
-        return table.keys[int(np.argmin(np.where(table.within, sign * table.worst(quantity), np.inf)))]
-    margins = np.full(len(table.keys), np.inf)
-    for limit in limits:
-        values = table.values[limit.quantity][:, table.rows_of(limit.quantity, limit.colour, limit.depth_m)]
-        for bound, sign in ((limit.min, 1.0), (limit.max, -1.0)):
-            if bound is not None:
-                # Against the size of the bound, so that limits of different quantities can be compared.
-                margin = sign * (values - bound) / (abs(bound) or 1.0)
-                margins = np.minimum(margins, margin.min(axis=1))
-    return table.keys[int(np.argmin(np.where(table.within, margins, np.inf)))]
+def _moments(values: Float[np.ndarray, " draw"]) -> dict[str, float]:
+    with np.errstate(invalid="ignore"):  # an infinite ratio has no mean
+        p05, median, p95 = np.percentile(values, [5, 50, 95])
+        mean, std = values.mean(), values.std(ddof=1) if len(values) > 1 else 0.0
+    names = ("mean", "std", "min", "p05", "median", "p95", "max")
+    return dict(zip(names, map(float, (mean, std, values.min(), p05, median, p95, values.max())), strict=True))
 
 
-_LIMIT = re.compile(
-    r"\s*(\w+)\s*(<=|>=)\s*([-+\d.eE]+)\s*(%?)(?:\s+for\s+([\w-]+))?(?:\s+at\s+(.+?))?\s*",
-)
+_LIMIT = re.compile(r"\s*(\w+)\s*(<=|>=)\s*([-+\d.eE]+)\s*(%?)(?:\s+for\s+([\w-]+))?(?:\s+at\s+(.+?))?\s*")
 
 
 def limit_from_text(text: str) -> LimitSpec:

@@ -1,7 +1,7 @@
 """The inverse budget: how large an error may be for a wanted yield."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -55,21 +55,9 @@ class Budget(NamedTuple):
             case _:
                 return f"without {self.what} errors the yield is {self.yields[0]}, so no budget gives {wanted}"
 
-    def as_record(self) -> dict[str, Any]:
-        """The same as a plain dictionary, for JSON."""
-        return {**self._asdict(), "yields": [one._asdict() for one in self.yields], "sigmas": dict(self.sigmas)}
-
 
 def budget_of(process: Process, what: str, wanted: float, factors: Sequence[float], yields: Sequence[Yield]) -> Budget:
-    """The budget that yields at some factors tell.
-
-    Args:
-        process: the process.
-        what: the errors, as `chosen_errors` takes them.
-        wanted: the wanted yield, between 0 and 1.
-        factors: growing, the first of them 0.
-        yields: the yield at each.
-    """
+    """The budget from the yields at some factors, which grow from 0; the other arguments as in `Study.budget`."""
     shares, lows, highs = (np.array([getattr(one, side) for one in yields]) for side in ("share", "low", "high"))
     falling = _falling(shares)
     verdict = "out of reach" if falling[0] < wanted else "beyond" if falling[-1] >= wanted else "found"

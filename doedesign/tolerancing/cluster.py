@@ -31,7 +31,7 @@ _KEPT = "Finished draws are kept."
 
 
 def evaluate_there(model: DrawModel, draws: Mapping[str, Variation], address: str) -> Iterator[tuple[str, Any]]:
-    """Evaluate draws by the workers of a Dask cluster.
+    """Evaluate draws, by key, by the workers of a Dask cluster.
 
     Args:
         model: how, and of what design and process.

@@ -9,7 +9,6 @@ half of a line that a killed run left behind is cut off.
 
 import contextlib
 import json
-import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 from doedesign.runs.folder import alone_in
 from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, read_json, write_atomic
+from fab.files import canonical_json, os_errors_explained, read_json, write_atomic
+from sim.metrics import without_infinities
 
 STUDY_NAME, DRAWS_NAME = "study.json", "draws.jsonl"
 
@@ -51,10 +51,8 @@ class Journal:
             self._claim(self.folder)
             path = self.folder / DRAWS_NAME
             self.finished |= _read(path)
-            try:
+            with os_errors_explained(path):
                 self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-            except OSError as error:
-                raise explain_os_error(error, path) from error
             try:
                 yield
             finally:
@@ -67,15 +65,15 @@ class Journal:
         Raises:
             InputError: the disk is full, or refuses otherwise.
         """
-        line = json.dumps({"key": key, **_record(found)}, sort_keys=True, allow_nan=False) + "\n"
-        if self._file is not None:
-            try:
+        beyond = isinstance(found, OutOfModel)
+        record = {"key": key, **({"beyond": found.reason} if beyond else {"rows": without_infinities(found)})}
+        line = json.dumps(record, sort_keys=True, allow_nan=False) + "\n"
+        if self.folder is not None and self._file is not None:
+            with os_errors_explained(self.folder / DRAWS_NAME):
                 data = line.encode()
                 while data:
                     data = data[os.write(self._file, data) :]
                 os.fsync(self._file)
-            except OSError as error:
-                raise explain_os_error(error, (self.folder or Path()) / DRAWS_NAME) from error
         # As it would be read again.
         self.finished |= dict([_draw(json.loads(line))])
 
@@ -93,25 +91,19 @@ class Journal:
         found = read_json(path)
         different = [key for key in sorted(found.keys() | study.keys()) if found.get(key) != study.get(key)]
         if different:
-            raise InputError(
-                str(folder),
-                "the folder must belong to this study",
-                f"one with another {', '.join(different)}",
-                "Choose another folder, or remove that study.",
-            )
+            rule, cure = "the folder must belong to this study", "Choose another folder, or remove that study."
+            raise InputError(str(folder), rule, f"one with another {', '.join(different)}", cure)
 
 
 def _read(path: Path) -> dict[str, Rows | OutOfModel]:
     """Results by key; half a line at the end is cut off the file."""
-    try:
+    if not path.exists():
+        return {}
+    with os_errors_explained(path):
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
         if whole < len(data):
             os.truncate(path, whole)
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     finished: dict[str, Rows | OutOfModel] = {}
     for number, line in enumerate(data[:whole].splitlines(), 1):
         try:
@@ -122,12 +114,6 @@ def _read(path: Path) -> dict[str, Rows | OutOfModel]:
             raise InputError(f"{path}, line {number}", "must be one finished draw", f'"{error}"', cure) from error
         finished[key] = found
     return finished
-
-
-def _record(found: Rows | OutOfModel) -> dict[str, Any]:
-    if isinstance(found, OutOfModel):
-        return {"beyond": found.reason}
-    return {"rows": [{name: None if value == math.inf else value for name, value in row.items()} for row in found]}
 
 
 def _draw(record: dict[str, Any]) -> tuple[str, Rows | OutOfModel]:

@@ -1,7 +1,7 @@
 """Pictures of a tolerance study: histograms, yield, which errors matter, and how large they may be.
 
 Every quantity has a panel of its own. "Worst" is the worst of a DOE's colours and depths, which decides whether the DOE
-is good.
+is good. A picture takes the place of axes `ax` of a subplot, or makes a new figure.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.report.labels import error_label
-from doedesign.tolerancing.analysis import QUANTITIES, SampleTable, good_draws, yield_of
+from doedesign.tolerancing.analysis import QUANTITIES, Sample, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare
 from fab.figure import INK, LINE, MARK, SERIES, length_text, panels, single
@@ -41,10 +41,6 @@ def _scale(quantity: str) -> float:
     return 100.0 if QUANTITIES[quantity].share else 1.0
 
 
-def _axis_label(quantity: str) -> str:
-    return QUANTITIES[quantity].label + (" (%)" if QUANTITIES[quantity].share else "")
-
-
 @contextmanager
 def _per_quantity(
     ax: "Axes | None",
@@ -59,9 +55,9 @@ def _per_quantity(
     size = (max(columns * size_in[0], 4.5), rows * size_in[1] + 0.5 + (0.2 if keys else 0.0))
     with panels(ax, size, note=note) as figure:
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes, quantity in zip(grid, quantities, strict=False):
-            axes.set_title(QUANTITIES[quantity].label)
-            axes.set_xlabel(_axis_label(quantity))
+        for axes, quantity in zip(grid, map(QUANTITIES.__getitem__, quantities), strict=False):
+            axes.set_title(quantity.label)
+            axes.set_xlabel(quantity.label + (" (%)" if quantity.share else ""))
         for spare in grid[len(quantities) :]:
             spare.set_axis_off()
         if keys:
@@ -69,48 +65,44 @@ def _per_quantity(
         yield figure, grid[: len(quantities)]
 
 
+def _hues(camera: "Camera") -> dict[str, Any]:
+    return dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
+
+
 def _colour_keys(camera: "Camera", **style: Any) -> "list[Line2D]":
     """A line or mark for every colour."""
     from matplotlib.lines import Line2D
 
-    hues = zip(camera.colours, line_colours(camera.colours), strict=True)
-    return [Line2D([], [], color=hue, label=colour_label(colour), **style) for colour, hue in hues]
+    return [Line2D([], [], color=_hues(camera)[c.name], label=colour_label(c), **style) for c in camera.colours]
 
 
-def plot_histograms(
-    table: SampleTable,
-    nominal: SampleTable,
-    camera: "Camera",
-    limits: Sequence["LimitSpec"] = (),
-    ax: "Axes | None" = None,
-) -> "FigureBase":
+def plot_histograms(sample: Sample, nominal: Sample, camera: "Camera", ax: "Axes | None" = None) -> "FigureBase":
     """Draw how every quantity is distributed over the DOEs: a line per colour, the worst depth of each DOE.
 
     Args:
-        table: the DOEs as fabricated.
+        sample: the DOEs as fabricated; the side beyond their limits is shaded.
         nominal: the DOE exactly as designed, dotted.
         camera: the colours.
-        limits: requirements on a good DOE; the side beyond is shaded.
-        ax: axes whose place the picture takes; a new figure by default.
+        ax: see the head of this module.
     """
-    hues = dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
-    words = f"{len(table.keys)} plates, the worst depth of each; dotted: the plate as drawn"
-    words += "; shaded: beyond the limit" if limits else ""
-    missing = int((~table.within).sum())
+    hues, plates = _hues(camera), len(sample.keys)
+    words = f"{plates} plates, the worst depth of each; dotted: the plate as drawn"
+    words += "; shaded: beyond the limit" if sample.limits else ""
+    missing = int((~sample.within).sum())
     words += f"; {missing} beyond the model are not shown" if missing else ""
-    with _per_quantity(ax, list(table.values), words, _colour_keys(camera)) as (figure, grid):
-        for axes, quantity in zip(grid, table.values, strict=True):
+    with _per_quantity(ax, list(sample.values), words, _colour_keys(camera)) as (figure, grid):
+        for axes, quantity in zip(grid, sample.values, strict=True):
             scale = _scale(quantity)
-            series = {c: scale * _finite(table.worst(quantity, c)) for c in table.colours}
-            design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in table.colours}
-            bins = _bins(np.concatenate([*series.values(), _finite(np.array(list(design.values())))]), len(table.keys))
+            series = {c: scale * _finite(sample.worst(quantity, c)) for c in sample.colours}
+            design = {c: scale * float(nominal.worst(quantity, c)[0]) for c in sample.colours}
+            bins = _bins(np.concatenate([*series.values(), _finite(np.array(list(design.values())))]), plates)
             for colour, values in series.items():
                 axes.hist(values, bins, histtype="stepfilled", color=hues[colour], alpha=0.15)
                 axes.hist(values, bins, histtype="step", color=hues[colour], lw=1.2)
                 if math.isfinite(design[colour]):
                     axes.axvline(design[colour], color=hues[colour], ls=":", lw=1.2)
             axes.set_xlim(bins[0], bins[-1])
-            _shade(axes, [one for one in limits if one.quantity == quantity], scale)
+            _shade(axes, sample.limits, quantity)
             axes.set_ylabel("plates")
             axes.locator_params(axis="y", integer=True)
     return figure
@@ -129,8 +121,9 @@ def _bins(values: Float[np.ndarray, " value"], plates: int = 1) -> list[float]:
     return np.linspace(low - room, high + room, round(min(max(2 * plates**0.5, 10), 40)) + 1).tolist()
 
 
-def _shade(axes: "Axes", limits: Sequence["LimitSpec"], scale: float) -> None:
-    """Shade what lies beyond limits; the view is widened so that the limits are in it."""
+def _shade(axes: "Axes", limits: Sequence["LimitSpec"], quantity: str) -> None:
+    """Shade what lies beyond the limits of a quantity; the view is widened so that the limits are in it."""
+    scale, limits = _scale(quantity), [one for one in limits if one.quantity == quantity]
     low, high = axes.get_xlim()
     bounds = [scale * b for one in limits for b in (one.min, one.max) if b is not None]
     room = 0.05 * (high - low)
@@ -143,28 +136,26 @@ def _shade(axes: "Axes", limits: Sequence["LimitSpec"], scale: float) -> None:
                 axes.axvline(scale * bound, color=MARK, lw=1.2)
 
 
-def plot_yield(table: SampleTable, limits: Sequence["LimitSpec"] = (), ax: "Axes | None" = None) -> "FigureBase":
+def plot_yield(sample: Sample, ax: "Axes | None" = None) -> "FigureBase":
     """Draw the yield over where the limit of each quantity lies: the share of DOEs whose worst row is as good.
 
-    Args:
-        table: the DOEs as fabricated.
-        limits: the limits as they are; one that concerns a single colour or depth has a curve of its own.
-        ax: axes whose place the picture takes; a new figure by default.
+    A limit that concerns a single colour or depth has a curve of its own.
 
     Raises:
         InputError: a limit that concerns no row.
     """
-    chosen = list(dict.fromkeys(one.quantity for one in limits)) or list(table.values)
-    words = f"share of {len(table.keys)} plates that are good if the limit lies there, with its 95 % confidence"
+    limits = sample.limits
+    chosen = list(dict.fromkeys(one.quantity for one in limits)) or list(sample.values)
+    words = f"share of {len(sample.keys)} plates that are good if the limit lies there, with its 95 % confidence"
     if limits:
-        words += f"; all limits together: {yield_of(good_draws(table, limits))}"
+        words += f"; all limits together: {sample.yield_}"
     with _per_quantity(ax, chosen, words) as (figure, grid):
         for axes, quantity in zip(grid, chosen, strict=True):
             places = {(one.colour, one.depth_m) for one in limits if one.quantity == quantity} or {(None, None)}
-            curves = {place: table.worst(quantity, *place) for place in sorted(places, key=str)}
+            curves = {place: sample.worst(quantity, *place) for place in sorted(places, key=str)}
             edges = _bins(_scale(quantity) * _finite(np.concatenate(list(curves.values()))))
             axes.set_xlim(edges[0], edges[-1])
-            _shade(axes, [one for one in limits if one.quantity == quantity], _scale(quantity))
+            _shade(axes, limits, quantity)
             for hue, (where, values) in zip(SERIES, curves.items(), strict=False):
                 words = ", ".join([where[0] or "", *([length_text(where[1])] if where[1] is not None else [])])
                 _plot_yield_curve(axes, values, quantity, hue, words.removeprefix(", ") or "all")
@@ -195,10 +186,6 @@ def plot_effects(effects: Sequence[Effect], ax: "Axes | None" = None) -> "Figure
     """Draw the effect of every error alone on the worst row of each quantity, one standard deviation to either side.
 
     Of more than ten errors, those that matter most to a quantity are shown.
-
-    Args:
-        effects: as `doedesign.tolerancing.sensitivity.one_at_a_time` gives them.
-        ax: axes whose place the picture takes; a new figure by default.
     """
     from matplotlib.lines import Line2D
 
@@ -244,13 +231,8 @@ def plot_variance_shares(shares: Sequence[VarianceShare], camera: "Camera", ax: 
 
     Bars are the worst row of a DOE: dark what a source causes by itself, light with other sources together. Marks are
     the totals of single colours.
-
-    Args:
-        shares: as `doedesign.tolerancing.sensitivity.sobol` gives them.
-        camera: the colours.
-        ax: axes whose place the picture takes; a new figure by default.
     """
-    hues = dict(zip((c.name for c in camera.colours), line_colours(camera.colours), strict=True))
+    hues = _hues(camera)
     quantities = list(dict.fromkeys(one.quantity for one in shares))
     sources = [s for s in dict.fromkeys(e.source for e in DEVIATIONS.values()) if any(o.source == s for o in shares)]
     sources += [s for s in dict.fromkeys(one.source for one in shares) if s not in sources]
@@ -277,16 +259,8 @@ def plot_variance_shares(shares: Sequence[VarianceShare], camera: "Camera", ax: 
 
 
 def plot_budget(budget: Budget, ax: "Axes | None" = None) -> "Axes":
-    """Draw the yield over the size of some errors, and where it is the wanted one.
-
-    Args:
-        budget: the budget.
-        ax: axes to draw on; those of a new figure by default.
-    """
-    share, low, high = (
-        [100 * value for value in side]
-        for side in zip(*((one.share, one.low, one.high) for one in budget.yields), strict=True)
-    )
+    """Draw the yield over the size of some errors, and where it is the wanted one; on `ax` or axes of a new figure."""
+    share, low, high = (100 * np.array([getattr(y, side) for y in budget.yields]) for side in ("share", "low", "high"))
     words = f"{budget.yields[0].plates} plates per point, 95 % confidence; {budget}"
     with single(ax, (5.0, 3.9), note=words) as axes:
         axes.fill_between(budget.factors, low, high, **_BAND)

@@ -41,11 +41,7 @@ _IDLE_S = 30  # after which a worker without work ends
 
 
 class OutOfModel(NamedTuple):
-    """Result of a draw whose errors are larger than the evaluation can describe.
-
-    Attributes:
-        reason: which of them, in a sentence.
-    """
+    """Result of a draw whose errors are larger than the evaluation can describe."""
 
     reason: str
 
@@ -101,11 +97,7 @@ def single_thread_settings() -> dict[str, str]:
 
 
 def default_workers(cells: int) -> int:
-    """As many workers as there are cores and memory for.
-
-    Args:
-        cells: DOE cells of the design.
-    """
+    """As many workers as there are cores and memory for, given the DOE cells of a design."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(cores, int(_free_gib() / (_BASE_GIB + cells * _BYTES_PER_CELL / _GIB))))
 
@@ -120,12 +112,7 @@ def _free_gib() -> float:
 
 
 def evaluate_here(model: DrawModel, draws: Mapping[str, Variation], workers: int) -> Iterator[tuple[str, Any]]:
-    """Evaluate draws on this machine.
-
-    Args:
-        model: how, and of what design and process.
-        draws: variations by key.
-        workers: number of worker processes; 0 to evaluate in this process, with all its threads.
+    """Evaluate draws, by key, in worker processes; with 0 workers in this process, with all its threads.
 
     Yields:
         key and result of every draw, as they are finished.

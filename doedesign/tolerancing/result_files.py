@@ -29,23 +29,20 @@ if TYPE_CHECKING:
     from doedesign.tolerancing.results import ToleranceResult
 
 
-def forget_results(folder: Path) -> None:
-    """Remove what an earlier call wrote, so that its pictures do not stand beside those of another plan."""
-    if (folder / MANIFEST_NAME).is_file():
-        for name in read_json(folder / MANIFEST_NAME).get("results_sha256", ()):
-            if Path(name).name == name:
-                (folder / name).unlink(missing_ok=True)
-        (folder / MANIFEST_NAME).unlink()
-
-
-def write_results(folder: Path, result: "ToleranceResult", keys: Sequence[str]) -> None:
-    """Write tables, results, pictures and a manifest of them.
+def write_results(folder: Path, result: "ToleranceResult") -> None:
+    """Write tables, results, pictures and a manifest of them, in the place of those of an earlier call.
 
     Raises:
         InputError: the system refuses the folder.
     """
-    write_atomic(folder / "draws.csv", _csv(_draw_lines(result.study, keys)))
-    write_atomic(folder / "errors.csv", _csv(_error_lines(result.study, keys)))
+    if (folder / MANIFEST_NAME).is_file():
+        # Pictures of another plan would stay otherwise.
+        for name in read_json(folder / MANIFEST_NAME).get("results_sha256", ()):
+            if Path(name).name == name:
+                (folder / name).unlink(missing_ok=True)
+        (folder / MANIFEST_NAME).unlink()
+    write_atomic(folder / "draws.csv", _csv(_draw_lines(result.study, result.keys)))
+    write_atomic(folder / "errors.csv", _csv(_error_lines(result.study, result.keys)))
     write_atomic(folder / "results.json", canonical_json(result.record()))
     pictures = _draw(folder, result)
     digests = {name: sha256_file(folder / name) for name in ("draws.csv", "errors.csv", "results.json", *pictures)}
@@ -54,10 +51,9 @@ def write_results(folder: Path, result: "ToleranceResult", keys: Sequence[str]) 
 
 
 def _draw(folder: Path, result: "ToleranceResult") -> list[str]:
-    """Draw what was found; returns the names of the pictures."""
+    """Draw all pictures; returns their names."""
     study, design = result.study, result.study.design
-    drawn: dict[str, Axes | FigureBase] = {"histograms.png": result.plot()}
-    drawn["yield.png"] = plot_yield(result.sample.table, study.limits)
+    drawn: dict[str, Axes | FigureBase] = {"histograms.png": result.plot(), "yield.png": plot_yield(result.sample)}
     if result.effects is not None:
         drawn["one_at_a_time.png"] = plot_effects(result.effects)
     if result.variance_shares is not None:

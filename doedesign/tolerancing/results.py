@@ -5,17 +5,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from doedesign.runs.folder import Run
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing.analysis import QUANTITIES, Yield, limit_text, obeys, yield_of
+from doedesign.tolerancing.analysis import QUANTITIES, Sample, Yield, limit_text, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_histograms
 from doedesign.tolerancing.pool import Evaluate, predicted_rows
-from doedesign.tolerancing.result_files import forget_results, write_results
-from doedesign.tolerancing.sensitivity import Effect, VarianceShare, as_records, source_shares
-from doedesign.tolerancing.studies import FORMAT, Sample, Study, study
+from doedesign.tolerancing.result_files import write_results
+from doedesign.tolerancing.sensitivity import Effect, VarianceShare, source_shares
+from doedesign.tolerancing.studies import FORMAT, Study, study
 from fab.draws import EXPECTED, NOMINAL, corner_keys, normal_keys, one_at_a_time_keys
 from fab.errors import InputError
 from fab.figure import html_of
@@ -31,45 +31,16 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 
-class StudyPlan(NamedTuple):
-    """Questions about a process; see `tolerance`."""
-
-    draws: int = 100
-    sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time"
-    sobol: int = 64
-    corners: bool = False
-    budget: str | None = None
-    wanted: float = 0.9
-
-    def keys(self, of: Study) -> list[str]:
-        """Every draw that the answers need.
-
-        Raises:
-            InputError: a question that cannot be asked of this study.
-        """
-        if self.draws < 1:
-            raise InputError("draws", "must be at least 1", self.draws, "For example 100.")
-        keys = [NOMINAL, EXPECTED, *normal_keys(self.draws)]
-        if self.sensitivity == "one_at_a_time":
-            keys += one_at_a_time_keys(of.process)
-        if self.sensitivity == "sobol":
-            keys += of.sobol_keys(self.sobol)
-        if self.corners:
-            keys += corner_keys(of.process)
-        if self.budget is not None:
-            keys += [key for some in of.budget_keys(self.budget, self.wanted, self.draws) for key in some]
-        return list(dict.fromkeys(keys))
-
-
 @dataclass(frozen=True)
 class ToleranceResult:
     """Result of a tolerance study; None where a question was not asked.
 
     Attributes:
         study: design, process and evaluated draws, of which more can be asked.
-        plan: the questions.
-        nominal: the DOE exactly as drawn.
-        expected: the one with every error at its mean.
+        plan: arguments of `tolerance` that say what was asked.
+        keys: all draws that the answers needed.
+        nominal: the DOE exactly as designed.
+        expected: the DOE with every error at its mean.
         sample: the Monte-Carlo draws.
         effects: effect of every error alone.
         variance_shares: Sobol indices of every source of error.
@@ -78,7 +49,8 @@ class ToleranceResult:
     """
 
     study: Study
-    plan: StudyPlan
+    plan: Mapping[str, Any]
+    keys: Sequence[str]
     nominal: Sample
     expected: Sample
     sample: Sample
@@ -95,16 +67,16 @@ class ToleranceResult:
     @property
     def worst(self) -> str:
         """Key of the worst Monte-Carlo draw, for `study.variation`."""
-        return self.sample.worst
+        return self.sample.worst_draw
 
     def statistics(self) -> list[dict[str, Any]]:
-        """Mean, spread and percentiles of every metric; see `doedesign.tolerancing.analysis.statistics`."""
+        """Mean, spread and percentiles of every metric; see `Sample.statistics`."""
         return self.sample.statistics()
 
     @property
     def shares(self) -> dict[str, dict[str, float]]:
         """Share of every source in the variance of each metric, the worst row of a draw; empty if not asked."""
-        quantities = self.sample.table.values
+        quantities = self.sample.values
         if self.variance_shares is not None:
             of = [one for one in self.variance_shares if one.colour is None]
             return {name: {one.source: one.total.value for one in of if one.quantity == name} for name in quantities}
@@ -112,75 +84,62 @@ class ToleranceResult:
 
     def record(self) -> dict[str, Any]:
         """Everything that was found as plain values for JSON, SI units; what is not finite is None."""
-        out: dict[str, Any] = {
+        answers = {
+            "one_at_a_time": self.effects,
+            "sobol": self.variance_shares,
+            "shares": self.shares or None,
+            "corners": self.corners and _sample_record(self.corners),
+            "budget": self.budget,
+        }
+        out = {
             "format": FORMAT,
             "design": self.study.design.name,
             "seed": self.study.seed,
-            "plan": self.plan._asdict(),
+            "plan": self.plan,
             "units": "SI; a depth of null is infinity; a colour of null is the worst colour and depth of each plate",
             "nominal": self.nominal.rows,
             "expected": self.expected.rows,
-            "beyond": self.study.beyond(self.plan.keys(self.study)),
-            "plates": self._sample_record(self.sample),
+            "beyond": self.study.beyond(self.keys),
+            "plates": _sample_record(self.sample),
+            **{name: found for name, found in answers.items() if found is not None},
         }
-        if self.effects is not None:
-            out["one_at_a_time"] = as_records(self.effects)
-        if self.variance_shares is not None:
-            out["sobol"] = as_records(self.variance_shares)
-        if shares := self.shares:
-            out["shares"] = shares
-        if self.corners is not None:
-            out["corners"] = self._sample_record(self.corners)
-        if self.budget is not None:
-            out["budget"] = self.budget.as_record()
         return plain(out)
 
-    def _sample_record(self, sample: Sample) -> dict[str, Any]:
-        together = sample.yield_
-        each = [{"limit": limit_text(one), **yield_of(obeys(sample.table, one))._asdict()} for one in sample.limits]
-        return {
-            "count": len(sample.table.keys),
-            "statistics": sample.statistics(),
-            "worst": {"key": sample.worst, "rows": self.study.sample([sample.worst]).rows},
-            "yield": None if together is None else {**together._asdict(), "limits": each},
-        }
-
     def __str__(self) -> str:
-        """What was found, on one line."""
-        quantity, limits = "strehl", self.study.limits
-        words = [f"{self.plan.draws} plates; without limits there is no yield"]
+        """Yield, the most important source of error and the budget, on one line."""
+        quantity, limits, draws = "strehl", self.study.limits, len(self.sample.keys)
+        words = [f"{draws} plates; without limits there is no yield"]
         if limits:
-            words = [f"yield {self.yield_} of {self.plan.draws} plates"]
+            words = [f"yield {self.yield_} of {draws} plates"]
             # The limit that most draws break.
-            quantity = min(limits, key=lambda one: yield_of(obeys(self.sample.table, one)).share).quantity
+            quantity = min(limits, key=lambda one: yield_of(self.sample.obeys(one)).share).quantity
         if shares := self.shares.get(quantity):
             source = max(shares, key=lambda name: shares[name])
             label = QUANTITIES[quantity].label
             words.append(f"most important: {source}, {100 * shares[source]:.0f} % of the variance of the {label}")
         if self.budget is not None:
             words.append(f"{self.budget}{_sigmas(self.budget)}")
-        if beyond := self.study.beyond(self.plan.keys(self.study)):
+        if beyond := self.study.beyond(self.keys):
             key, reason = next(iter(beyond.items()))
             words.append(f"{len(beyond)} plates beyond the model count as bad, such as {key} ({reason})")
         return "; ".join(words)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
-        """Draw how every metric is distributed over the draws; see `doedesign.tolerancing.plots` for other pictures.
+        """Draw how every metric is distributed over the draws, in the place of axes or a new figure.
 
-        Args:
-            ax: axes whose place the picture takes; a new figure by default.
+        Other pictures are in `doedesign.tolerancing.plots`.
         """
-        camera, limits = self.study.design.camera, self.study.limits
-        return plot_histograms(self.sample.table, self.nominal.table, camera, limits, ax)
+        return plot_histograms(self.sample, self.nominal, self.study.design.camera, ax)
 
     def _repr_html_(self) -> str:
         drawn = {row["quantity"]: row for row in self.statistics() if row["colour"] is None}
         rows: dict[str, object] = {"yield": self.yield_ or "no limits"}
         for name, row in drawn.items():
-            nominal = float(self.nominal.table.worst(name)[0])
-            told = f"mean {row['mean']:.4g}, 5 to 95 %: {row['p05']:.4g} to {row['p95']:.4g}, as drawn {nominal:.4g}"
-            rows[QUANTITIES[name].label] = told
-        return html_of(f"Tolerance of {self.study.design.name}, {self.plan.draws} draws", rows, self.plot())
+            nominal = float(self.nominal.worst(name)[0])
+            rows[QUANTITIES[name].label] = (
+                f"mean {row['mean']:.4g}, 5 to 95 %: {row['p05']:.4g} to {row['p95']:.4g}, as drawn {nominal:.4g}"
+            )
+        return html_of(f"Tolerance of {self.study.design.name}, {len(self.sample.keys)} draws", rows, self.plot())
 
 
 def tolerance(
@@ -230,13 +189,29 @@ def tolerance(
     settings: dict[str, Any] = {"process": process, "errors": errors, "limits": limits, "seed": seed, "masks": masks}
     where: dict[str, Any] = {"out": out, "workers": workers, "scheduler": scheduler, "evaluate": evaluate}
     asked = study(design, **settings, **where)
-    plan = StudyPlan(draws, sensitivity, sobol, corners, budget, wanted)
-    keys = plan.keys(asked)  # mistakes in the plan are told before anything is computed
+    # All draws first: mistakes in the questions show before anything is computed, and no worker waits between two.
+    if draws < 1:
+        raise InputError("draws", "must be at least 1", draws, "For example 100.")
+    keys = [NOMINAL, EXPECTED, *normal_keys(draws)]
+    if sensitivity == "one_at_a_time":
+        keys += one_at_a_time_keys(asked.process)
+    if sensitivity == "sobol":
+        keys += asked.sobol_keys(sobol)
+    if corners:
+        keys += corner_keys(asked.process)
+    if budget is not None:
+        keys += [key for some in asked.budget_keys(budget, wanted, draws) for key in some]
+    keys = list(dict.fromkeys(keys))
+    plan = {
+        **{"draws": draws, "sensitivity": sensitivity, "sobol": sobol},
+        **{"corners": corners, "budget": budget, "wanted": wanted},
+    }
     with asked.journal.open():
-        asked.sample(keys)  # all at once, so that no worker waits between two questions
+        asked.sample(keys)
         result = ToleranceResult(
             asked,
             plan,
+            keys,
             asked.sample([NOMINAL]),
             asked.sample([EXPECTED]),
             asked.monte_carlo(draws),
@@ -246,16 +221,27 @@ def tolerance(
             asked.budget(budget, wanted, draws) if budget is not None else None,
         )
         if out is not None:
-            forget_results(Path(out))
-            write_results(Path(out), result, keys)
+            write_results(Path(out), result)
     log.info(str(result))
     return result
 
 
+def _sample_record(sample: Sample) -> dict[str, Any]:
+    together = sample.yield_
+    each = [{"limit": limit_text(one), **yield_of(sample.obeys(one))._asdict()} for one in sample.limits]
+    return {
+        "count": len(sample.keys),
+        "statistics": sample.statistics(),
+        "worst": {"key": sample.worst_draw, "rows": sample.of([sample.worst_draw]).rows},
+        "yield": None if together is None else {**together._asdict(), "limits": each},
+    }
+
+
 def plain(value: Any) -> Any:
-    """Plain values for JSON: what is not finite becomes None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+    """Plain values for JSON: a NamedTuple becomes a dictionary, and what is not finite None."""
+    if isinstance(value, Mapping) or hasattr(value, "_asdict"):
+        named = value if isinstance(value, Mapping) else value._asdict()
+        return {str(key): plain(one) for key, one in named.items()}
     if isinstance(value, list | tuple):
         return [plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -268,10 +254,10 @@ def _sigmas(budget: Budget) -> str:
     named: dict[str, set[float]] = {}
     for name, sigma in budget.sigmas.items():
         named.setdefault(name.partition("[")[0], set()).add(sigma)
-    alike = {key: of.pop() for key, of in named.items() if len(of) == 1}
-    return "".join(f", sigma of {short_name(key)} {_sigma_text(key, sigma)}" for key, sigma in alike.items())
-
-
-def _sigma_text(key: str, sigma: float) -> str:
-    rounded, unit = float(f"{sigma:.3g}"), DEVIATIONS[key].unit
-    return format_length(rounded) if unit == "m" else f"{rounded:g}{' rad' if unit == 'rad' else ''}"
+    words = []
+    for key, sigmas in named.items():
+        if len(sigmas) == 1:
+            sigma, unit = float(f"{sigmas.pop():.3g}"), DEVIATIONS[key].unit
+            text = format_length(sigma) if unit == "m" else f"{sigma:g}{' rad' if unit == 'rad' else ''}"
+            words.append(f", sigma of {short_name(key)} {text}")
+    return "".join(words)

@@ -6,12 +6,12 @@ of a source is the variance that it causes by itself, the total index also what 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.tolerancing.analysis import CONFIDENCE, SampleTable
+from doedesign.tolerancing.analysis import CONFIDENCE, Sample
 from fab.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
 from fab.process import DEVIATIONS, Process
 from fab.sampling import source_of, varying
@@ -44,18 +44,13 @@ class Effect(NamedTuple):
     variance: float
 
 
-def one_at_a_time(process: Process, table: SampleTable) -> list[Effect]:
-    """Effect of every error alone.
-
-    Args:
-        process: the process.
-        table: draws of `one_at_a_time_keys` and the expected one.
-    """
+def one_at_a_time(process: Process, sample: Sample) -> list[Effect]:
+    """Effect of every error alone, from the draws of `one_at_a_time_keys` and the expected one."""
     keys = set(one_at_a_time_keys(process))
     out = []
-    for quantity in table.values:
-        for colour in (None, *table.colours):
-            values = dict(zip(table.keys, table.worst(quantity, colour).tolist(), strict=True))
+    for quantity in sample.values:
+        for colour in (None, *sample.colours):
+            values = dict(zip(sample.keys, sample.worst(quantity, colour).tolist(), strict=True))
             expected = values[EXPECTED]
             for name in varying(process):
                 below, above = (f"one_at_a_time/{name}/{reach}" for reach in ("-1", "+1"))
@@ -110,12 +105,12 @@ class VarianceShare(NamedTuple):
     total: SensitivityIndex
 
 
-def sobol(process: Process, table: SampleTable, count: int, seed: int = 0) -> list[VarianceShare]:
+def sobol(process: Process, sample: Sample, count: int, seed: int = 0) -> list[VarianceShare]:
     """Sobol indices of every source (estimators of Saltelli et al. 2010).
 
     Args:
         process: the process.
-        table: draws of `sobol_keys(process, count)`.
+        sample: draws of `sobol_keys(process, count)`.
         count: rows of the samples, a power of two.
         seed: seed of the bootstrap.
 
@@ -125,7 +120,7 @@ def sobol(process: Process, table: SampleTable, count: int, seed: int = 0) -> li
     from scipy.stats import bootstrap
 
     sources = sources_of(process)
-    of = table.of(sobol_keys(process, count))
+    of = sample.of(sobol_keys(process, count))
     numbers = {(q, c): _clipped(of.worst(q, c)) for q in of.values for c in (None, *of.colours)}
     outputs = [output for output, found in numbers.items() if _varies(found)]
     if not outputs:
@@ -172,10 +167,3 @@ def _indices(values: Float[np.ndarray, "sample output row"], rows: np.ndarray) -
     mixed = np.stack([*mixed, mixed[-1]])
     found = sobol_indices(func={"f_A": a, "f_B": b, "f_AB": mixed}, n=len(rows))
     return np.stack([found.first_order[:-1, :-1], found.total_order[:-1, :-1]])
-
-
-def as_records(found: Sequence[Effect] | Sequence[VarianceShare]) -> list[dict[str, Any]]:
-    """Plain dictionaries of effects or shares, for JSON."""
-    return [
-        {k: v._asdict() if isinstance(v, SensitivityIndex) else v for k, v in one._asdict().items()} for one in found
-    ]

@@ -15,16 +15,7 @@ from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing.analysis import (
-    SampleTable,
-    Yield,
-    good_draws,
-    limit_from_text,
-    statistics,
-    table_of,
-    worst_draw,
-    yield_of,
-)
+from doedesign.tolerancing.analysis import Sample, limit_from_text, sample_of, yield_of
 from doedesign.tolerancing.budget import FACTORS, Budget, budget_of
 from doedesign.tolerancing.cluster import evaluate_there
 from doedesign.tolerancing.journal import Journal
@@ -44,8 +35,7 @@ from fab.draws import (
 )
 from fab.errors import InputError
 from fab.files import sha256_bytes
-from fab.levels import Levels
-from fab.process import DEVIATIONS, Normal, Process, Variation, error_names
+from fab.process import DEVIATIONS, Process, Variation, error_names
 
 if TYPE_CHECKING:
     from doedesign.design.design import Design
@@ -55,48 +45,6 @@ FORMAT = "doedesign tolerance 1"
 _EARLIER = {"doedesign.tolerancing.pool:predicted_rows": "doedesign.tolerance.pool:predicted_rows"}
 # Draws times cells below which a study in memory is evaluated in this process: a worker starts in five seconds or so.
 _FEW_CELLS = 3_000_000
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Some draws of a study.
-
-    Attributes:
-        table: their metrics.
-        limits: what a good DOE obeys.
-    """
-
-    table: SampleTable
-    limits: tuple[LimitSpec, ...]
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """A dictionary per draw, colour and depth (`depth_m`, metres); metrics that a row does not have are missing."""
-        return [
-            {"key": key, "colour": colour, "depth_m": depth}
-            | {name: float(values[i, j]) for name, values in self.table.values.items() if not math.isnan(values[i, j])}
-            for i, key in enumerate(self.table.keys)
-            for j, (colour, depth) in enumerate(self.table.places)
-            if self.table.within[i]
-        ]
-
-    @property
-    def yield_(self) -> Yield | None:
-        """Share of draws that obey every limit; None where there are no limits.
-
-        Raises:
-            InputError: a limit that concerns no colour and depth of the design.
-        """
-        return yield_of(good_draws(self.table, self.limits)) if self.limits else None
-
-    @property
-    def worst(self) -> str:
-        """Key of the worst draw."""
-        return worst_draw(self.table, self.limits)
-
-    def statistics(self) -> list[dict[str, Any]]:
-        """Mean, spread and percentiles; see `doedesign.tolerancing.analysis.statistics`."""
-        return statistics(self.table)
 
 
 @dataclass(frozen=True)
@@ -111,8 +59,8 @@ class Study:
         limits: what a good DOE obeys.
         seed: seed of every draw.
         journal: the finished draws.
-        evaluate: what is asked of every draw.
-        run: how draws are evaluated.
+        evaluate: evaluation of one draw.
+        run: evaluation of many draws, here or on a cluster.
         quiet: whether no progress is shown.
     """
 
@@ -126,11 +74,6 @@ class Study:
     quiet: bool = False
 
     @property
-    def side_m(self) -> float:
-        """Side of the square on which particles and pinholes fall, metres: the whole grid of the DOE."""
-        return max(self.design.camera.grid.extent_m)
-
-    @property
     def sources(self) -> tuple[str, ...]:
         """Sources of error by which the draws differ."""
         return sources_of(self.process)
@@ -141,7 +84,8 @@ class Study:
         Raises:
             InputError: no such key.
         """
-        return variation_at(self.process, self.seed, self.side_m, key)
+        # Particles and pinholes fall on the whole grid of the DOE.
+        return variation_at(self.process, self.seed, max(self.design.camera.grid.extent_m), key)
 
     def sample(self, keys: Sequence[str]) -> Sample:
         """Evaluate some draws.
@@ -155,41 +99,35 @@ class Study:
             with self.journal.open():
                 missing = [key for key in keys if key not in self.journal.finished]
                 self._evaluate({key: self.variation(key) for key in missing}, len(keys))
-        self._require_some(keys)
-        return Sample(table_of({key: self.journal.finished[key] for key in keys}), self.limits)
+        beyond = self.beyond(keys)
+        for key in keys if len(beyond) == len(keys) else (NOMINAL, EXPECTED):
+            if key in beyond:
+                rule, cure = "must be within what can be evaluated", "Lower the means and sigmas of the errors."
+                raise InputError(f"draw {key}", rule, f'"{beyond[key]}"', cure)
+        return sample_of({key: self.journal.finished[key] for key in keys}, self.limits)
 
     def beyond(self, keys: Sequence[str]) -> dict[str, str]:
         """Why some of these draws could not be evaluated, by key; they count as bad."""
         found = ((key, self.journal.finished.get(key)) for key in keys)
         return {key: one.reason for key, one in found if isinstance(one, OutOfModel)}
 
-    def _require_some(self, keys: Sequence[str]) -> None:
-        beyond = self.beyond(keys)
-        needed = keys if len(beyond) == len(keys) else (NOMINAL, EXPECTED)
-        for key in needed:
-            if key in beyond:
-                rule, cure = "must be within what can be evaluated", "Lower the means and sigmas of the errors."
-                raise InputError(f"draw {key}", rule, f'"{beyond[key]}"', cure)
-
     def _evaluate(self, draws: Mapping[str, Variation], total: int) -> None:
         if not draws:
             return
-        done = total - len(draws)
-        progress = nullcontext() if self.quiet else meter("plates", total, done)
+        progress = nullcontext() if self.quiet else meter("plates", total, total - len(draws))
         model = DrawModel(self.evaluate, self.design, self.process)
         with progress as shown, closing(self.run(model, draws)) as finished:  # pyright: ignore[reportArgumentType]
-            for count, (key, found) in enumerate(finished):
-                if count == 0 and not isinstance(found, OutOfModel):
-                    # A limit that concerns none of the rows is told now, and not after all draws.
-                    good_draws(table_of({key: found}), self.limits)
+            for count, (key, found) in enumerate(finished, 1):
+                if count == 1 and not isinstance(found, OutOfModel):
+                    # A limit that concerns none of the rows is refused now, and not after all draws.
+                    _ = sample_of({key: found}, self.limits).good
                 self.journal.add(key, found)
-                done += 1
                 if shown is not None:
-                    shown.advance(done)
+                    shown.advance(total - len(draws) + count)
 
     def monte_carlo(self, draws: int = 100) -> Sample:
         """DOEs as the process makes them, rare events included."""
-        return self.sample(normal_keys(_at_least(1, "draws", draws)))
+        return self.sample(normal_keys(_at_least_one("draws", draws)))
 
     def corners(self) -> Sample:
         """DOEs with every error two standard deviations to one side or the other.
@@ -204,7 +142,7 @@ class Study:
 
     def one_at_a_time(self) -> list[Effect]:
         """Effect of every error alone, one standard deviation to either side."""
-        return one_at_a_time(self.process, self.sample([EXPECTED, *one_at_a_time_keys(self.process)]).table)
+        return one_at_a_time(self.process, self.sample([EXPECTED, *one_at_a_time_keys(self.process)]))
 
     def sobol_keys(self, count: int) -> list[str]:
         """The draws that `sobol` needs."""
@@ -221,7 +159,7 @@ class Study:
         Raises:
             InputError: not a power of two.
         """
-        return sobol(self.process, self.sample(self.sobol_keys(count)).table, count, self.seed)
+        return sobol(self.process, self.sample(self.sobol_keys(count)), count, self.seed)
 
     def budget_keys(
         self, what: str, wanted: float = 0.9, draws: int = 100, factors: Sequence[float] = FACTORS
@@ -235,7 +173,7 @@ class Study:
         if len(factors) < 2 or factors[0] != 0 or any(b <= a for a, b in pairwise(factors)):
             raise InputError("factors", "must grow from 0", tuple(factors), "For example 0, 0.5, 1, 2.")
         chosen_errors(self.process, what)
-        return [budget_keys(what, [factor], _at_least(1, "draws", draws)) for factor in factors]
+        return [budget_keys(what, [factor], _at_least_one("draws", draws)) for factor in factors]
 
     def budget(self, what: str, wanted: float = 0.9, draws: int = 100, factors: Sequence[float] = FACTORS) -> Budget:
         """Find how large some errors may be for a wanted yield, all others as they are.
@@ -252,8 +190,8 @@ class Study:
             InputError: no limits, nothing of that name varies, or a yield that is none.
         """
         keys = self.budget_keys(what, wanted, draws, factors)
-        table = self.sample([key for some in keys for key in some]).table
-        yields = [yield_of(good_draws(table.of(some), self.limits)) for some in keys]
+        sample = self.sample([key for some in keys for key in some])
+        yields = [yield_of(sample.of(some).good) for some in keys]
         return budget_of(self.process, what, wanted, factors, yields)
 
 
@@ -299,19 +237,17 @@ def study(
     # Errors are those of the lab; the design sees them through its masks.
     made = with_edge_moves(with_errors(made, errors) if errors else made, design.edge_moves_m)
     if not sources_of(made):
-        rule, cure = (
-            "a tolerance study needs errors that vary",
-            'Give a process with errors, such as "contact_aligner".',
-        )
+        rule = "a tolerance study needs errors that vary"
+        cure = 'Give a process with errors, such as "contact_aligner".'
         raise InputError("process.errors", rule, "none with a sigma above zero", cure)
     if seed < 0:
         raise InputError("seed", "must not be negative", seed, "For example 0.")
     if out is not None and "<" in evaluate.__qualname__:
         rule = "must be a function at the top of a module, for a study on disk is known by its name"
         raise InputError("evaluate", rule, evaluate.__qualname__, "Move it there.")
-    own = design.spec.limits if design.spec else ()
-    obeyed = own if limits is None else tuple(limit_from_text(one) if isinstance(one, str) else one for one in limits)
-    journal = Journal(None if out is None else Path(out), identity(design, made, seed, evaluate))
+    given = limits if limits is not None else design.spec.limits if design.spec else ()
+    obeyed = tuple(limit_from_text(one) if isinstance(one, str) else one for one in given)
+    journal = Journal(None if out is None else Path(out), _identity(design, made, seed, evaluate))
     run = _runner(design, workers, scheduler, out is None)
     return Study(design.bare(), made, obeyed, seed, journal, evaluate, run, quiet)
 
@@ -343,7 +279,7 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
         return partial(evaluate_there, address=scheduler)
     cells = design.level_map.level.size
     if workers is not None:
-        return partial(evaluate_here, workers=_at_least(1, "workers", workers))
+        return partial(evaluate_here, workers=_at_least_one("workers", workers))
     several = default_workers(cells)
 
     def run(model: DrawModel, draws: Mapping[str, Variation]) -> Iterator[tuple[str, Any]]:
@@ -352,25 +288,20 @@ def _runner(design: "Design", workers: int | None, scheduler: str | None, in_mem
     return run
 
 
-def _at_least(least: int, name: str, value: int) -> int:
-    if value < least:
-        raise InputError(name, f"must be at least {least}", value, f"For example {max(least, 2)}.")
+def _at_least_one(name: str, value: int) -> int:
+    if value < 1:
+        raise InputError(name, "must be at least 1", value, "For example 2.")
     return value
 
 
-def _levels_record(levels: Levels) -> dict[str, Any]:
-    """A staircase as JSON; depths that follow from the step are left out, as they were before there were others."""
-    depths = {} if levels.is_binary else {"depths_m": list(levels.depths_m)}
-    return {"count": levels.count, "step_m": levels.step_m, **depths}
-
-
-def identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
+def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Everything a draw's numbers depend on besides its key, as JSON.
 
     How many draws there are, and the limits they are judged by, are no part of it: a study may grow.
     """
-    level = design.level_map.level
-    spreads: Mapping[str, Normal] = process.spreads
+    level, levels = design.level_map.level, design.levels
+    # Depths that follow from the step are left out, as they were before there were others.
+    depths = {} if levels.is_binary else {"depths_m": list(levels.depths_m)}
     name = f"{evaluate.__module__}:{evaluate.__qualname__}"
     return {
         "format": FORMAT,
@@ -379,14 +310,14 @@ def identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) 
             "name": design.name,
             "level_sha256": sha256_bytes(level.tobytes()),
             "shape": list(level.shape),
-            "levels": _levels_record(design.levels),
+            "levels": {"count": levels.count, "step_m": levels.step_m, **depths},
             "camera": asdict(design.camera),
             "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*design.near_m, *design.far_m)],
             "near": len(design.near_m),
         },
         "process": {
             "order": list(process.order),
-            "errors": {name: spread._asdict() for name, spread in sorted(spreads.items())},
+            "errors": {name: spread._asdict() for name, spread in sorted(process.spreads.items())},
             "defects": asdict(process.defects),
             "die_m": list(process.die_m),
             "wafer_radius_m": process.wafer_radius_m,

@@ -11,17 +11,7 @@ import numpy as np
 import pytest
 
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing.analysis import (
-    QUANTITIES,
-    good_draws,
-    limit_from_text,
-    limit_text,
-    obeys,
-    statistics,
-    table_of,
-    worst_draw,
-    yield_of,
-)
+from doedesign.tolerancing.analysis import QUANTITIES, Sample, limit_from_text, limit_text, sample_of, yield_of
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
 from doedesign.tolerancing.sensitivity import source_shares
@@ -56,7 +46,7 @@ def row(colour: str, depth_m: float | None, **values: float | None) -> dict[str,
     return {"colour": colour, "depth_m": depth_m, **values}
 
 
-TWO = table_of(
+TWO = sample_of(
     {
         "normal/0": [
             row("red", 0.05, zeroth_order=0.01, strehl=0.9, ring_to_disc=3.0),
@@ -74,6 +64,10 @@ TWO = table_of(
 )
 
 
+def limited(sample: Sample, limits: list[LimitSpec]) -> Sample:
+    return dataclasses.replace(sample, limits=tuple(limits))
+
+
 def test_the_worst_row_is_the_highest_or_the_lowest():
     assert TWO.worst("zeroth_order").tolist() == [0.04, 0.03]
     assert TWO.worst("strehl").tolist() == [0.8, 0.7]
@@ -87,7 +81,7 @@ def test_the_worst_row_is_the_highest_or_the_lowest():
 
 
 def test_statistics_of_every_row_and_of_the_worst():
-    found = {(s["quantity"], s["colour"], s["depth_m"]): s for s in statistics(TWO)}
+    found = {(s["quantity"], s["colour"], s["depth_m"]): s for s in TWO.statistics()}
     worst = found["zeroth_order", None, None]
     assert worst["mean"] == pytest.approx(0.035)
     assert worst["std"] == pytest.approx(0.01 / math.sqrt(2))
@@ -104,9 +98,9 @@ def test_statistics_of_every_row_and_of_the_worst():
 def test_plates_with_other_rows_are_refused():
     rows = [row("red", None, strehl=1.0)]
     with pytest.raises(ValueError, match="the same rows"):
-        table_of({"normal/0": rows, "normal/1": [row("blue", None, strehl=1.0)]})
+        sample_of({"normal/0": rows, "normal/1": [row("blue", None, strehl=1.0)]})
     with pytest.raises(ValueError, match="at least one draw with rows"):
-        table_of({})
+        sample_of({})
 
 
 def test_yield_is_a_share_with_wilson_interval():
@@ -138,23 +132,23 @@ def test_yield_is_a_share_with_wilson_interval():
 )
 def test_a_limit_holds_for_every_row_it_speaks_of(text: str, good: list[bool]):
     limit = limit_from_text(text)
-    assert obeys(TWO, limit).tolist() == good
+    assert TWO.obeys(limit).tolist() == good
     assert limit_from_text(limit_text(limit)) == limit
 
 
 def test_a_good_plate_obeys_every_limit():
     limits = [limit_from_text("zeroth_order <= 3.5 %"), limit_from_text("ring_to_disc >= 2")]
-    assert good_draws(TWO, limits).tolist() == [False, False]
-    assert good_draws(TWO, []).tolist() == [True, True]
+    assert limited(TWO, limits).good.tolist() == [False, False]
+    assert limited(TWO, []).good.tolist() == [True, True]
     both = LimitSpec(quantity="zeroth_order", min=0.015, max=0.035, colour="red")
-    assert obeys(TWO, both).tolist() == [False, True]
+    assert TWO.obeys(both).tolist() == [False, True]
     assert limit_text(both) == "zeroth_order >= 0.015 and <= 0.035 for red"
 
 
 @pytest.mark.parametrize("text", ["throughput <= 5 %", "strehl >= 0.5 for green", "strehl >= 0.5 at 7 cm"])
 def test_a_limit_on_what_is_not_there_is_refused(text: str):
     with pytest.raises(InputError, match=r"must match a colour and depth.*red at 50 mm, red at inf"):
-        obeys(TWO, limit_from_text(text))
+        TWO.obeys(limit_from_text(text))
 
 
 @pytest.mark.parametrize(
@@ -168,23 +162,23 @@ def test_words_that_are_no_limit_are_refused(text: str):
 
 def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
     rows = [row("red", 0.05, strehl=0.9, zeroth_order=0.1, ring_to_disc=None)]
-    table = table_of({"normal/0": OutOfModel("too much"), "normal/1": rows, "normal/2": rows})
+    table = sample_of({"normal/0": OutOfModel("too much"), "normal/1": rows, "normal/2": rows})
     assert table.within.tolist() == [False, True, True]
-    assert good_draws(table, []).tolist() == [False, True, True]
-    assert obeys(table, limit_from_text("strehl >= 0")).tolist() == [False, True, True]
-    assert worst_draw(table, []) == "normal/1"
-    assert worst_draw(table, [limit_from_text("strehl >= 0.95")]) == "normal/1"
-    assert [found["min"] for found in statistics(table) if found["quantity"] == "strehl"] == [0.9, 0.9]
+    assert limited(table, []).good.tolist() == [False, True, True]
+    assert table.obeys(limit_from_text("strehl >= 0")).tolist() == [False, True, True]
+    assert limited(table, []).worst_draw == "normal/1"
+    assert limited(table, [limit_from_text("strehl >= 0.95")]).worst_draw == "normal/1"
+    assert [found["min"] for found in table.statistics() if found["quantity"] == "strehl"] == [0.9, 0.9]
     with pytest.raises(ValueError, match="at least one draw with rows"):
-        table_of({"normal/0": OutOfModel("too much")})
+        sample_of({"normal/0": OutOfModel("too much")})
 
 
 def test_the_worst_plate_is_farthest_beyond_a_limit():
-    assert worst_draw(TWO, []) == "normal/1"  # Strehl 0.7
-    assert worst_draw(TWO, [limit_from_text("zeroth_order <= 1 %")]) == "normal/0"
+    assert limited(TWO, []).worst_draw == "normal/1"  # Strehl 0.7
+    assert limited(TWO, [limit_from_text("zeroth_order <= 1 %")]).worst_draw == "normal/0"
     # 0.2 below 0.3 is worse than 0.04 above 0.035, against the size of the limits.
     limits = [limit_from_text("far_spot >= 0.3"), limit_from_text("zeroth_order <= 3.5 %")]
-    assert worst_draw(TWO, limits) == "normal/1"
+    assert limited(TWO, limits).worst_draw == "normal/1"
 
 
 def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
@@ -337,7 +331,7 @@ def test_plates_as_rows_and_without_limits(ask: Callable[..., Study]):
     assert plates.rows[0]["key"] == "normal/0"
     assert ("ring_to_disc" in plates.rows[0], "far_spot" in plates.rows[0]) == (True, False)
     assert plates.rows[1]["depth_m"] == math.inf
-    assert len(ask().corners().table.keys) == 2**5
+    assert len(ask().corners().keys) == 2**5
 
 
 def test_a_plate_is_evaluated_once(ask: Callable[..., Study], fakes):

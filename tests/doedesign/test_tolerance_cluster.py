@@ -141,7 +141,7 @@ def test_workers_are_set_up_and_mistakes_are_told(
     cluster.staff(1)
     set_up = ask(evaluate=fakes.settings)
     with pytest.raises(KeyError):  # these rows are no numbers of a plate
-        set_up.monte_carlo(1).table.worst("strehl")
+        set_up.monte_carlo(1).worst("strehl")
     found = set_up.journal.finished["normal/0"]
     assert isinstance(found, list)
     (row,) = found

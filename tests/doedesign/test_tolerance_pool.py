@@ -68,7 +68,7 @@ def test_workers_find_what_is_right_each_with_one_thread(ask: Callable[..., Stud
     assert asked.journal.finished == right
     set_up = ask(evaluate=fakes.settings, workers=2)
     with pytest.raises(KeyError):  # these rows are no numbers of a plate
-        set_up.monte_carlo(8).table.worst("strehl")
+        set_up.monte_carlo(8).worst("strehl")
     for found in set_up.journal.finished.values():
         assert isinstance(found, list)
         (row,) = found
@@ -110,7 +110,7 @@ def test_a_plate_beyond_the_model_is_a_bad_plate(ask: Callable[..., Study], fake
     assert set(beyond.values()) == {"overlay_x: must stay below 0.5 um, but got more"}
     assert plates.yield_ is not None
     assert plates.yield_.good == 40 - len(beyond)
-    assert plates.worst not in beyond
+    assert plates.worst_draw not in beyond
     assert {row["key"] for row in plates.rows} == set(normal_keys(40)) - set(beyond)
     assert all(math.isfinite(found["max"]) for found in plates.statistics())
     # They are kept like the others.

@@ -1,6 +1,7 @@
 """Pictures of tolerance studies are whole, repeatable, and show what they are given."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -9,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from doedesign.report.labels import error_label
-from doedesign.tolerancing.analysis import SampleTable, limit_from_text, yield_of
+from doedesign.spec import LimitSpec
+from doedesign.tolerancing.analysis import Sample, limit_from_text, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_budget, plot_effects, plot_histograms, plot_variance_shares, plot_yield
 from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, VarianceShare
@@ -29,7 +31,7 @@ LIMITS = [
 MARK = np.array([0xD1, 0x49, 0x5B]) / 255
 
 
-def random_table(rng: np.random.Generator, plates: int = 60) -> SampleTable:
+def random_table(rng: np.random.Generator, limits: Sequence[LimitSpec] = (), plates: int = 60) -> Sample:
     shape = (plates, len(PLACES))
     values = {
         "zeroth_order": rng.gamma(3, 0.01, shape),
@@ -40,7 +42,7 @@ def random_table(rng: np.random.Generator, plates: int = 60) -> SampleTable:
         "far_spot": np.where(NEAR_ROWS, np.nan, rng.normal(0.4, 0.02, shape)),
     }
     values["ring_to_disc"][0, 0] = np.inf  # a plate without any light in the disc
-    return SampleTable(tuple(f"normal/{i}" for i in range(plates)), PLACES, values)
+    return Sample(tuple(f"normal/{i}" for i in range(plates)), PLACES, values, tuple(limits))
 
 
 def changes(rng: np.random.Generator) -> list[Effect]:
@@ -79,18 +81,18 @@ def budget(verdict: str = "found") -> Budget:
 
 def plot(name: str, ax: Axes | None = None) -> Axes | FigureBase:
     rng = np.random.default_rng(5)
-    table = random_table(rng)
+    table = random_table(rng, () if name == "bare" else LIMITS)
     match name:
         case "histograms":
-            return plot_histograms(table, table.of(["normal/3"]), CAMERA, LIMITS, ax)
+            return plot_histograms(table, table.of(["normal/3"]), CAMERA, ax)
         case "yield":
-            return plot_yield(table, LIMITS, ax)
+            return plot_yield(table, ax)
         case "one_at_a_time":
             return plot_effects(changes(rng), ax)
         case "sobol":
             return plot_variance_shares(shares(rng), CAMERA, ax)
         case "bare":
-            return plot_yield(table, ax=ax)
+            return plot_yield(table, ax)
         case _:
             return plot_budget(budget(name), ax)
 
@@ -111,15 +113,15 @@ def coloured(drawn: Axes | FigureBase, hue: np.ndarray) -> int:
 
 @pytest.mark.parametrize(
     "draw",
-    [lambda table, limits: plot_histograms(table, table, CAMERA, limits), plot_yield],
+    [lambda table: plot_histograms(table, table, CAMERA), plot_yield],
     ids=["histograms", "yield"],
 )
-def test_a_limit_is_marked_wherever_it_lies(draw: Callable[[SampleTable, list], FigureBase], rng: np.random.Generator):
+def test_a_limit_is_marked_wherever_it_lies(draw: Callable[[Sample], FigureBase], rng: np.random.Generator):
     table = random_table(rng)
-    assert coloured(draw(table, []), MARK) == 0
+    assert coloured(draw(table), MARK) == 0
     # Far from all plates: the view is widened.
     # One line over the height of a panel, 1.7 inches of 160 dots, about 2 wide; not all of them are of the pure colour.
-    assert coloured(draw(table, [limit_from_text("ring_to_disc >= 9")]), MARK) > 200
+    assert coloured(draw(replace(table, limits=(limit_from_text("ring_to_disc >= 9"),))), MARK) > 200
 
 
 def test_a_longer_bar_is_a_larger_change():
