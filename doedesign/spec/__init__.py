@@ -25,10 +25,10 @@ import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from doedesign.spec.checks import find_problems, spec_warnings
-from doedesign.spec.errors import SpecError, Table, explain, key_as_written, spec_error, validated
+from doedesign.spec.errors import SpecError, Table, key_as_written, spec_error, validated
 from doedesign.spec.models import Spec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
@@ -53,19 +53,18 @@ from fab.process import Variation
 _OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
 
 
-class _File(NamedTuple):
-    what: str
-    example: str
-    problems: Callable[[Any], Iterable[InputError]] = lambda _: ()
-
-
-_FILES: dict[type, _File] = {
-    Spec: _File("a spec", "examples/quick.toml", find_problems),
-    ProcessFile: _File(
-        "a process", "the [process] table of examples/automotive.toml", lambda file: process_problems(file.process)
-    ),
-    WaferFile: _File("a wafer", "`[wafer]` with `dies = [2, 2]`"),
-    VariationFile: _File("a variation", "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`", variation_problems),
+# What a file should hold and an example of it, for messages.
+_FILES: dict[type, tuple[str, str]] = {
+    Spec: ("a spec", "examples/quick.toml"),
+    ProcessFile: ("a process", "the [process] table of examples/automotive.toml"),
+    WaferFile: ("a wafer", "`[wafer]` with `dies = [2, 2]`"),
+    VariationFile: ("a variation", "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`"),
+}
+# The rules between the values of a file.
+_PROBLEMS: dict[type, Callable[[Any], Iterable[InputError]]] = {
+    Spec: find_problems,
+    ProcessFile: lambda file: process_problems(file.process),
+    VariationFile: variation_problems,
 }
 
 
@@ -87,7 +86,7 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
         InputError: the file cannot be read, is no TOML, or breaks a rule.
     """
     path = Path(path)
-    raw = read_toml(path, *_FILES[Spec][:2])
+    raw = read_toml(path, *_FILES[Spec])
     keys = [_override(raw, text) for text in overrides]
     tables = {field.alias for field in Spec.model_fields.values()}
     for name, value in values.items():
@@ -108,10 +107,7 @@ def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
 
 
 def load_process(path: str | Path) -> ProcessSpec:
-    """Read a process from the `[process]` table of a TOML file: a file of its own, or a whole spec.
-
-    Args:
-        path: the file. Other tables of a spec are passed over.
+    """Read a process from the `[process]` table of a TOML file, whose other tables, those of a spec, are passed over.
 
     Raises:
         InputError: the file cannot be read, is no TOML, has no process, or breaks a rule.
@@ -120,23 +116,12 @@ def load_process(path: str | Path) -> ProcessSpec:
 
 
 def load_wafer(path: str | Path) -> WaferSpec:
-    """Read a wafer from the `[wafer]` table of a TOML file: a file of its own, or a whole spec.
-
-    Args:
-        path: the file. Other tables of a spec are passed over.
-
-    Raises:
-        InputError: the file cannot be read, is no TOML, has no wafer, or breaks a rule.
-    """
+    """Read a wafer from the `[wafer]` table of a TOML file; see `load_process`."""
     return _load(WaferFile, path, "wafer").wafer
 
 
 def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
-    """Make a process from plain values in SI units, as `ProcessSpec.model_dump` returns them.
-
-    Args:
-        data: the values by attribute.
-        source: where they came from, for the message.
+    """Make a process from plain SI values by attribute; `source` names where they came from in messages.
 
     Raises:
         InputError: the values are not those of a process, or break a rule.
@@ -155,7 +140,7 @@ def load_variation(path: str | Path) -> Variation:
 
 def _load(model: type[Table], path: str | Path, table: str | None = None) -> Table:
     """Read a file; with a `table`, pass over the other tables of a spec."""
-    raw = read_toml(Path(path), *_FILES[model][:2])
+    raw = read_toml(Path(path), *_FILES[model])
     others = {toml_key(name) for name in Spec.model_fields if table} - {table}
     return _checked(model, {key: value for key, value in raw.items() if key not in others}, str(path))
 
@@ -165,7 +150,7 @@ def _checked(
 ) -> Table:
     """Return the tables of a file as a model that obeys the rules between its values, too; see `validated`."""
     value = validated(model, raw, source, overridden, si=si)
-    mistakes = list(_FILES[model].problems(value))
+    mistakes = list(_PROBLEMS[model](value)) if model in _PROBLEMS else []
     for mistake in mistakes:
         mistake.where = mistake.where if si else key_as_written(mistake.where, raw)
     if mistakes:
@@ -174,10 +159,9 @@ def _checked(
 
 
 def input_files(spec: Spec) -> dict[str, Path]:
-    """Return the files a spec names, found relative to the folder of the spec file (or to the current one).
+    """Return the files a spec names by dotted key ("optimize.start", "objective[0].options.image").
 
-    Returns:
-        For each dotted key ("optimize.start", "objective[0].options.image") the existing file.
+    They are found relative to the folder of the spec file, or to the current one.
 
     Raises:
         InputError: a file is missing.
@@ -199,12 +183,7 @@ def input_files(spec: Spec) -> dict[str, Path]:
 
 
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
-    """Read the tables of a TOML file.
-
-    Args:
-        path: the file.
-        what: what it should hold, for messages: "a spec".
-        example: one that exists, for messages.
+    """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages.
 
     Raises:
         InputError: the file cannot be read or is no TOML.

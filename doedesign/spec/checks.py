@@ -8,15 +8,9 @@ import operator
 from collections.abc import Iterator
 
 from doedesign.spec.models import Spec
-from doedesign.spec.process_checks import (
-    limit_problems,
-    limit_warnings,
-    printing_warning,
-    process_problems,
-    wafer_problem,
-)
+from doedesign.spec.process_checks import process_problems
 from doedesign.spec.training import training_problems
-from doedesign.spec.values import OBJECTIVES
+from doedesign.spec.values import NEAR_OBJECTIVES, nearest
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
@@ -24,12 +18,11 @@ from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_
 _WAVE_TOLERANCE = 0.02
 
 
-def find_problems(spec: Spec) -> list[InputError]:
-    """Return every rule between values that a spec breaks.
+_DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all others exist at every depth
 
-    Args:
-        spec: a spec whose single values are valid.
-    """
+
+def find_problems(spec: Spec) -> list[InputError]:
+    """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (
         _materials,
         _colours,
@@ -43,8 +36,8 @@ def find_problems(spec: Spec) -> list[InputError]:
         _fresnel_sampling,
         _objectives,
         lambda spec: process_problems(spec.process),
-        wafer_problem,
-        limit_problems,
+        _wafer,
+        _limits,
         lambda spec: training_problems(spec.network, spec.train, len(spec.optics.colours)),
     )
     return [problem for rule in rules for problem in rule(spec)]
@@ -116,8 +109,7 @@ def _aperture(spec: Spec) -> Iterator[InputError]:
 def _depth_order(spec: Spec) -> Iterator[InputError]:
     near, far = spec.scene.near_m, spec.scene.far_m
     if near and max(near) >= min(far):
-        farthest = "inf" if math.isinf(min(far)) else format_length(min(far))
-        got = f"{format_length(max(near))} near and {farthest} far"
+        got = f"{format_length(max(near))} near and {_depth_text(min(far))} far"
         rule = "every near depth must be smaller than every far depth"
         yield InputError("scene.near", rule, got, "Move the obstruction closer or the scene away.")
 
@@ -164,19 +156,36 @@ def _objectives(spec: Spec) -> Iterator[InputError]:
         rule = "an optimisation must have something to improve"
         yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
     for index, objective in enumerate(spec.objectives):
-        if objective.name in OBJECTIVES and OBJECTIVES[objective.name].near and not spec.scene.near_m:
+        if objective.name in NEAR_OBJECTIVES and not spec.scene.near_m:
             rule = f'"{objective.name}" looks at near depths, so scene.near must hold one'
             cure = "Add a depth to scene.near or remove the objective."
             yield InputError(f"objective[{index}].name", rule, "an empty scene.near", cure)
 
 
-def spec_warnings(spec: Spec) -> list[str]:
-    """Return what is allowed but probably not meant, one sentence or two each.
+def _wafer(spec: Spec) -> Iterator[InputError]:
+    process = spec.process.filled()
+    die_m, radius_m = process.die_m or (0.0, 0.0), process.wafer_radius_m or math.inf
+    reach_m = math.hypot(*die_m) + spec.doe.aperture_m / 2
+    if reach_m > radius_m:
+        yield InputError(
+            "process.die",
+            f"the DOE must lie on the wafer of radius {format_length(radius_m)}",
+            f"a DOE that reaches {_rounded(reach_m)} from its middle",
+            "Move the die inward or choose a larger process.wafer_radius.",
+        )
 
-    Args:
-        spec: a valid spec.
-    """
-    rules = (_level_warning, printing_warning, _sensor_warning, _reach_warning, _disc_warning, limit_warnings)
+
+def _limits(spec: Spec) -> Iterator[InputError]:
+    colours = [colour.name for colour in spec.optics.colours]
+    for index, limit in enumerate(spec.limits):
+        if limit.colour is not None and limit.colour not in colours:
+            rule, cure = "must be a colour channel of the spec", nearest(limit.colour, colours)
+            yield InputError(f"limit[{index}].colour", rule, f'"{limit.colour}"', cure)
+
+
+def spec_warnings(spec: Spec) -> list[str]:
+    """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
+    rules = (_level_warning, _printing_warning, _sensor_warning, _reach_warning, _disc_warning, _limit_warnings)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -228,3 +237,35 @@ def _disc_warning(spec: Spec) -> Iterator[str]:
             f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
             f"more than the window's {_rounded(spec.sensor.window_m)}; its rim is cut off."
         )
+
+
+def _printing_warning(spec: Spec) -> Iterator[str]:
+    """Warn of cells finer than what the lithography prints: bit 0 may have lines of a single cell."""
+    process, pitch_m = spec.process.filled(), spec.doe.pitch_m
+    for key, smallest_m, what in (
+        ("minimum_line", process.minimum_line_m, "lines"),
+        ("minimum_space", process.minimum_space_m, "gaps"),
+    ):
+        if smallest_m and pitch_m < smallest_m * (1 - 1e-9):
+            yield (
+                f"process.{key}: cells of {format_length(pitch_m)} are finer than the {what} of "
+                f"{format_length(smallest_m)} that the process prints, so single cells of the finest mask (bit 0) are "
+                "lost. Choose a coarser pitch, a finer process, or accept that they will not be there."
+            )
+
+
+def _limit_warnings(spec: Spec) -> Iterator[str]:
+    """Warn of limits that every plate obeys, for there is nothing at the depths of the scene that they apply to."""
+    near, far = spec.scene.near_m, spec.scene.far_m
+    for index, limit in enumerate(spec.limits):
+        where, depths = _DEPTHS_OF.get(limit.quantity, "depth"), (*near, *far)
+        if limit.quantity in _DEPTHS_OF:
+            depths = near if where == "near depth" else far
+        at = "" if limit.depth_m is None else f" at {_depth_text(limit.depth_m)}"
+        if limit.depth_m not in (None, *depths) or not depths:
+            listed = ", ".join(_depth_text(depth_m) for depth_m in depths) or "none"
+            yield f"limit[{index}]: {limit.quantity}{at} limits nothing; the scene's {where}s are: {listed}."
+
+
+def _depth_text(depth_m: float) -> str:
+    return "inf" if math.isinf(depth_m) else format_length(depth_m)

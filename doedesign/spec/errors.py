@@ -12,7 +12,6 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from doedesign.spec.models import Spec
 from doedesign.spec.response import RESPONSE_KEYS
 from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.values import FROM_TOML, nearest
@@ -77,7 +76,11 @@ def validated(
     try:
         return model.model_validate(raw, by_alias=not si, by_name=si, context=None if si else FROM_TOML)
     except ValidationError as error:
-        raise spec_error(source, explain(error, raw, model), overridden) from None
+        found = error.errors(include_url=False)
+    # Pydantic also calls a list with wrong entries too short, which would only repeat them.
+    inner = {details["loc"][:length] for details in found for length in range(len(details["loc"]))}
+    mistakes = [_mistake(d, raw, model) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
+    raise spec_error(source, mistakes, overridden)
 
 
 def spec_error(source: str, mistakes: Sequence[InputError], overridden: Collection[str] = ()) -> InputError:
@@ -92,20 +95,6 @@ def spec_error(source: str, mistakes: Sequence[InputError], overridden: Collecti
 def _covers(overridden: Collection[str], key: str) -> bool:
     dotted = key.replace("[", ".").replace("]", "")
     return any(f"{dotted}.".startswith(f"{k}.") or k.startswith(f"{dotted}.") for k in overridden)
-
-
-def explain(error: ValidationError, raw: Mapping[str, Any], root: type[SpecTable] = Spec) -> list[InputError]:
-    """Translate the findings of pydantic.
-
-    Args:
-        error: the failed validation.
-        raw: the tables as they were read.
-        root: the model of the whole file.
-    """
-    found = error.errors(include_url=False)
-    # Pydantic also calls a list with wrong entries too short, which would only repeat them.
-    inner = {details["loc"][:length] for details in found for length in range(len(details["loc"]))}
-    return [_mistake(d, raw, root) for d in found if not (d["type"] == "too_short" and d["loc"] in inner)]
 
 
 def _mistake(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable]) -> InputError:
@@ -132,13 +121,9 @@ def _mistake(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable
 
 
 def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
-    """Return a key as the file has it, which may use a short form.
+    """Return a dotted key of the full form ("optics.colours[1].wavelengths") as the file has it.
 
     A colour may have been made from `optics.wavelengths`, a sigma from `process.errors.overlay_x = "1 um"`.
-
-    Args:
-        key: dotted key of the full form, such as "optics.colours[1].wavelengths".
-        raw: the tables as they were read.
     """
     optics = raw.get("optics")
     if isinstance(optics, Mapping) and "colours" not in optics:

@@ -6,6 +6,7 @@ Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies bot
 `process`, those of scene and sensor in `scene`, those of the network and its training in `training`.
 """
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,23 +18,49 @@ from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
-    Aperture,
+    HEIGHT_FILES,
+    OBJECTIVES,
+    STARTS,
     ColourName,
     Count,
-    FocalLength,
-    Material,
-    ObjectiveName,
     Options,
     OptionsTable,
     Pitch,
     Positive,
-    SpecName,
-    Start,
-    Wavelength,
+    Seed,
+    Steps,
+    accepted,
     broken,
+    known,
+    length,
 )
 from doedesign.spec.wafer import WaferSpec
-from fab.units import NM, parse_length
+from fab.units import NM, UM, parse_length
+from sim.material import MATERIALS
+
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
+SpecName = Annotated[
+    str, accepted(_FILE_NAME.fullmatch, "must be a file name of at most 64 letters, digits, dots, dashes")
+]
+ObjectiveName = Annotated[
+    str,
+    accepted(
+        lambda name: name in OBJECTIVES or _FUNCTION.fullmatch(name),
+        'must be a known objective or a function as "module:function"',
+        OBJECTIVES,
+    ),
+]
+Start = Annotated[
+    str,
+    accepted(
+        lambda name: name in STARTS or name.lower().endswith(HEIGHT_FILES),
+        f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})",
+        STARTS,
+    ),
+]
 
 
 class ColourSpec(SpecTable, frozen=True):
@@ -75,7 +102,7 @@ class OpticsSpec(SpecTable, frozen=True):
             propagated from the lens to the sensor, eq. 5; needs a fine pitch, eq. 6).
     """
 
-    focal_length_m: FocalLength = Field(examples=['"8 mm"'])
+    focal_length_m: Annotated[float, length(10 * UM, 100.0)] = Field(examples=['"8 mm"'])
     design_wavelength_m: Wavelength = Field(examples=['"550 nm"'])
     colours: tuple[ColourSpec, ...] = Field(min_length=1)
     propagation: Literal["far_field", "fresnel"] = "far_field"
@@ -114,8 +141,8 @@ class DoeSpec(SpecTable, frozen=True):
 
     samples: Annotated[int, Field(strict=True, ge=2, le=20000, examples=["2400"])]
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
-    aperture_m: Aperture = Field(examples=['"4.44 mm"'])
-    material: Material = Field(examples=['"fused_silica"'])
+    aperture_m: Annotated[float, length(1 * UM, 1.0)] = Field(examples=['"4.44 mm"'])
+    material: Annotated[str, known("material", MATERIALS)] = Field(examples=['"fused_silica"'])
 
 
 class OptimizeSpec(SpecTable, frozen=True):
@@ -139,9 +166,9 @@ class OptimizeSpec(SpecTable, frozen=True):
     parametrization: Literal["freeform", "radial"] = "freeform"
     start: Start = "flat"
     start_options: OptionsTable = Options()
-    steps: Annotated[int, Field(strict=True, ge=0, le=10_000_000)] = 200
+    steps: Steps = 200
     learning_rate: Positive = 0.1
-    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     quantisation: Literal["straight_through", "annealed", "none"] = "straight_through"
     sampling: Literal["sparse", "exact"] = "sparse"
     checkpoint_every: Count = 25
@@ -162,22 +189,10 @@ class ObjectiveSpec(SpecTable, frozen=True):
 
 
 class Spec(SpecTable, frozen=True):
-    """All that a design depends on.
+    """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-    Attributes:
-        name: name of the design; runs and mask sets are called after it.
-        optics: the lens and the light.
-        doe: the DOE.
-        process: the levels that the fab lab makes, and its errors.
-        scene: where light comes from.
-        sensor: the sensor behind the lens.
-        obstruction: the obstruction in front of the scene.
-        optimize: how the height map is found.
-        objectives: terms of the loss; `[[objective]]` in TOML.
-        limits: conditions of a good DOE; `[[limit]]` in TOML.
-        wafer: layout of the wafer.
-        network: the network that reconstructs pictures from captures.
-        train: training of that network, and of the optics with it.
+    `objectives` are the terms of the loss and `limits` the conditions of a good DOE, `[[objective]]` and `[[limit]]` in
+    TOML.
     """
 
     name: SpecName = Field(examples=['"automotive"'])

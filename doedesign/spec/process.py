@@ -21,30 +21,16 @@ from pydantic import (
 )
 
 from doedesign.spec.table import SpecTable, optional
-from doedesign.spec.values import (
-    ChromeOverlap,
-    ColourName,
-    FarDepth,
-    LevelCount,
-    LevelStep,
-    angle,
-    broken,
-    length,
-    nearest,
-    share,
-)
+from doedesign.spec.values import ColourName, FarDepth, NotNegative, angle, broken, known, length, share
 from fab.process import DEVIATIONS, Deviation, Normal
-from fab.stock import IDEAL, STOCK, Stock
-from fab.units import MM, NM
-
-__all__ = ["DefectsSpec", "ErrorsSpec", "EtchSpec", "LimitSpec", "ProcessSpec", "Quantity", "SpreadSpec"]
+from fab.stock import IDEAL, STOCK
+from fab.units import MM, NM, UM
 
 Quantity = Literal["zeroth_order", "strehl", "throughput", "outside_window", "ring_to_disc", "far_spot"]
 
 Etch = Annotated[float, length(0.1 * NM, 1 * MM)]
 Feature = Annotated[float, length(0.0, 1 * MM)]
 Place = Annotated[float, length(-1.0, 1.0)]
-Radius = Annotated[float, length(1 * MM, 1.0)]
 DefectRadius = Annotated[float, length(1 * NM, 1 * MM)]
 Density = Annotated[float, share(0.0, 1e4)]
 Chance = Annotated[float, share(0.0, 1.0)]
@@ -62,17 +48,8 @@ def _etch_depths(value: Any, info: ValidationInfo) -> tuple[float, ...] | Litera
     return _DEPTHS.validate_python(value, context=info.context)
 
 
-# Any, as below, because the serialiser of what stands here would be wary of a union; `_etch_depths` says what it holds.
-_EtchDepths = Annotated[Any, PlainValidator(_etch_depths)]
-
-
 class EtchSpec(SpecTable, frozen=True):
-    """One etch.
-
-    Attributes:
-        mask: the mask, k = 0 for the shallowest.
-        depth_m: its depth; always that of `ProcessSpec.etch_depths_m`, and checked where it is given.
-    """
+    """One etch; its depth is always that of `ProcessSpec.etch_depths_m`, and checked where it is given."""
 
     inline: ClassVar[bool] = True
 
@@ -81,13 +58,9 @@ class EtchSpec(SpecTable, frozen=True):
 
 
 class SpreadSpec(SpecTable, frozen=True):
-    """How one error is distributed, in the SI unit that the error's name ends in.
+    """Mean and standard deviation of one error, in the SI unit that its name ends in; a tuple has a value per mask.
 
     In TOML `overlay_x = "0.5 um"` is short for `overlay_x = { sigma = "0.5 um" }`.
-
-    Attributes:
-        mean: its mean; a tuple holds one value per mask, a number is for all masks.
-        sigma: its standard deviation, likewise.
     """
 
     inline: ClassVar[bool] = True
@@ -107,7 +80,7 @@ class SpreadSpec(SpecTable, frozen=True):
 
 
 def quantity_of(error: Deviation, low: float, high: float) -> Any:
-    """Return the type of a value of an error between two bounds, SI units."""
+    """Type of a value of an error between two bounds, SI units."""
     of_unit = {"1": share, "m": length, "rad": angle}[error.unit]
     return Annotated[float, of_unit(low, high)]
 
@@ -156,16 +129,7 @@ _PER_MM2 = {"particles_per_m2": "particles_per_mm2", "pinholes_per_m2": "pinhole
 
 
 class DefectsSpec(SpecTable, frozen=True):
-    """Rare events; see `fab.process.Defects`.
-
-    Attributes:
-        particles_per_mm2: particles per mm2 and etch that keep an etch off a disc.
-        particle_radius_m: their mean radius.
-        pinholes_per_mm2: pinholes per mm2 of chrome.
-        pinhole_radius_m: their mean radius.
-        missed: chance that an etch is forgotten.
-        doubled: chance that an etch is done twice.
-    """
+    """Rare events, as in `fab.process.Defects`: densities, mean radii, and the chances that an etch fails."""
 
     particles_per_mm2: Density | None = optional()
     particle_radius_m: DefectRadius | None = optional()
@@ -182,15 +146,15 @@ class DefectsSpec(SpecTable, frozen=True):
 
     def in_si(self) -> dict[str, float]:
         """Return what is given, by its name in `fab.process.Defects`."""
-        said = self.given()
-        per_m2 = {name: said.pop(key) * 1e6 for name, key in _PER_MM2.items() if key in said}
-        return per_m2 | said
+        given = self.given()
+        per_m2 = {name: given.pop(key) * 1e6 for name, key in _PER_MM2.items() if key in given}
+        return per_m2 | given
 
 
-def _stock_name(name: str) -> str:
-    if name not in STOCK:
-        raise broken("must be a known process", nearest(name, tuple(STOCK)))
-    return name
+def _level_count(count: int) -> int:
+    if count not in (2, 4, 8, 16, 32, 64):
+        raise broken("must be a power of two from 2 to 64, one bit per etch mask", "Choose 2, 4, 8, 16, 32 or 64.")
+    return count
 
 
 class ProcessSpec(SpecTable, frozen=True):
@@ -214,17 +178,18 @@ class ProcessSpec(SpecTable, frozen=True):
         defects: rare events.
     """
 
-    levels: LevelCount = Field(examples=["16"])
-    level_step_m: LevelStep = Field(examples=['"75 nm"'])
-    etch_depths_m: _EtchDepths = optional()
-    chrome_overlap_m: ChromeOverlap = 5e-6
-    stock: Annotated[str, AfterValidator(_stock_name)] | None = optional()
+    levels: Annotated[int, Field(strict=True), AfterValidator(_level_count)] = Field(examples=["16"])
+    level_step_m: Annotated[float, length(0.1 * NM, 100 * UM)] = Field(examples=['"75 nm"'])
+    # Any, as in `_for_masks`, because a serialiser would be wary of a union.
+    etch_depths_m: Annotated[Any, PlainValidator(_etch_depths)] = optional()
+    chrome_overlap_m: Annotated[float, length(0.0, 1 * MM)] = 5e-6
+    stock: Annotated[str, known("process", STOCK)] | None = optional()
     etches: tuple[EtchSpec, ...] = optional(())
     tone: Literal["clear", "dark"] | None = optional()
     minimum_line_m: Feature | None = optional()
     minimum_space_m: Feature | None = optional()
     die_m: tuple[Place, Place] | None = optional()
-    wafer_radius_m: Radius | None = optional()
+    wafer_radius_m: Annotated[float, length(1 * MM, 1.0)] | None = optional()
     errors: ErrorsSpec = optional(ErrorsSpec())
     defects: DefectsSpec = optional(DefectsSpec())
 
@@ -257,18 +222,13 @@ class ProcessSpec(SpecTable, frozen=True):
             "wafer_radius_m": stock.wafer_radius_m.value,
             "etches": tuple(EtchSpec(mask=mask) for mask in sorted(range(self.masks), key=self.depth_m)),
         }
-        tables = {"errors": _filled_errors(self.errors, stock), "defects": _filled_defects(self.defects, stock)}
+        errors = {name: {"mean": typical.mean, "sigma": typical.sigma} for name, typical in stock.errors.items()}
+        defects = DefectsSpec.from_si({name: figure.value for name, figure in stock.defects.items()})
+        tables = {
+            "errors": ErrorsSpec.model_validate(errors | self.errors.given()),
+            "defects": defects.model_copy(update=self.defects.given()),
+        }
         return self.model_copy(update=usual | self.given() | tables)
-
-
-def _filled_errors(errors: ErrorsSpec, stock: Stock) -> ErrorsSpec:
-    usual = {name: {"mean": typical.mean, "sigma": typical.sigma} for name, typical in stock.errors.items()}
-    return ErrorsSpec.model_validate(usual | errors.given())
-
-
-def _filled_defects(defects: DefectsSpec, stock: Stock) -> DefectsSpec:
-    usual = DefectsSpec.from_si({name: figure.value for name, figure in stock.defects.items()})
-    return usual.model_copy(update=defects.given())
 
 
 class LimitSpec(SpecTable, frozen=True):
@@ -283,8 +243,8 @@ class LimitSpec(SpecTable, frozen=True):
     """
 
     quantity: Quantity = Field(examples=['"zeroth_order"'])
-    min: Annotated[float, Field(strict=True, ge=0)] | None = optional()
-    max: Annotated[float, Field(strict=True, ge=0)] | None = optional()
+    min: NotNegative | None = optional()
+    max: NotNegative | None = optional()
     colour: ColourName | None = optional()
     depth_m: FarDepth | None = optional()
 

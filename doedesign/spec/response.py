@@ -18,7 +18,7 @@ a run does not depend on the file.
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,8 +29,6 @@ from fab.errors import InputError
 from fab.files import explain_os_error
 from fab.units import NM
 
-__all__ = ["RESPONSE_KEYS", "Response", "lines_of", "read_responses", "with_response"]
-
 RESPONSE_KEYS = ("spectral_response", "lines_per_colour")
 
 _LINES, _MOST_LINES = 5, 16
@@ -38,13 +36,7 @@ _CURE = "Give wavelengths in nm and one column per colour, as in `550,0.1,0.9,0.
 
 
 class Response(NamedTuple):
-    """What one colour answers to light of equal energy at every wavelength.
-
-    Attributes:
-        name: the colour.
-        wavelengths_m: rising.
-        values: signal per energy, in any scale, straight between the wavelengths.
-    """
+    """Signal of a colour per energy, in any scale, straight between rising wavelengths."""
 
     name: str
     wavelengths_m: NDArray[np.float64]
@@ -52,14 +44,7 @@ class Response(NamedTuple):
 
 
 def with_response(raw: Mapping[str, Any], source: Path) -> dict[str, Any]:
-    """Put the colours that a response file stands for into the tables of a spec.
-
-    Args:
-        raw: the tables as read.
-        source: the spec file, beside which the response lies.
-
-    Returns:
-        the tables with `optics.colours`; the same tables where no response is named.
+    """Put the colours of a response file, which lies beside the spec file `source`, into the tables of the spec.
 
     Raises:
         InputError: the file cannot be read or holds no response, or the colours are stated twice.
@@ -89,15 +74,7 @@ def with_response(raw: Mapping[str, Any], source: Path) -> dict[str, Any]:
 
 
 def lines_of(response: Response, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Wavelengths and weights of Gauss' quadrature for a response.
-
-    Args:
-        response: the response.
-        count: lines.
-
-    Returns:
-        wavelengths, metres, from the longest to the shortest, and weights that sum to 1.
-    """
+    """`count` wavelengths (metres, the longest first) and weights (sum 1) of Gauss' quadrature for a response."""
     ends = response.wavelengths_m
     # Enough points per step of the file for a straight piece times the polynomials below to be summed exactly.
     places, shares = np.polynomial.legendre.leggauss(count + 1)
@@ -135,24 +112,19 @@ def read_responses(path: Path) -> list[Response]:
     except UnicodeDecodeError as error:
         raise InputError(str(path), "must be a text file", f"a foreign byte at {error.start}", _CURE) from error
     kept = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    rows = [(n, [cell.strip() for cell in cells]) for (n, _), cells in zip(kept, _cells(path, kept), strict=True)]
+    try:
+        cells = list(csv.reader((line for _, line in kept), strict=True))
+    except csv.Error as error:
+        raise InputError(str(path), "must be a table with commas", f'"{error}"', _CURE) from error
+    rows = [(n, [cell.strip() for cell in row]) for (n, _), row in zip(kept, cells, strict=True)]
     if not rows:
         raise InputError(str(path), "must hold a spectral response", "no line with numbers", _CURE)
-    names = None
-    if not _is_number(rows[0][1][0]):
-        names = rows.pop(0)[1]
+    names = None if _is_number(rows[0][1][0]) else rows.pop(0)[1]
     table = np.array([_numbers(path, line, cells, rows[0][1]) for line, cells in rows])
     if len(table) < 2 or table.shape[1] < 2:
         got = f"{len(table)} lines of {table.shape[1] if table.ndim == 2 else 0} numbers"
         raise InputError(str(path), "needs at least two wavelengths and one colour", got, _CURE)
     return _checked(path, names, table)
-
-
-def _cells(path: Path, kept: Sequence[tuple[int, str]]) -> list[list[str]]:
-    try:
-        return list(csv.reader((line for _, line in kept), strict=True))
-    except csv.Error as error:
-        raise InputError(str(path), "must be a table with commas", f'"{error}"', _CURE) from error
 
 
 def _is_number(cell: str) -> bool:

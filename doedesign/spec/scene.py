@@ -5,46 +5,32 @@ default, so that nobody uses one unawares: those two commands ask for it.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 
 from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import (
     Count,
-    Defocus,
     FarDepth,
     NearDepth,
+    NotNegative,
     Options,
     OptionsTable,
     Pitch,
     Positive,
-    broken,
-    nearest,
+    known,
+    length,
 )
-
-__all__ = ["BAYER_PATTERNS", "NOISE_MODELS", "OBSTRUCTION_KINDS", "OCCLUSION_MODELS", "ObstructionSpec"]
-__all__ += ["SceneSpec", "SensorSpec"]
+from fab.units import MM
 
 # The same names as in `sim`, which would bring jax along.
 Occlusion = Literal["radiometric", "reciprocal", "paper", "paper_release"]
 Noise = Literal["physical", "tseng", "release", "none"]
 Bayer = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
-OCCLUSION_MODELS = ("radiometric", "reciprocal", "paper", "paper_release")
-NOISE_MODELS = ("physical", "tseng", "release", "none")
-BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-OBSTRUCTION_KINDS = (
-    "fence",
-    "raindrop",
-    "dirt",
-    "dirt_raindrop",
-    "release_fence",
-    "release_raindrop",
-    "release_dirt",
-    "folder",
-)
-
-Electrons = Annotated[float, Field(strict=True, ge=0)]
+OCCLUSION_MODELS, NOISE_MODELS, BAYER_PATTERNS = get_args(Occlusion), get_args(Noise), get_args(Bayer)
+OBSTRUCTION_KINDS = ("fence", "raindrop", "dirt", "dirt_raindrop")
+OBSTRUCTION_KINDS += ("release_fence", "release_raindrop", "release_dirt", "folder")
 
 
 def _as_list(value: Any) -> Any:
@@ -54,12 +40,6 @@ def _as_list(value: Any) -> Any:
 
 Efficiency = Annotated[float, Field(strict=True, gt=0, le=1)]
 Efficiencies = Annotated[tuple[Efficiency, ...], BeforeValidator(_as_list)]
-
-
-def _kind(name: str) -> str:
-    if name not in OBSTRUCTION_KINDS:
-        raise broken("must be a known kind of obstruction", nearest(name, OBSTRUCTION_KINDS))
-    return name
 
 
 class SceneSpec(SpecTable, frozen=True):
@@ -88,7 +68,7 @@ class ObstructionSpec(SpecTable, frozen=True):
             the nearest and the farthest of `scene.near`.
     """
 
-    kind: Annotated[str, AfterValidator(_kind)] = Field(examples=['"dirt"'])
+    kind: Annotated[str, known("kind of obstruction", OBSTRUCTION_KINDS)] = Field(examples=['"dirt"'])
     options: OptionsTable = optional(Options())
 
 
@@ -119,13 +99,13 @@ class SensorSpec(SpecTable, frozen=True):
     binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
     fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
-    defocus_m: Defocus = 0.0
+    defocus_m: Annotated[float, length(-10 * MM, 10 * MM)] = 0.0
     full_well_e: Positive | None = optional()
     exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = optional()
     quantum_efficiency: Efficiencies = optional(())
-    read_noise_e: Electrons | None = optional()
-    dark_e: Electrons | None = optional()
-    black_level: Electrons | None = optional()
+    read_noise_e: NotNegative | None = optional()
+    dark_e: NotNegative | None = optional()
+    black_level: NotNegative | None = optional()
     bits: Annotated[int, Field(strict=True, ge=1, le=16)] | None = optional()
     bayer: Bayer | None = optional()
     noise: Noise | None = optional()

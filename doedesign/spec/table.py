@@ -25,13 +25,9 @@ def optional(default: Any = None) -> Any:
 
 
 class SpecTable(BaseModel, frozen=True):
-    """Table of a spec. Unknown keys are refused, values never change.
+    """Table of a spec. Unknown keys are refused, values never change."""
 
-    Attributes:
-        inline: whether it is written on one line, as `{ key = value }`.
-    """
-
-    inline: ClassVar[bool] = False
+    inline: ClassVar[bool] = False  # whether it is written on one line, as `{ key = value }`
 
     model_config = ConfigDict(
         extra="forbid",

@@ -15,10 +15,7 @@ from fab.units import format_length, parse_angle, parse_length
 
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
-    """Return a spec as plain dictionaries, lists, text and numbers in SI units.
-
-    Defaults are filled in, except those of optional keys.
-    """
+    """Return a spec as plain values in SI units, with the defaults filled in except those of optional keys."""
     return spec.model_dump(mode="json")
 
 
@@ -28,12 +25,7 @@ def spec_digest(spec: Spec) -> str:
 
 
 def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
-    """Write a spec with every default and override filled in, as TOML that reads back to the same spec.
-
-    Args:
-        spec: the spec.
-        comments: lines for the head of the file, for example the overrides that led to it.
-    """
+    """Write a spec with every default filled in, as TOML that reads back to the same spec; `comments` come first."""
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
     return "\n".join(lines + _table_lines(spec, "")).strip() + "\n"
 

@@ -9,12 +9,9 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from doedesign.spec.table import SpecTable
-from doedesign.spec.values import Count, Positive
+from doedesign.spec.values import Count, NotNegative, Positive, Seed, Steps
 from fab.errors import InputError
 
-__all__ = ["NetworkSpec", "TrainSpec", "training_problems"]
-
-Share = Annotated[float, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 
 
@@ -69,24 +66,24 @@ class TrainSpec(SpecTable, frozen=True):
         validation: number of these pictures.
     """
 
-    steps: Annotated[int, Field(strict=True, ge=0, le=10_000_000)] = 50_000
+    steps: Steps = 50_000
     batch: Annotated[int, Field(strict=True, ge=1, le=4096)] = 1
     size: Annotated[int, Field(strict=True, ge=16, le=8192)] = 512
     learning_rate: Positive = 1e-4
-    optics_learning_rate: Share = 0.02
+    optics_learning_rate: NotNegative = 0.02
     schedule: Literal["cosine", "constant"] = "cosine"
     mode: Literal["simultaneous", "alternating"] = "simultaneous"
     period: Annotated[int, Field(strict=True, ge=2, le=1000)] = 4
     freeze: Literal["none", "optics", "network"] = "none"
     camera: Literal["doe", "conventional"] = "doe"
-    l1: Share = 1.0
-    perceptual: Share = 1.0
-    masked: Share = 1.0
+    l1: NotNegative = 1.0
+    perceptual: NotNegative = 1.0
+    masked: NotNegative = 1.0
     field: Literal["off", "random"] = "off"
     fabricated: Flag = False
     precision: Literal["float32", "mixed"] = "float32"
     checkpointing: Flag = False
-    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     checkpoint_every: Count = 200
     validate_every: Count = 500
     validation: Annotated[int, Field(strict=True, ge=1, le=10_000)] = 8
@@ -103,13 +100,7 @@ class TrainSpec(SpecTable, frozen=True):
 
 
 def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> Iterator[InputError]:
-    """Yield every broken rule that joins several values.
-
-    Args:
-        network: the network.
-        train: its training.
-        colours: colours of the camera.
-    """
+    """Yield every broken rule that joins values of network, training and the number of colours of the camera."""
     # A design that says nothing of a network may have any number of colours.
     if network != NetworkSpec() and network.width % colours:
         nearest = max(1, round(network.width / colours)) * colours
@@ -125,10 +116,9 @@ def training_problems(network: NetworkSpec, train: TrainSpec, colours: int) -> I
         rule = f"must be a multiple of 2^network.depth = {coarsest}, and at least twice that"
         yield InputError("train.size", rule, str(train.size), f"Set size = {nearest}, or another depth of the network.")
     if not (train.moves_optics or train.moves_network):
-        got = 'freeze = "network" with ' + (
-            'camera = "conventional"' if train.camera == "conventional" else "optics_learning_rate = 0"
-        )
-        yield InputError("train.freeze", "something must be left to train", got, "Let the network or the optics learn.")
+        still = 'camera = "conventional"' if train.camera == "conventional" else "optics_learning_rate = 0"
+        got, cure = f'freeze = "network" with {still}', "Let the network or the optics learn."
+        yield InputError("train.freeze", "something must be left to train", got, cure)
     if train.l1 == train.perceptual == train.masked == 0:
         rule = "one of l1, perceptual and masked must be above 0"
         yield InputError("train.l1", rule, "0 for all of them", "Give a weight, such as l1 = 1.0.")

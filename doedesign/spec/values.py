@@ -16,30 +16,15 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, Va
 from pydantic_core import PydanticCustomError
 
 from fab.units import MM, NM, UM, format_length, parse_angle, parse_length
-from sim.material import MATERIALS
 
 FROM_TOML = "toml"
 HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
 
 
-class ObjectiveTraits(NamedTuple):
-    """Requirements of a built-in objective.
-
-    Attributes:
-        near: whether it needs a near depth in the scene.
-    """
-
-    near: bool = False
-
-
-# The built-in objectives; each is a function of the same name in `doedesign.design.objectives`.
-OBJECTIVES = {
-    "far_spot": ObjectiveTraits(),
-    "near_spread": ObjectiveTraits(near=True),
-    "window_loss": ObjectiveTraits(),
-    "handcrafted": ObjectiveTraits(near=True),
-    "target_pattern": ObjectiveTraits(),
-}
+# The built-in objectives, each a function of the same name in `doedesign.design.objectives`, and those of them that
+# need a near depth in the scene.
+OBJECTIVES = ("far_spot", "near_spread", "window_loss", "handcrafted", "target_pattern")
+NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 
 # The built-in starts with their options; each is a function of the same name in `doedesign.design.starts`.
 STARTS = {
@@ -51,12 +36,7 @@ STARTS = {
 
 
 def broken(rule: str, cure: str) -> PydanticCustomError:
-    """Return the error of a broken rule, for a validator to raise.
-
-    Args:
-        rule: what must hold ("must be a power of two").
-        cure: what to do about it, a full sentence.
-    """
+    """Return the error of a broken rule ("must be ...", and a sentence on what to do), for a validator to raise."""
     return PydanticCustomError("spec", "{rule}", {"rule": rule, "cure": cure})
 
 
@@ -66,22 +46,16 @@ def nearest(name: object, choices: Collection[str]) -> str:
     return f"Did you mean `{close[0]}`?" if close else f"Choose one of {', '.join(choices)}."
 
 
+def angle_text(angle_rad: float) -> str:
+    """Write an angle in degrees, a small one in microradians, to twelve digits, which `parse_angle` reads back."""
+    return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
+
+
 class _Unit(NamedTuple):
     name: str
     plural: str
     parse: Callable[[str], float]
     format: Callable[[float], str]
-
-    def read(self, text: Any) -> float:
-        value = self.parse(text)
-        number, _, name = text.strip().partition(" ")
-        # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
-        return float(number) if name.strip() == self.name else value
-
-
-def angle_text(angle_rad: float) -> str:
-    """Write an angle in degrees, a small one in microradians, to twelve digits, which `parse_angle` reads back."""
-    return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
 
 
 _LENGTH = _Unit("m", "metres", parse_length, format_length)
@@ -94,22 +68,28 @@ def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
     return f"must lie between {text(low)} and {text(high)}"
 
 
+def _read(unit: _Unit, value: Any, context: Any) -> float:
+    """A quantity as text with a unit in TOML, as a number in SI units otherwise."""
+    if context != FROM_TOML:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        raise broken(f"must be a number of {unit.plural}", "Give a number.")
+    try:
+        parsed = unit.parse(value)
+    except ValueError as error:
+        raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
+    number, _, name = value.strip().partition(" ")
+    # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
+    return float(number) if name.strip() == unit.name else parsed
+
+
 def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
     def validate(value: Any, info: ValidationInfo) -> float:
-        if infinite and value == "inf":
+        if infinite and (value == "inf" or (value == math.inf and info.context != FROM_TOML)):
             return math.inf
-        if info.context == FROM_TOML:
-            try:
-                number = unit.read(value)
-            except ValueError as error:
-                raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            number = float(value)
-        else:
-            raise broken(f"must be a number of {unit.plural}", "Give a number.")
+        number = _read(unit, value, info.context)
         slack = 1e-12  # a bound itself, rounded on its way from text, is inside
-        inside = low - slack * abs(low) <= number <= high + slack * abs(high)
-        if not (inside or (infinite and number == math.inf)):
+        if not low - slack * abs(low) <= number <= high + slack * abs(high):
             rule = _range_rule(low, high, unit.format) + (', or be "inf"' if infinite else "")
             raise broken(rule, "Check the unit.")
         return number
@@ -141,10 +121,10 @@ def share(low: float, high: float) -> BeforeValidator:
 
 def known(what: str, names: Collection[str]) -> AfterValidator:
     """Return the validator of a name that must be one of `names`; `what` is what they are names of."""
-    return _accepted(names.__contains__, f"must be a known {what}", names)
+    return accepted(names.__contains__, f"must be a known {what}", names)
 
 
-def _accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] = ()) -> AfterValidator:
+def accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] = ()) -> AfterValidator:
     """Return the validator of text that `accept` takes."""
 
     def validate(text: str) -> str:
@@ -157,11 +137,6 @@ def _accepted(accept: Callable[[str], Any], rule: str, choices: Collection[str] 
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
 Pitch = Annotated[float, length(10 * NM, 1 * MM)]
-Aperture = Annotated[float, length(1 * UM, 1.0)]
-FocalLength = Annotated[float, length(10 * UM, 100.0)]
-LevelStep = Annotated[float, length(0.1 * NM, 100 * UM)]
-ChromeOverlap = Annotated[float, length(0.0, 1 * MM)]
-Defocus = Annotated[float, length(-10 * MM, 10 * MM)]
 NearDepth = Annotated[float, length(10 * UM, 1e6)]
 FarDepth = Annotated[
     float,
@@ -173,47 +148,13 @@ FarDepth = Annotated[
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
+NotNegative = Annotated[float, Field(strict=True, ge=0)]
+Seed = Annotated[int, Field(strict=True, ge=0, lt=2**32)]
+Steps = Annotated[int, Field(strict=True, ge=0, le=10_000_000)]
 
-
-def _level_count(count: int) -> int:
-    if count not in (2, 4, 8, 16, 32, 64):
-        raise broken("must be a power of two from 2 to 64, one bit per etch mask", "Choose 2, 4, 8, 16, 32 or 64.")
-    return count
-
-
-LevelCount = Annotated[int, Field(strict=True), AfterValidator(_level_count)]
-SpecName = Annotated[
-    str,
-    _accepted(
-        re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}").fullmatch,
-        "must be a file name of at most 64 letters, digits, dots, dashes",
-    ),
-]
-ColourName = Annotated[
-    str,
-    _accepted(
-        re.compile(r"[A-Za-z0-9_-]{1,32}").fullmatch,
-        "must be a name of at most 32 letters, digits, dashes, underscores",
-    ),
-]
-Material = Annotated[str, known("material", MATERIALS)]
-_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
-ObjectiveName = Annotated[
-    str,
-    _accepted(
-        lambda name: name in OBJECTIVES or _FUNCTION.fullmatch(name),
-        'must be a known objective or a function as "module:function"',
-        OBJECTIVES,
-    ),
-]
-Start = Annotated[
-    str,
-    _accepted(
-        lambda name: name in STARTS or name.lower().endswith(HEIGHT_FILES),
-        f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})",
-        STARTS,
-    ),
-]
+_COLOUR_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
+_COLOUR_RULE = "must be a name of at most 32 letters, digits, dashes, underscores"
+ColourName = Annotated[str, accepted(_COLOUR_NAME.fullmatch, _COLOUR_RULE)]
 
 
 @dataclass(frozen=True)

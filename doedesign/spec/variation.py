@@ -24,18 +24,12 @@ from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import length
 from fab.process import DEVIATIONS, Deviation, Disc, MaskDisc, Variation
 
-__all__ = ["ProcessFile", "VariationFile", "variation_file"]
-
 Place = Annotated[float, length(-1.0, 1.0)]
 Radius = Annotated[float, length(0.0, 1.0)]
 
 
 class ProcessFile(SpecTable, frozen=True):
-    """A file that holds a process.
-
-    Attributes:
-        process: the process.
-    """
+    """TOML file of a process."""
 
     process: ProcessSpec
 
@@ -79,13 +73,7 @@ class ParticleSpec(SpecTable, frozen=True):
 
 
 class VariationFile(SpecTable, frozen=True):
-    """A file that holds the errors of one plate.
-
-    Attributes:
-        variation: the errors.
-        particles: `[[particle]]` in TOML.
-        pinholes: `[[pinhole]]` in TOML.
-    """
+    """TOML file of the errors of one DOE."""
 
     variation: VariationSpec
     particles: tuple[ParticleSpec, ...] = optional(())
@@ -101,25 +89,18 @@ class VariationFile(SpecTable, frozen=True):
 
 
 def variation_file(variation: Variation) -> VariationFile:
-    """Return the file that says what a variation is.
-
-    Args:
-        variation: errors as numbers of any kind that `float` takes.
+    """Return the file that says what a variation is, whose errors may be numbers of any kind that `float` takes.
 
     Raises:
         ValueError: a value that is not finite, or an error below zero that never is.
     """
     errors = {name: getattr(variation, name) for name in DEVIATIONS}
     plain = {name: tuple(map(float, v)) if DEVIATIONS[name].per_mask else float(v) for name, v in errors.items()}
-    return VariationFile.model_validate(
-        {
-            "variation": {**plain, "repeats": tuple(map(int, variation.repeats)), "seed": int(variation.seed)},
-            "particles": [
-                {"mask": int(p.mask), "y_m": float(p.y_m), "x_m": float(p.x_m), "radius_m": float(p.radius_m)}
-                for p in variation.particles
-            ],
-            "pinholes": [
-                {"y_m": float(p.y_m), "x_m": float(p.x_m), "radius_m": float(p.radius_m)} for p in variation.pinholes
-            ],
-        }
+    particles, pinholes = (
+        [{key: float(getattr(disc, key)) for key in ("y_m", "x_m", "radius_m")} for disc in discs]
+        for discs in (variation.particles, variation.pinholes)
     )
+    for particle, disc in zip(particles, variation.particles, strict=True):
+        particle["mask"] = int(disc.mask)
+    rest = {"repeats": tuple(map(int, variation.repeats)), "seed": int(variation.seed)}
+    return VariationFile.model_validate({"variation": plain | rest, "particles": particles, "pinholes": pinholes})
