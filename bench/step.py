@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.design.optimize import constants_at, initial_state, make_update
+from doedesign.design.optimize import initial_state, make_update, step_inputs
 from doedesign.design.problem import problem_of
 from doedesign.spec import load_spec
 
@@ -25,13 +25,13 @@ def main(rounds: int = 9) -> None:
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False))
     update = make_update(spec)
-    state = (first.radians, first.adam)
+    state = (first.parameters, first.adam)
     transform = jax.jit(jnp.fft.fft2)
     field = jnp.ones(problem.camera.grid.shape, jnp.complex64)
     ratios, step_s, floor_s = [], [], []
     for step in range(rounds + 2):
         start = time.perf_counter()
-        state, loss, _ = update(constants_at(spec, problem, scene, step), state)
+        state, loss, _ = update(step_inputs(spec, problem, scene, step), state)
         jax.block_until_ready((state, loss))
         middle = time.perf_counter()
         for _ in range(12):

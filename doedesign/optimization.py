@@ -1,4 +1,4 @@
-"""`doedesign optimize`: a spec becomes a design, in memory or in a run folder."""
+"""Optimisation of a spec into a design, in memory or in a run folder."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from doedesign.design.design import Design
@@ -14,8 +15,8 @@ from doedesign.design.metrics import design_metrics, pattern_metrics
 from doedesign.design.optimize import (
     OptimizationState,
     finished_design,
+    first_parameters,
     initial_state,
-    learns_depths,
     optimiser_of,
     steps,
 )
@@ -45,7 +46,7 @@ from sim.optic import HeightOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
-from sim.psf_bank import PsfBank, psf
+from sim.psf_bank import psf
 from sim.transfer import mtf
 
 log = logging.getLogger("doedesign")
@@ -106,22 +107,17 @@ def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:
 def _resume(
     run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    optimiser = optimiser_of(run.spec)
-    shape = problem.optic.shape
-    # Depths that are learnt stand between the parameters and the moments.
-    shapes = [shape, (run.spec.process.masks,)] if learns_depths(run.spec) else [shape]
-    free = [np.zeros(each, np.float32) for each in shapes]
-    template = jax.eval_shape(lambda: optimiser.init(tuple(free) if len(free) > 1 else free[0]))
+    parameters = first_parameters(run.spec, jnp.zeros(problem.optic.shape, jnp.float32))
+    template = jax.eval_shape(lambda: (parameters, optimiser_of(run.spec).init(parameters)))
     leaves, tree = jax.tree.flatten(template)
-    stored = load_checkpoint(run, [*shapes, *(leaf.shape for leaf in leaves)])
+    stored = load_checkpoint(run, [leaf.shape for leaf in leaves])
     if stored is None:
         log.info(f'starting from "{run.spec.optimize.start}"')
         return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []
     arrays, step, history = stored
     log.info(f"resuming after step {step}")
-    radians, *depths = (jax.numpy.asarray(a) for a in arrays[: len(shapes)])
-    adam = jax.tree.unflatten(tree, [jax.numpy.asarray(a) for a in arrays[len(shapes) :]])
-    return OptimizationState(radians, adam, step, *depths), history
+    parameters, adam = jax.tree.unflatten(tree, [jnp.asarray(array) for array in arrays])
+    return OptimizationState(parameters, adam, step), history
 
 
 def _saving(run: Run) -> Save:
@@ -129,7 +125,7 @@ def _saving(run: Run) -> Save:
 
     def save(state: OptimizationState, history: Sequence[Mapping[str, Any]]) -> None:
         if state.step % run.spec.optimize.checkpoint_every == 0 or state.step == run.spec.optimize.steps:
-            arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.free, state.adam))]
+            arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.parameters, state.adam))]
             save_checkpoint(run, arrays, state.step, history)
 
     return save
@@ -143,19 +139,12 @@ def _iterate(
     history: list[dict[str, Any]],
     save: Save = lambda *_: None,
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    names = [term.name for term in problem.terms]
     with meter("optimising", spec.optimize.steps, state.step) as progress:
         for state, record in steps(spec, problem, sources, state):  # noqa: B020 - the last state is the result
-            history.append({"step": record.step, "loss": record.loss, "terms": list(record.terms), "names": names})
-            progress.advance(state.step, f"loss {record.loss:.4f}")
+            history.append(record)
+            progress.advance(state.step, f"loss {record['loss']:.4f}")
             save(state, history)
     return state, history
-
-
-def design_bank(spec: Spec, problem: Problem, height_m: np.ndarray) -> PsfBank:
-    """The exact PSF bank of a height map at all depths of the spec."""
-    depths = (*spec.scene.near_m, *spec.scene.far_m)
-    return psf(height_m, problem.camera, depths, propagation=spec.optics.propagation)
 
 
 def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
@@ -172,16 +161,14 @@ def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
 
 def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     spec, camera, height = run.spec, problem.camera, design.nominal_height_m
+    near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.optics.propagation
     levels = None if spec.optimize.quantisation == "none" else design.levels
     names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
     write_history(run, design.history)
-    near, far = spec.scene.near_m, spec.scene.far_m
-    bank = design_bank(spec, problem, height)
     flat = np.zeros_like(height)
-    lens = design_bank(spec, problem, flat)
+    bank, lens = (psf(each, camera, (*near, *far), propagation=propagation) for each in (height, flat))
     metrics: dict[str, Any] = {"psf": design_metrics(HeightOptic.of(camera, height), bank, near, lens)}
-    patterns = pattern_metrics(spec, camera, bank, problem.terms)
-    if patterns:
+    if patterns := pattern_metrics(spec, camera, bank, problem.terms):
         metrics["patterns"] = patterns
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(problem, design)
@@ -195,8 +182,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if design.history:
         save(plot_history(design.history), run.path("history.png"))
         names.append("history.png")
-    targets = [term.target for term in problem.terms if term.target is not None]
-    if targets:
+    if targets := [term.target for term in problem.terms if term.target is not None]:
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
         efficiency, uniformity = (patterns[0][name] for name in ("efficiency", "uniformity"))
         drawn = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)

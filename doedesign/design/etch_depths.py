@@ -44,10 +44,10 @@ class HeightHistogram(NamedTuple):
 
     Attributes:
         running: `[line, edge]` sum of share times exp(2 pi i waves_per_metre h) below each edge of the histogram, whose
-            bins divide one wave of the design evenly.
+            bins divide one wave of the design, `period_m`, evenly.
         waves_per_metre: `[line]` waves per metre of height.
         weights: `[line]` weight of each line; they sum to 1.
-        period_m: height of one wave of the design.
+        period_m: see `running`.
     """
 
     running: NDArray[np.complex128]
@@ -59,13 +59,10 @@ class HeightHistogram(NamedTuple):
 def height_histogram(
     height_m: Float[np.ndarray, "*s"], area: Float[np.ndarray, "*s"], period_m: float, camera: Camera
 ) -> HeightHistogram:
-    """Return the histogram of a design's heights before rounding.
+    """Return the histogram of a design's heights before rounding, metres, taken modulo one wave, `period_m`.
 
-    Args:
-        height_m: heights, metres, taken modulo one wave.
-        area: how much each of them counts, such as the open share of its cell.
-        period_m: height of one wave of the design.
-        camera: its colours weigh alike, the lines of a colour by their weights.
+    `area` is how much each of them counts, such as the open share of its cell. The colours of the camera weigh alike,
+    the lines of a colour by their weights.
     """
     lines = [(w, share) for c in camera.colours for w, share in zip(c.wavelengths_m, c.weights, strict=True)]
     waves_per_metre = np.array([camera.waves_per_metre(wavelength) for wavelength, _ in lines])
@@ -98,15 +95,7 @@ def recipe_depths_m(depths_m: Sequence[float] | NDArray[np.floating]) -> tuple[f
 
 
 def optimal_levels(heights: HeightHistogram, start: Levels) -> Levels:
-    """Return the staircase that rounds a design's heights at the least loss of light.
-
-    Args:
-        heights: heights of the design.
-        start: the staircase to begin with; it is returned if none is better.
-
-    Returns:
-        The staircase; its depths rise from mask to mask.
-    """
+    """Return the staircase, `start` if none is better, that rounds a design's heights at the least loss of light."""
     import nlopt
 
     step = start.step_m

@@ -24,13 +24,9 @@ from sim.psf_bank import PsfBank
 
 
 def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank) -> list[dict[str, Any]]:
-    """Return one row per depth and colour of a bank: the metrics of a design (`sim.metrics`) and its energy budget.
+    """Return one row per depth and colour of a bank on the axis: metrics (`sim.metrics`) and energy budget.
 
-    Args:
-        optic: the DOE.
-        bank: its PSFs on the axis.
-        near_m: which of the bank's depths are obstructions.
-        lens: PSFs of the plain lens at the same depths.
+    `near_m` are those of its depths, metres, that are obstructions; `lens` has the plain lens at the same depths.
     """
     rows = without_infinities(metric_rows(bank.metric_inputs(near_m, optic, lens=lens), "design"))
     places = ((d, c) for d in range(len(bank.depths_m)) for c in range(len(bank.colours)))

@@ -46,13 +46,7 @@ class PsfSet(eqx.Module):
 
 
 class Term(NamedTuple):
-    """Weighted objective; the loss is the sum of weight times value.
-
-    Attributes:
-        name: name of the objective.
-        weight: its factor.
-        value: the objective with its options.
-    """
+    """Weighted objective with its options; the loss is the sum of weight times value."""
 
     name: str
     weight: float
@@ -122,12 +116,7 @@ BUILT_IN: dict[str, Callable[..., Array]] = {name: globals()[name] for name in O
 
 
 def terms_from_spec(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
-    """Return a spec's objectives, with options bound and images read.
-
-    Args:
-        spec: the spec.
-        camera: its camera.
-        files: input files of the spec by dotted key (`doedesign.spec.input_files`).
+    """Return a spec's objectives, with options bound and images read from its `doedesign.spec.input_files`.
 
     Raises:
         InputError: a function that cannot be imported, an option it does not take, or an image that cannot be read.

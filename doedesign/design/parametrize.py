@@ -12,7 +12,7 @@ blends from the continuous to the quantised height while the cubic schedule of L
 The depths of the etches may be parameters, too. Cells then take the nearest of the levels that these depths make.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,21 +23,25 @@ from jaxtyping import Array, Float, Int
 from fab.levels import Levels
 from sim.material import full_wave_height_m
 
-Quantisation = Literal["straight_through", "annealed", "none"]
-# The parameters, and where the depths of the etches are learnt their logarithms (`LevelParametrization.depths_m`).
-Free = Array | tuple[Array, Array]
-
 # A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
 DEPTH_SCALE = 0.1
 
 
-class LevelParametrization(eqx.Module):
-    """How parameters become heights.
+class Parameters(NamedTuple):
+    """All that an optimisation moves.
 
     Attributes:
-        metres_per_radian: height of one radian of phase at the design wavelength.
-        levels: the process's staircase.
+        radians: phase at the design wavelength, of every cell or ring.
+        log_depth_ratio: `[mask]` logarithm of every etch's depth over its first one, in units of `DEPTH_SCALE`; None
+            where the depths are given.
     """
+
+    radians: Array
+    log_depth_ratio: Array | None = None
+
+
+class LevelParametrization(eqx.Module):
+    """Heights on a staircase from phases: one radian at the design wavelength is `metres_per_radian` high."""
 
     metres_per_radian: float = eqx.field(static=True)
     levels: Levels = eqx.field(static=True)
@@ -63,14 +67,9 @@ class LevelParametrization(eqx.Module):
     ) -> Float[Array, "*s"]:
         """Height that is optimised: quantised at softness 0, continuous at 1, blended between.
 
-        The gradient by the parameters is that of the continuous height at softness 0 and 1 (straight-through), and the
-        blend's own otherwise. The gradient by the depths is that of the levels' heights; which level is nearest counts
-        as given.
-
-        Args:
-            radians: the parameters.
-            softness: 0 to 1.
-            depths_m: depths of the etches, mask 0 first, if they are not those of the staircase.
+        The gradient with respect to `radians` is that of the continuous height at softness 0 and 1 (straight-through),
+        and the blend's own otherwise. `depths_m` are the depths of the etches, mask 0 first, if they are not those of
+        the staircase; the gradient with respect to them is that of the levels' heights, at the same nearest level.
         """
         height = self.continuous_m(radians)
         if depths_m is None and self.levels.is_binary:
@@ -83,12 +82,10 @@ class LevelParametrization(eqx.Module):
         blended = softness * height + (1.0 - softness) * stepped
         return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
 
-    def height_of(self, free: Free, softness: Float[Array, ""]) -> Float[Array, "*s"]:
+    def height_of(self, parameters: Parameters, softness: Float[Array, ""]) -> Float[Array, "*s"]:
         """`height_m` of all that an optimisation moves."""
-        if isinstance(free, tuple):
-            radians, stretch = free
-            return self.height_m(radians, softness, self.depths_m(stretch))
-        return self.height_m(free, softness)
+        ratio = parameters.log_depth_ratio
+        return self.height_m(parameters.radians, softness, None if ratio is None else self.depths_m(ratio))
 
     def _nearest(self, height_m: Float[Array, "*s"], depths_m: Float[Array, " k"]) -> Int[Array, "*s"]:
         """Nearest level of a wrapped height if the etches have these depths (`fab.levels.wrapped_cells`)."""
@@ -125,7 +122,7 @@ def _add_tangent_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Ar
     return primals[0], tangents[0] + tangents[1]
 
 
-def softness_at(quantisation: Quantisation, step: int, steps: int) -> float:
+def softness_at(quantisation: Literal["straight_through", "annealed", "none"], step: int, steps: int) -> float:
     """Softness of the staircase at a step: 0 is what will be drawn."""
     if quantisation == "straight_through":
         return 0.0

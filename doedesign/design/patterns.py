@@ -18,11 +18,7 @@ Image = Float[np.ndarray, "y x"]
 
 
 def positive_length(text: object, where: str) -> float:
-    """Length of an option, metres.
-
-    Args:
-        text: its value, such as "250 um".
-        where: its key, for messages.
+    """Length in metres of an option such as "250 um"; `where` is its key, for messages.
 
     Raises:
         InputError: anything else than a positive length with a unit.
@@ -101,13 +97,10 @@ def _picture(camera: Camera, path: Path) -> Image:
 
 
 def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, where: str) -> Image:
-    """Target energies per pixel, summing to 1, float32.
+    """Target energies per pixel of the sensor window, summing to 1, float32: a picture, or a pattern of the options.
 
-    Args:
-        camera: sensor window.
-        options: `pattern` = "spots" (count, spacing), "square" (width) or "disc" (diameter).
-        picture: a picture file to draw instead.
-        where: key of the objective, for messages.
+    `pattern` is "spots" (count, spacing), "square" (width) or "disc" (diameter); `where` is the key of the objective,
+    for messages.
 
     Raises:
         InputError: an unknown pattern, a missing or impossible option, an unreadable or black picture.

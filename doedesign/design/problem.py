@@ -24,7 +24,7 @@ from sim.source import SourceMap
 
 
 class StepSources(NamedTuple):
-    """What one evaluation of the loss looks at.
+    """Those of a `SourceSet` that one evaluation of the loss looks at, and where the image lies.
 
     Attributes:
         near: `[line][depth]` source waves of near depths.
@@ -40,14 +40,9 @@ class StepSources(NamedTuple):
 
 
 class Problem(eqx.Module):
-    """What stays the same from step to step.
+    """All that stays the same from step to step: the objectives, and propagation of every line of the camera.
 
-    Attributes:
-        parametrization: parameters to heights.
-        terms: weighted objectives.
-        plans: propagation of every line (wavelength) of the camera.
-        waves_per_metre: of DOE height, for every line.
-        optic: the DOE, its heights (of cells or rings) still those of the bare lens.
+    The optic is a DOE of cells or rings whose heights are still those of the bare lens.
     """
 
     parametrization: LevelParametrization = eqx.field(static=True)
@@ -61,21 +56,9 @@ class Problem(eqx.Module):
         """Optics and sensor."""
         return self.optic.camera
 
-    @property
-    def radial(self) -> bool:
-        """Whether the parameters are a profile over rings."""
-        return len(self.optic.shape) == 1
-
 
 class SourceSet(NamedTuple):
-    """Everything a step may look at: source waves of every line and depth, and the plain lens.
-
-    Attributes:
-        near: `[line][depth]` near sources.
-        far: `[line][depth]` far sources.
-        lens: `[w, n]` participation of the plain lens.
-        displacement_m: largest displacement of the image, 0 to leave it on the axis.
-    """
+    """Everything a step may look at, as in `StepSources`, and the largest displacement of the image, metres or 0."""
 
     near: tuple[tuple[Array, ...], ...]
     far: tuple[tuple[Array, ...], ...]
@@ -83,9 +66,9 @@ class SourceSet(NamedTuple):
     displacement_m: float
 
     def look(self, seed: int, step: int) -> StepSources:
-        """What step number `step` looks at; depends on the two numbers alone, so a resumed run repeats it.
+        """Sources of a step: depths in shuffled rounds, so that each is seen equally often.
 
-        Depths come in shuffled rounds, so each is seen equally often.
+        They depend on the two numbers alone, so a resumed run repeats them.
         """
 
         def pick(count: int, salt: int) -> list[int]:
@@ -125,7 +108,10 @@ def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSe
         tuple(tuple(sources(line, depth).source_waves for depth in depths_m) for line in optic.lines)
         for depths_m in (spec.scene.near_m, spec.scene.far_m)
     )
-    lens = lens_participation(camera, spec.scene.near_m)
+    lens = np.zeros((len(camera.colours), 0), np.float32)
+    if spec.scene.near_m:
+        bank = psf(HeightOptic.of(camera), depths=spec.scene.near_m)
+        lens = np.asarray(participation(jnp.asarray(bank.energy)))
     return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
 
 
@@ -153,13 +139,6 @@ def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
         waves_per_metre=tuple(jnp.float32(camera.waves_per_metre(line.wavelength_m)) for line in optic.lines),
         optic=optic,
     )
-
-
-def lens_participation(camera: Camera, near_m: tuple[float, ...]) -> Float[np.ndarray, "w n"]:
-    """Sum of squared pixel energies of the lens behind a flat DOE, per colour and near depth."""
-    if not near_m:
-        return np.zeros((len(camera.colours), 0), np.float32)
-    return np.asarray(participation(jnp.asarray(psf(HeightOptic.of(camera), depths=near_m).energy)))
 
 
 def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:

@@ -22,15 +22,7 @@ _WHERE = "optimize.start_options"
 
 
 class StartSetup(NamedTuple):
-    """Design task of a start.
-
-    Attributes:
-        camera: optics.
-        radial: whether heights are a profile over rings instead of a map.
-        wavelength_m: design wavelength.
-        seed: seed of random starts.
-        loss: loss of given heights.
-    """
+    """Design task of a start: whether its heights are a profile over rings instead of a map, and their loss."""
 
     camera: Camera
     radial: bool
@@ -134,12 +126,7 @@ BUILT_IN = {name: globals()[name] for name in STARTS}
 
 
 def start_heights(name: str, options: Mapping[str, Any], setup: StartSetup) -> Heights:
-    """Heights of a named start, metres.
-
-    Args:
-        name: one of `doedesign.spec.values.STARTS`.
-        options: `optimize.start_options` of the spec.
-        setup: the design task.
+    """Heights, metres, of a start of `doedesign.spec.values.STARTS` with its options.
 
     Raises:
         InputError: an option that the start does not take, or an impossible value.

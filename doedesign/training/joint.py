@@ -26,7 +26,7 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import sensor_from_spec
 from doedesign.capture.scenes import Batch
-from doedesign.design.parametrize import Free, softness_at
+from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import plans_of
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
@@ -65,15 +65,14 @@ class JointState(NamedTuple):
     Attributes:
         step: number of steps done.
         network: the network.
-        free: what is learnt of the plate (`doedesign.design.optimize.OptimizationState.free`); None for a plate at
-            rest.
+        free: phases of the plate, radians; None for a plate at rest.
         network_moments: Adam's moments.
         optics_moments: Adam's moments; None for a plate at rest.
     """
 
     step: int
     network: Network
-    free: Free | None
+    free: Array | None
     network_moments: optax.OptState
     optics_moments: optax.OptState | None
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel
-from doedesign.design.parametrize import Free, LevelParametrization
+from doedesign.design.parametrize import LevelParametrization
 from sim.imaging.scene import Scene
 from sim.optic import ON_AXIS, HeightOptic, RingOptic, colour_energies
 from sim.psf_bank import BankOptic
@@ -45,7 +45,7 @@ class TrainingDoe(eqx.Module):
         """
         return tuple(self.optic.source(line, depth_m, field_rad) for line in self.optic.lines)
 
-    def psf(self, free: Free | None, softness: Array, sources: tuple[Any, ...]) -> Float[Array, "c y x"]:
+    def psf(self, free: Array | None, softness: Array, sources: tuple[Any, ...]) -> Float[Array, "c y x"]:
         """PSF of every colour, energy per pixel.
 
         Args:
@@ -53,7 +53,7 @@ class TrainingDoe(eqx.Module):
             softness: of the quantisation (`doedesign.design.parametrize.softness_at`).
             sources: see `sources`.
         """
-        optic = self.optic if free is None else self.learnt.with_heights(self.learning.height_of(free, softness))
+        optic = self.optic if free is None else self.learnt.with_heights(self.learning.height_m(free, softness))
         return colour_energies(optic, self.plans, sources)
 
     @property
@@ -97,7 +97,7 @@ class Capture(NamedTuple):
 
 
 def shot(
-    seen: TrainingScene, doe: TrainingDoe, free: Free | None, softness: Array, bench: CaptureModel, key: Key[Array, ""]
+    seen: TrainingScene, doe: TrainingDoe, free: Array | None, softness: Array, bench: CaptureModel, key: Key[Array, ""]
 ) -> Capture:
     """Photograph a scene through a DOE.
 
@@ -116,7 +116,7 @@ def shot(
 def shots(
     seen: TrainingScene,
     doe: TrainingDoe,
-    free: Free | None,
+    free: Array | None,
     softness: Array,
     bench: CaptureModel,
     keys: Key[Array, " b"],

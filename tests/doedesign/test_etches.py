@@ -173,7 +173,7 @@ def test_gradient_of_the_whole_chain_by_the_depths() -> None:
     state = initial_state(spec, problem, scene, {}, unread)
     look, staircase = scene.look(0, 0), problem.parametrization
     # Heights in the middle of levels' shares, so that a step of a few nanometres moves no cell to another level.
-    level = quantise_wrapped(np.asarray(staircase.continuous_m(state.radians)), staircase.levels)
+    level = quantise_wrapped(np.asarray(staircase.continuous_m(state.parameters.radians)), staircase.levels)
     radians = jnp.asarray(staircase.radians_of(height_of(level, staircase.levels) + 20e-9))
 
     @jax.jit
@@ -205,8 +205,8 @@ def test_chosen_depths_resume_to_the_last_bit(changes: list[str]) -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN, *changes])
     whole = run(spec)
     resumed = run(spec, run(spec, stop=3))
-    assert whole.log_depth_ratio is not None
-    assert np.any(whole.log_depth_ratio != 0)
+    assert whole.parameters.log_depth_ratio is not None
+    assert np.any(whole.parameters.log_depth_ratio != 0)
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(resumed), strict=True):
         assert np.array_equal(one, other)
 
@@ -216,8 +216,8 @@ def test_the_design_stands_on_the_chosen_levels() -> None:
     problem, _ = problem_of(spec, {})
     state = run(spec)
     design = finished_design(spec, problem, state)
-    assert state.log_depth_ratio is not None
-    learnt = np.array([300e-9, 600e-9]) * np.exp(DEPTH_SCALE * state.log_depth_ratio)
+    assert state.parameters.log_depth_ratio is not None
+    learnt = np.array([300e-9, 600e-9]) * np.exp(DEPTH_SCALE * state.parameters.log_depth_ratio)
     # A recipe holds tenths of a nanometre.
     np.testing.assert_allclose(design.levels.depths_m, learnt, atol=0.051 * NM)
     assert not design.levels.is_binary
@@ -228,7 +228,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
     spec = load_spec(QUICK, [*SMALL, *CHOSEN, "optimize.quantisation=none"])
     problem, _ = problem_of(spec, {})
     state = run(spec)
-    assert state.log_depth_ratio is None
+    assert state.parameters.log_depth_ratio is None
     design = finished_design(spec, problem, state)
     assert isinstance(problem.optic, HeightOptic)
     area = np.asarray(problem.optic.coverage)

@@ -28,7 +28,7 @@ def run(
     begun = start or initial_state(spec, problem, scene, {}, unread)
     state, history = begun, []
     for state, record in steps(spec, problem, scene, begun):
-        history.append(record.loss)
+        history.append(record["loss"])
         if state.step == stop:
             break
     return jax.tree.map(np.asarray, state), history
@@ -54,10 +54,11 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
         height = radians * problem.parametrization.metres_per_radian  # no wrap: it has no derivative
         return losses(problem, view_of(problem, height, look))[0]
 
-    direction = jnp.asarray(np.random.default_rng(0).normal(size=state.radians.shape), jnp.float32)
-    slope = float(jnp.vdot(jax.grad(loss)(state.radians), direction))
+    radians = state.parameters.radians
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=radians.shape), jnp.float32)
+    slope = float(jnp.vdot(jax.grad(loss)(radians), direction))
     step = 3e-3
-    difference = float(loss(state.radians + step * direction) - loss(state.radians - step * direction)) / (2 * step)
+    difference = float(loss(radians + step * direction) - loss(radians - step * direction)) / (2 * step)
     # Central differences in float32: rounding 1e-7 / 6e-3 = 2e-5 of the loss, curvature of the same order.
     assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
 
@@ -68,7 +69,7 @@ def test_resumed_run_has_the_same_bits() -> None:
     half, first = run(spec, stop=5)
     resumed, second = run(spec, start=jax.tree.map(jnp.asarray, half)._replace(step=5))
     assert first + second == history
-    assert np.array_equal(whole.radians, resumed.radians)
+    assert np.array_equal(whole.parameters.radians, resumed.parameters.radians)
 
 
 def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
