@@ -37,11 +37,7 @@ def camera_from_spec(spec: Spec) -> Camera:
 
 
 def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
-    """Return the staircase that a process makes.
-
-    Args:
-        spec: the process of a spec, or of a file of its own.
-        chosen: the staircase where the spec leaves the depths of the etches to the optimisation.
+    """Return the staircase that a process makes, `chosen` where its spec leaves the depths to the optimisation.
 
     Raises:
         InputError: the depths are still to be chosen.
@@ -58,12 +54,8 @@ def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
 def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Process:
     """Return a process, with what the spec leaves out taken from its stock process.
 
-    Args:
-        spec: the process of a spec, or of a file of its own.
-        chosen: see `levels_from_spec`.
-
-    Returns:
-        The process; errors whose mean and standard deviation are zero are left out of its spreads.
+    Its staircase is `chosen` where the spec leaves the depths of the etches to the optimisation; errors whose mean and
+    standard deviation are zero are left out of its spreads.
 
     Raises:
         InputError: the depths are still to be chosen.
@@ -86,23 +78,16 @@ def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Proces
 
 
 def wafer_from_spec(spec: WaferSpec) -> Wafer:
-    """Return the layout of a wafer.
-
-    Raises:
-        InputError: numbers that do not go together.
-    """
+    """Return the layout of a wafer, or raise an `InputError` for numbers that do not go together."""
     return Wafer(**spec.model_dump())
 
 
 def resolve_process(
     given: "Process | ProcessSpec | str | Path | None", levels: Levels, default: ProcessSpec | None = None
 ) -> Process:
-    """Return a process for a staircase.
+    """Return a process for a staircase: one that is given, by itself, its spec, its stock name or its TOML file.
 
-    Args:
-        given: a process or its spec; the name of a stock process; a TOML file; None for the default.
-        levels: the staircase it must make.
-        default: the process of the design's spec; an ideal process if there is none.
+    None stands for the `default`, the process of the design's spec, or else for the ideal process.
 
     Raises:
         InputError: the file cannot be read, or the process makes another staircase.
@@ -111,28 +96,14 @@ def resolve_process(
     if isinstance(given, Path) or (isinstance(given, str) and given not in STOCK):
         where, given = str(given), load_process(given)
     if isinstance(given, ProcessSpec):
-        return require_levels(process_from_spec(given, levels), levels, where)
+        given = process_from_spec(given, levels)
+        if given.levels != levels:
+            raise InputError(where, f"must be for {levels}", given.levels, "Give a process for this design.")
     return process_from(given, levels)
 
 
-def require_levels(process: Process, levels: Levels, where: str) -> Process:
-    """Return a process that makes a staircase.
-
-    Raises:
-        InputError: it makes another one.
-    """
-    if process.levels != levels:
-        raise InputError(where, f"must be for {levels}", process.levels, "Give a process for this design.")
-    return process
-
-
 def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
-    """Return a process with the line-width bias that is left where masks draw moved edges.
-
-    Args:
-        process: the process.
-        edge_moves_m: how far every edge of each mask was moved outward, mask 0 first, metres; empty for none.
-    """
+    """Return a process with the line-width bias that is left where masks draw edges moved outward, metres by mask."""
     if not any(edge_moves_m):
         return process
     names = [f"cd_bias_m[{mask}]" for mask in range(process.masks)]
@@ -142,11 +113,7 @@ def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
 
 
 def spec_from_process(process: Process, like: ProcessSpec | None = None) -> ProcessSpec:
-    """Return the spec of a process, with every number given and none left to a stock process.
-
-    Args:
-        process: the process, for example one fitted to measurements.
-        like: the spec it came from, for the chrome's overlap; the usual one by default.
+    """Return the spec of a process, with every number given; the overlap of the chrome is that of `like`.
 
     Raises:
         InputError: a number that no spec may hold.
@@ -155,10 +122,8 @@ def spec_from_process(process: Process, like: ProcessSpec | None = None) -> Proc
     for error in DEVIATIONS:
         spreads = [process.spreads.get(name, Normal()) for name in error_names(process.masks, error)]
         if any(spread != Normal() for spread in spreads):
-            errors[error] = {
-                "mean": _one_or_each([float(spread.mean) for spread in spreads]),
-                "sigma": _one_or_each([float(spread.sigma) for spread in spreads]),
-            }
+            parts = {part: [float(getattr(spread, part)) for spread in spreads] for part in ("mean", "sigma")}
+            errors[error] = {part: v[0] if len(set(v)) == 1 else tuple(v) for part, v in parts.items()}
     in_order = process.order == Process(process.levels).order
     data: dict[str, Any] = {
         "levels": process.levels.count,
@@ -171,7 +136,3 @@ def spec_from_process(process: Process, like: ProcessSpec | None = None) -> Proc
         **{key: getattr(process, key) for key in _SHARED},
     }
     return process_from_json(data, f"process {process.name}")
-
-
-def _one_or_each(values: Sequence[float]) -> float | tuple[float, ...]:
-    return values[0] if len(set(values)) == 1 else tuple(values)

@@ -61,12 +61,13 @@ def print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
     print_text(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(names))
 
 
-def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
-    """Run the work of a command; a mistake of the user becomes one message instead of a traceback.
+def print_results(folder: Path, as_json: bool, **more: Any) -> None:
+    """Print the paths of a folder and of what is in it."""
+    print_paths([folder, *sorted(folder.iterdir())], as_json, **more)
 
-    Returns:
-        0 done, 1 a check failed, 2 bad input, 130 interrupted.
-    """
+
+def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
+    """Run a command and return its exit code; a mistake of the user becomes one message instead of a traceback."""
     try:
         with shown_log():
             work()

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.cli.console import print_paths, print_text, say
+from doedesign.cli.console import print_paths, print_results, print_text, say
 from doedesign.cli.options import AsJson, Overrides, length_of
 from fab.errors import InputError
 
@@ -73,7 +73,7 @@ def masks(
 
         folder = source / "as-built"
         predict(source, as_built, order, process=process, out=folder)
-        print_paths([folder, *sorted(folder.iterdir())], json_)
+        print_results(folder, json_)
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
@@ -95,7 +95,7 @@ def masks(
         aperture_m=length_of("--aperture", aperture),
     )
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is as designed")
-    print_paths([done.folder, *sorted(done.folder.iterdir())], json_, checks=len(done.report.checks))
+    print_results(done.folder, json_, checks=len(done.report.checks))
 
 
 def verify(order: Path, *, json_: AsJson = False) -> None:

@@ -1,12 +1,9 @@
 """PSFs and captures of a design: psf, simulate."""
 
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
-from doedesign.cli.console import print_paths
-from doedesign.cli.options import AsJson, Overrides, length_of
+from doedesign.cli.console import print_paths, print_results
+from doedesign.cli.options import AsJson, Flag, Overrides, length_of
 from fab.errors import InputError
 
 
@@ -16,7 +13,7 @@ def psf(
     masks: Path | None = None,
     depths: tuple[str, ...] = (),
     field_deg: tuple[float, float] = (0.0, 0.0),
-    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    fabricated: Flag = False,
     process: Path | None = None,
     variation: Path | None = None,
     seed: int | None = None,
@@ -48,7 +45,7 @@ def psf(
 
         folder = run / "fabricated"
         predict(run, masks, process=process, variation=variation, seed=seed, draw=draw, out=folder)
-        print_paths([folder, *sorted(folder.iterdir())], json_)
+        print_results(folder, json_)
         return
     if process is not None or variation is not None or seed is not None:
         raise InputError("--fabricated", "must be given with --process, --variation or --seed", "not there", "Add it.")
@@ -63,7 +60,7 @@ def psf(
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = run / "psf"
     psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)
-    print_paths([folder, *sorted(folder.iterdir())], json_)
+    print_results(folder, json_)
 
 
 def simulate(
@@ -76,13 +73,13 @@ def simulate(
     count: int | None = None,
     seed: int = 0,
     size: int | None = None,
-    fabricated: Annotated[bool, Parameter(negative="")] = False,
+    fabricated: Flag = False,
     process: Path | None = None,
     variation: Path | None = None,
     plate_seed: int | None = None,
     draw: str = "normal/0",
     masks: Path | None = None,
-    png: Annotated[bool, Parameter(negative="")] = False,
+    png: Flag = False,
     set_: Overrides = (),
     json_: AsJson = False,
 ) -> None:

@@ -6,27 +6,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from doedesign.cli.console import print_paths
-from doedesign.cli.options import AsJson, Overrides, length_of
+from doedesign.cli.console import print_paths, print_results
+from doedesign.cli.options import AsJson, Flag, Overrides, length_of
 from fab.errors import InputError
 
 if TYPE_CHECKING:
     from doedesign.recon.model import Model, PsfPair
 
+Files = Annotated[tuple[Path, ...], Parameter(negative="")]
 PsfFiles = Annotated[
-    tuple[Path, ...],
+    Files,
     Parameter(
         name="--psf",
-        negative="",
         help="PSFs other than the model's: one bank, or first a file of the scene and then one of the obstruction.",
     ),
 ]
 PixelPitch = Annotated[str | None, Parameter(help='Pixel pitch of PSFs from another program, such as "3.7 um".')]
 NearDepth = Annotated[
     str | None,
-    Parameter(
-        help='Distance of the obstruction, such as "7 cm"; the middle, in 1/z, of those trained on by default.',
-    ),
+    Parameter(help='Distance of the obstruction, such as "7 cm"; the middle, in 1/z, of those trained on by default.'),
 ]
 FarDepth = Annotated[
     str | None,
@@ -42,9 +40,9 @@ def train(
     obstruction: str | None = None,
     out: Path | None = None,
     validation: Path | None = None,
-    lpips_weights: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    lpips_weights: Files = (),
     licence: str | None = None,
-    tensorboard: Annotated[bool, Parameter(negative="")] = False,
+    tensorboard: Flag = False,
     devices: int | None = None,
     coordinator: str | None = None,
     hosts: int | None = None,
@@ -80,7 +78,7 @@ def train(
     how |= {"validation": validation, "lpips_weights": lpips_weights, "overrides": set_, **several}
     folder = out or run / "trained"
     work(design, images, folder, **how)
-    print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
+    print_results(folder, json_, metrics=str(folder / "metrics.json"))
 
 
 def finetune(
@@ -97,7 +95,7 @@ def finetune(
     seed: int = 0,
     validation: int | None = None,
     size: int | None = None,
-    lpips_weights: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    lpips_weights: Files = (),
     linear: bool | None = None,
     mirror: bool = True,
     json_: AsJson = False,
@@ -125,12 +123,12 @@ def finetune(
     how: Any = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validation": validation, "size": size}
     how |= {"lpips_weights": lpips_weights, "linear": linear, "mirrored": mirror}
     work(model, pairs, folder, psfs=_psfs(model, psf, pixel, near_depth, far_depth), **how)
-    print_paths([folder, *sorted(folder.iterdir())], json_, metrics=str(folder / "metrics.json"))
+    print_results(folder, json_, metrics=str(folder / "metrics.json"))
 
 
 def reconstruct(
     run: Path,
-    captures: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    captures: Files = (),
     /,
     *,
     out: Path | None = None,
@@ -142,7 +140,7 @@ def reconstruct(
     overlap: int | None = None,
     linear: bool | None = None,
     kind: str | None = None,
-    beside: Annotated[bool, Parameter(negative="")] = False,
+    beside: Flag = False,
     json_: AsJson = False,
 ) -> None:
     """Reconstruct what captures show behind their obstruction. With captures alone, the released model is taken.

@@ -10,6 +10,7 @@ from fab.errors import InputError
 Overrides = Annotated[
     tuple[str, ...], Parameter(name="--set", negative="", help="Change one value of the spec, KEY=VALUE.")
 ]
+Flag = Annotated[bool, Parameter(negative="")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON instead of paths.")]
 
 

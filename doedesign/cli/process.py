@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from doedesign.cli.console import print_paths, print_text
-from doedesign.cli.options import AsJson, length_of
+from doedesign.cli.console import print_results, print_text
+from doedesign.cli.options import AsJson, Flag, length_of
 from fab.errors import InputError
 
 
@@ -19,7 +19,7 @@ def tolerance(
     seed: int = 0,
     sensitivity: Literal["one_at_a_time", "sobol", "none"] = "one_at_a_time",
     sobol: int = 64,
-    corners: Annotated[bool, Parameter(negative="")] = False,
+    corners: Flag = False,
     budget: str | None = None,
     yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
     limit: Annotated[tuple[str, ...], Parameter(negative="")] = (),
@@ -72,7 +72,7 @@ def tolerance(
         workers=workers,
         scheduler=scheduler,
     )
-    print_paths([folder, *sorted(folder.iterdir())], json_, results=str(folder / "results.json"))
+    print_results(folder, json_, results=str(folder / "results.json"))
 
 
 def _one_draw(run: Path, key: str, as_json: bool, **settings: Any) -> str:
@@ -156,7 +156,7 @@ def calibrate(
         settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
         result = fit(opened, measurement, errors, **settings, out=folder)
         estimate = str(folder / "process-estimate.toml")
-        print_paths([folder, *sorted(folder.iterdir())], json_, estimate=estimate, explained=result.explained)
+        print_results(folder, json_, estimate=estimate, explained=result.explained)
         return
     from doedesign.calibration.explanations import Targets, explain_ratio
 
@@ -176,4 +176,4 @@ def calibrate(
     targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
     folder = out or opened.path("explanations")
     explain_ratio(opened, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
-    print_paths([folder, *sorted(folder.iterdir())], json_)
+    print_results(folder, json_)

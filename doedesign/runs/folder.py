@@ -87,10 +87,7 @@ class _Manifest(BaseModel):
     spec_sha256: str
     inputs_sha256: dict[str, str] = {}
     etch_depths_m: Any = None
-
-
-class _FinishedManifest(_Manifest):
-    results_sha256: dict[str, str]
+    results_sha256: dict[str, str] = {}
 
 
 def _write_manifest(run: Run, state: str, results: Mapping[str, Any]) -> None:
@@ -114,7 +111,9 @@ def _read_manifest(folder: Path, formats: Sequence[str] = (FORMAT,)) -> _Manifes
         rule = "must say format " + " or ".join(f'"{name}"' for name in formats)
         raise InputError(str(path), rule, repr(raw.get("format")), "Give a folder that this version wrote.")
     try:
-        return (_FinishedManifest if raw.get("state") == "done" else _Manifest).model_validate(raw)
+        if raw.get("state") == "done":
+            raw.setdefault("results_sha256", None)  # which only a run that is not finished may lack
+        return _Manifest.model_validate(raw)
     except ValidationError as error:
         key = str(error.errors()[0]["loc"][0])
         cure = f"Remove {folder} and optimise again."
@@ -128,12 +127,9 @@ def input_digests(files: Mapping[str, Path]) -> dict[str, str]:
 
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a run folder, and remove the temporary files of a killed one.
+    """Keep other processes out of a run folder (made if missing), and remove the temporary files of a killed one.
 
     The system unlocks the folder when this process ends, however it ends.
-
-    Args:
-        folder: the run folder; made if missing.
 
     Raises:
         InputError: another process works in the folder, or the system refuses it.
@@ -165,7 +161,7 @@ def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Se
     Args:
         folder: the run folder; made if missing.
         spec: the spec.
-        inputs: digests of the files the spec names, by key.
+        inputs: digests of the files that the spec names, by key.
         overrides: changes that led to the spec, "table.key=value", for the record.
 
     Yields:
@@ -205,13 +201,7 @@ def begin_run(run: Run) -> None:
 
 
 def finish_run(run: Run, results: Sequence[str], depths_m: Sequence[float] = ()) -> None:
-    """Record the digests of all results and mark a claimed run done; the checkpoint is no longer needed.
-
-    Args:
-        run: the run.
-        results: names of all files.
-        depths_m: depths of the etches, mask 0 first, where the run was to choose them.
-    """
+    """Mark a claimed run done, with its files and, where it was to choose them, the depths of the etches, metres."""
     chosen = {_DEPTHS: list(depths_m)} if run.spec.process.chooses_depths else {}
     digests = {name: sha256_file(run.path(name)) for name in sorted(results)}
     _write_manifest(run, "done", {**chosen, "results_sha256": digests})
@@ -235,7 +225,7 @@ def open_run(folder: Path) -> Run:
     if spec_digest(spec) != manifest.spec_sha256:
         cure = "Restore it, or optimise the changed spec into a folder of its own."
         raise InputError(str(path), "must be the spec of this run", "a file that was changed since", cure)
-    if not isinstance(manifest, _FinishedManifest):
+    if manifest.state != "done":
         cure = "Resume it with the same command."
         raise InputError(str(folder), "the run must be finished", "an unfinished run", cure)
     if manifest.format == TRAINING and LEVEL_MAP not in manifest.results_sha256:  # trained behind a plain lens
@@ -252,12 +242,9 @@ def open_run(folder: Path) -> Run:
 
 
 def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:
-    """Return the spec of a finished run with overrides of values that its DOE does not depend on.
+    """Return the spec of a finished run with overrides, "table.key=value", that its DOE does not depend on.
 
-    Args:
-        run: a finished run.
-        overrides: changes, "table.key=value".
-        free: tables that may be changed; of the sensor, only its response to light.
+    Those of the `free` tables may be changed; of the sensor, only its response to light.
 
     Raises:
         InputError: an override that breaks a rule, or of something else.

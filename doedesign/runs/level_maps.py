@@ -23,13 +23,7 @@ from fab.units import NM, format_length
 
 
 class Drawing(NamedTuple):
-    """Level map to order masks for, and its source.
-
-    Attributes:
-        level_map: the level map.
-        origin: entry of an order's manifest on its source.
-        design: the design, if the source is a run.
-    """
+    """Level map to order masks for, the entry of an order's manifest on its source, and its design if it has one."""
 
     level_map: LevelMap
     origin: dict[str, Any]
@@ -203,11 +197,7 @@ def drawing_from(
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
-    """Return the level numbers ``[y, x]`` that the combined GDS file of a mask order draws.
-
-    Args:
-        folder: the mask order.
-        level_map: the level map that it should draw.
+    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws.
 
     Raises:
         InputError: no mask order, a broken file, or a drawing on another raster or with other levels.

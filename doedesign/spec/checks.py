@@ -23,60 +23,11 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
-    rules = (
-        _materials,
-        _colours,
-        _aperture,
-        _opening,
-        _sensor,
-        _efficiencies,
-        _mosaic,
-        _depth_order,
-        _source_sampling,
-        _fresnel_sampling,
-        _objectives,
-        lambda spec: process_problems(spec.process),
-        _wafer,
-        _limits,
-        lambda spec: training_problems(spec.network, spec.train, len(spec.optics.colours)),
-    )
+    rules = (_light, _doe, _sensor, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
     return [problem for rule in rules for problem in rule(spec)]
 
 
-def _opening(spec: Spec) -> Iterator[InputError]:
-    overlap, aperture = spec.process.chrome_overlap_m, spec.doe.aperture_m
-    if aperture - 2 * overlap < 2 * spec.doe.pitch_m:
-        rule = f"twice the overlap must leave an opening in an aperture of {format_length(aperture)}"
-        yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
-
-
-def _sensor(spec: Spec) -> Iterator[InputError]:
-    focal, defocus = spec.optics.focal_length_m, spec.sensor.defocus_m
-    if defocus <= -focal / 2:
-        rule = f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens"
-        yield InputError("sensor.defocus", rule, format_length(defocus), "Choose a smaller defocus.")
-
-
-def _efficiencies(spec: Spec) -> Iterator[InputError]:
-    count, colours = len(spec.sensor.quantum_efficiency), len(spec.optics.colours)
-    if count not in (0, 1, colours):
-        rule = f"must be one number or one per colour, {colours} here"
-        yield InputError("sensor.quantum_efficiency", rule, f"{count}", "Add or remove numbers.")
-
-
-def _mosaic(spec: Spec) -> Iterator[InputError]:
-    means = [sum(map(operator.mul, c.wavelengths_m, c.weights)) for c in spec.optics.colours]
-    if spec.sensor.bayer and not (len(means) == 3 and means[0] > means[1] > means[2]):
-        rule = "a mosaic needs three colours, from the longest wavelength to the shortest"
-        got = ", ".join(colour.name for colour in spec.optics.colours)
-        yield InputError("sensor.bayer", rule, got, "State the colours as red, green, blue, or leave `bayer` out.")
-
-
-def _shortest_m(spec: Spec) -> float:
-    return min(wavelength_m for colour in spec.optics.colours for wavelength_m in colour.wavelengths_m)
-
-
-def _materials(spec: Spec) -> Iterator[InputError]:
+def _light(spec: Spec) -> Iterator[InputError]:
     named = [("optics.design_wavelength", spec.optics.design_wavelength_m)]
     for index, colour in enumerate(spec.optics.colours):
         named += [(f"optics.colours[{index}].wavelengths", wavelength_m) for wavelength_m in colour.wavelengths_m]
@@ -85,9 +36,6 @@ def _materials(spec: Spec) -> Iterator[InputError]:
             refractive_index(spec.doe.material, wavelength_m)
         except InputError as error:
             yield InputError(key, f"{error.rule} ({spec.doe.material})", str(error.got), error.cure)
-
-
-def _colours(spec: Spec) -> Iterator[InputError]:
     names = [colour.name for colour in spec.optics.colours]
     for index, name in enumerate(names):
         if name in names[:index]:
@@ -95,39 +43,58 @@ def _colours(spec: Spec) -> Iterator[InputError]:
             yield InputError(key, rule, f"{name!r} twice", "Rename or remove one of them.")
 
 
-def _aperture(spec: Spec) -> Iterator[InputError]:
-    doe = spec.doe
-    span_m = doe.samples * doe.pitch_m
+def _doe(spec: Spec) -> Iterator[InputError]:
+    doe, overlap = spec.doe, spec.process.chrome_overlap_m
+    span_m, aperture = doe.samples * doe.pitch_m, format_length(doe.aperture_m)
     # One part in a million of slack, for values that lie on the limit in decimal.
     if abs(doe.aperture_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
         span = format_length(span_m)
         rule = f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {span}"
         cure = f'Set aperture = "{span}" or samples = {max(2, round(doe.aperture_m / doe.pitch_m))}.'
-        yield InputError("doe.aperture", f"{rule} to within half a pitch", format_length(doe.aperture_m), cure)
+        yield InputError("doe.aperture", f"{rule} to within half a pitch", aperture, cure)
+    if doe.aperture_m - 2 * overlap < 2 * doe.pitch_m:
+        rule = f"twice the overlap must leave an opening in an aperture of {aperture}"
+        yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
 
 
-def _depth_order(spec: Spec) -> Iterator[InputError]:
-    near, far = spec.scene.near_m, spec.scene.far_m
+def _sensor(spec: Spec) -> Iterator[InputError]:
+    focal, sensor, colours = spec.optics.focal_length_m, spec.sensor, spec.optics.colours
+    if sensor.defocus_m <= -focal / 2:
+        rule = f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens"
+        yield InputError("sensor.defocus", rule, format_length(sensor.defocus_m), "Choose a smaller defocus.")
+    count = len(sensor.quantum_efficiency)
+    if count not in (0, 1, len(colours)):
+        rule = f"must be one number or one per colour, {len(colours)} here"
+        yield InputError("sensor.quantum_efficiency", rule, f"{count}", "Add or remove numbers.")
+    means = [sum(map(operator.mul, c.wavelengths_m, c.weights)) for c in colours]
+    if sensor.bayer and not (len(means) == 3 and means[0] > means[1] > means[2]):
+        rule = "a mosaic needs three colours, from the longest wavelength to the shortest"
+        got = ", ".join(colour.name for colour in colours)
+        yield InputError("sensor.bayer", rule, got, "State the colours as red, green, blue, or leave `bayer` out.")
+
+
+def _scene(spec: Spec) -> Iterator[InputError]:
+    near, far, least_m = spec.scene.near_m, spec.scene.far_m, _nyquist_length_m(spec)
     if near and max(near) >= min(far):
         got = f"{format_length(max(near))} near and {_depth_text(min(far))} far"
         rule = "every near depth must be smaller than every far depth"
         yield InputError("scene.near", rule, got, "Move the obstruction closer or the scene away.")
-
-
-def _nyquist_length_m(spec: Spec) -> float:
-    """Radius of the strongest wavefront curvature the cells can sample (paper eq. 6), at the shortest wavelength."""
-    return spec.doe.samples * spec.doe.pitch_m**2 / _shortest_m(spec)
-
-
-def _source_sampling(spec: Spec) -> Iterator[InputError]:
-    """Check that neighbouring cells see a source less than half a wave apart: the bound of eq. 6 for the depth."""
-    least_m = _nyquist_length_m(spec)
-    for key, depths in (("scene.near", spec.scene.near_m), ("scene.far", spec.scene.far_m)):
+    # Neighbouring cells must see a source less than half a wave apart: the bound of eq. 6 for the depth.
+    for key, depths in (("scene.near", near), ("scene.far", far)):
         if depths and min(depths) < least_m:
             rule = f"every depth must be at least samples x pitch^2 / wavelength = {_rounded(least_m)}, "
             rule += "or the cells cannot follow the wave of the source"
             cure = "Move the source away or choose a finer pitch for the same aperture."
             yield InputError(key, rule, format_length(min(depths)), cure)
+
+
+def _shortest_m(spec: Spec) -> float:
+    return min(wavelength_m for colour in spec.optics.colours for wavelength_m in colour.wavelengths_m)
+
+
+def _nyquist_length_m(spec: Spec) -> float:
+    """Radius of the strongest wavefront curvature the cells can sample (paper eq. 6), at the shortest wavelength."""
+    return spec.doe.samples * spec.doe.pitch_m**2 / _shortest_m(spec)
 
 
 def _rounded(length_m: float) -> str:
@@ -162,7 +129,8 @@ def _objectives(spec: Spec) -> Iterator[InputError]:
             yield InputError(f"objective[{index}].name", rule, "an empty scene.near", cure)
 
 
-def _wafer(spec: Spec) -> Iterator[InputError]:
+def _process(spec: Spec) -> Iterator[InputError]:
+    yield from process_problems(spec.process)
     process = spec.process.filled()
     die_m, radius_m = process.die_m or (0.0, 0.0), process.wafer_radius_m or math.inf
     reach_m = math.hypot(*die_m) + spec.doe.aperture_m / 2
@@ -183,9 +151,13 @@ def _limits(spec: Spec) -> Iterator[InputError]:
             yield InputError(f"limit[{index}].colour", rule, f'"{limit.colour}"', cure)
 
 
+def _training(spec: Spec) -> Iterator[InputError]:
+    yield from training_problems(spec.network, spec.train, len(spec.optics.colours))
+
+
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
-    rules = (_level_warning, _printing_warning, _sensor_warning, _reach_warning, _disc_warning, _limit_warnings)
+    rules = (_level_warning, _printing_warning, _window_warnings, _limit_warnings)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -208,34 +180,28 @@ def _level_warning(spec: Spec) -> Iterator[str]:
     )
 
 
-def _sensor_warning(spec: Spec) -> Iterator[str]:
-    sensor = spec.sensor
+def _window_warnings(spec: Spec) -> Iterator[str]:
+    sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m, spec.doe.pitch_m
     binned = min(sensor.resolution) // sensor.binning
     if sensor.window > binned:
         yield (
             f"sensor.window: {sensor.window} pixels are more than the {binned} binned pixels of the sensor's shorter "
             "side; PSFs will reach beyond the sensor."
         )
-
-
-def _reach_warning(spec: Spec) -> Iterator[str]:
-    wavelength_m, half_m = _shortest_m(spec), spec.sensor.window_m / 2
-    reach_m = spec.optics.focal_length_m * wavelength_m / (2 * spec.doe.pitch_m)
+    wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2
+    reach_m = focal_m * wavelength_m / (2 * pitch_m)
     if half_m > reach_m:
         yield (
-            f"sensor.window: it ends {half_m / UM:.0f} um from the axis, but cells of "
-            f"{format_length(spec.doe.pitch_m)} steer {format_length(wavelength_m)} only {reach_m / UM:.0f} um far; "
-            f"beyond that the PSF repeats. At most {int(2 * reach_m / spec.sensor.pixel_m)} pixels avoid it."
+            f"sensor.window: it ends {half_m / UM:.0f} um from the axis, but cells of {format_length(pitch_m)} steer "
+            f"{format_length(wavelength_m)} only {reach_m / UM:.0f} um far; "
+            f"beyond that the PSF repeats. At most {int(2 * reach_m / sensor.pixel_m)} pixels avoid it."
         )
-
-
-def _disc_warning(spec: Spec) -> Iterator[str]:
     depth_m = min(spec.scene.near_m, default=math.inf)
-    disc_m = spec.doe.aperture_m * spec.optics.focal_length_m / depth_m
-    if disc_m > spec.sensor.window_m:
+    disc_m = spec.doe.aperture_m * focal_m / depth_m
+    if disc_m > sensor.window_m:
         yield (
             f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
-            f"more than the window's {_rounded(spec.sensor.window_m)}; its rim is cut off."
+            f"more than the window's {_rounded(sensor.window_m)}; its rim is cut off."
         )
 
 

@@ -85,31 +85,28 @@ def quantity_of(error: Deviation, low: float, high: float) -> Any:
     return Annotated[float, of_unit(low, high)]
 
 
-def _for_plate(value_type: Any) -> Any:
+def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:
+    """Type of the spread of an error: values for the whole plate, or one for all masks or a list of one per mask."""
+
     def refuse_list(value: Any) -> Any:
         if isinstance(value, list | tuple):
             raise broken("must be one value, for it concerns the whole plate", "Remove the brackets.")
         return value
 
-    return Annotated[value_type, BeforeValidator(refuse_list)]
+    def part(low: float) -> Any:
+        of_one = quantity_of(error, low, error.largest)
+        if not error.per_mask:
+            return Annotated[of_one, BeforeValidator(refuse_list)]
+        of_each: Any = tuple[of_one, ...]
+        one, each = TypeAdapter(of_one), TypeAdapter(of_each)
 
+        def validate(value: Any, info: ValidationInfo) -> float | tuple[float, ...]:
+            return (each if isinstance(value, list | tuple) else one).validate_python(value, context=info.context)
 
-def _for_masks(value_type: Any) -> Any:
-    """Return the type of one value for all masks or a list of one per mask."""
-    list_type: Any = tuple[value_type, ...]
-    one, each = TypeAdapter(value_type), TypeAdapter(list_type)
+        # Any, because a serialiser would be wary of a union.
+        return Annotated[Any, PlainValidator(validate)]
 
-    def validate(value: Any, info: ValidationInfo) -> float | tuple[float, ...]:
-        adapter = each if isinstance(value, list | tuple) else one
-        return adapter.validate_python(value, context=info.context)
-
-    return Annotated[Any, PlainValidator(validate)]
-
-
-def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:
-    of = _for_masks if error.per_mask else _for_plate
-    mean = of(quantity_of(error, 0.0 if error.one_sided else -error.largest, error.largest))
-    sigma = of(quantity_of(error, 0.0, error.largest))
+    mean, sigma = part(0.0 if error.one_sided else -error.largest), part(0.0)
     fields: dict[str, Any] = {"mean": (mean, optional(0.0)), "sigma": (sigma, optional(0.0))}
     model = create_model(f"_spread_of_{name}", __base__=SpreadSpec, __module__=__name__, **fields)
     globals()[model.__name__] = model  # a spec is found again by its classes' names where it is sent to another process
@@ -180,7 +177,7 @@ class ProcessSpec(SpecTable, frozen=True):
 
     levels: Annotated[int, Field(strict=True), AfterValidator(_level_count)] = Field(examples=["16"])
     level_step_m: Annotated[float, length(0.1 * NM, 100 * UM)] = Field(examples=['"75 nm"'])
-    # Any, as in `_for_masks`, because a serialiser would be wary of a union.
+    # Any, because a serialiser would be wary of a union.
     etch_depths_m: Annotated[Any, PlainValidator(_etch_depths)] = optional()
     chrome_overlap_m: Annotated[float, length(0.0, 1 * MM)] = 5e-6
     stock: Annotated[str, known("process", STOCK)] | None = optional()
