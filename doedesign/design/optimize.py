@@ -81,7 +81,7 @@ def initial_state(
             rule = "the start of a radial design must be a raster of rings one cell wide"
             cure = 'Use parametrization = "freeform", or another start.'
             raise InputError(str(path), rule, "a map with other structure", cure)
-    parameters = first_parameters(spec, jnp.asarray(problem.parametrization.radians_of(heights)))
+    parameters: Any = first_parameters(spec, jnp.asarray(problem.parametrization.radians_of(heights)))
     return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0)
 
 
@@ -102,7 +102,7 @@ def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
     """
     optimiser = optimiser_of(spec)
 
-    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Parameters, optax.OptState]) -> Any:
+    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
         parameters, adam = state
         (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(parameters, *inputs)
         updates, adam = optimiser.update(gradient, adam)

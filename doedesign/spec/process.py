@@ -155,7 +155,7 @@ def _level_count(count: int) -> int:
 
 
 class ProcessSpec(SpecTable, frozen=True):
-    """What the fab lab makes, and how well.
+    """Levels that the fab lab makes, and how well.
 
     Attributes:
         levels: number of heights L, a power of two.

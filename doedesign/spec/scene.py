@@ -1,4 +1,4 @@
-"""What the camera looks at and what it records: the tables [scene], [sensor] and [obstruction].
+"""Scene, sensor and obstruction: the tables [scene], [sensor] and [obstruction].
 
 What only `simulate` and `train` need may be left out; a spec without it stays what it was. The occlusion model has no
 default, so that nobody uses one unawares: those two commands ask for it.
@@ -59,7 +59,7 @@ class SceneSpec(SpecTable, frozen=True):
 
 
 class ObstructionSpec(SpecTable, frozen=True):
-    """What stands before the scene.
+    """Obstruction in front of the scene.
 
     Attributes:
         kind: one of `OBSTRUCTION_KINDS`.
