@@ -88,7 +88,7 @@ class Calibration:
         return {name: value_text(name, float(value), float(sigma)) for name, value, sigma in values}
 
     def __str__(self) -> str:
-        """What was found, a line per error."""
+        """The estimates, a line per error."""
         labels = {error_label(name): name for name in self.estimates}
         wide = max(map(len, labels))
         lines = [f"{self.posterior.chi2_per_pixel:.4g} chi2 per pixel after {self.models} plates"]
@@ -145,7 +145,7 @@ def calibrate(
     """
     design = open_design(design, masks)
     prior = design.process(process)
-    unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # mistakes are told before files are read
+    unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read
     if not isinstance(measurement, Measurement):
         measurement = read_measurement(Path(measurement), design.camera)
     writing = contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder)

@@ -248,7 +248,7 @@ class _ScoredModel:
         return None
 
     def explanation(self, scores: Mapping[str, float]) -> Explanation:
-        """What scores at which the ratio is met amount to."""
+        """The explanation by scores at which the ratio is met."""
         row, wanted = self.row(scores), self.targets.throughput
         assert row is not None  # it is one that was computed
         return Explanation(

@@ -2,7 +2,7 @@
 
 calibration.json        everything that was found
 process-estimate.toml   the estimate, which every command takes as a process
-plate.toml              the errors of this DOE, which `psf --fabricated --variation` reads
+plate.toml              the errors of this DOE, which the prediction of a DOE with given errors reads
 explanations.json/.txt  errors that would give a measured ring:disc ratio
 """
 

@@ -26,6 +26,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
 
+Image = Float[np.ndarray, "y x"]
 Motion = Float[np.ndarray, "3"]  # of an image: shifts along y and x in pixels, defocus in 1/m
 
 
@@ -37,12 +38,7 @@ class VariedDoe(NamedTuple):
 
 
 class _MovedColumns(NamedTuple):
-    """A source that is moved: the rows are its waves and the rows' places, in cells from the middle.
-
-    Attributes:
-        axis: columns' places.
-        motion: tilt along y and x, waves per cell, and curvature, waves per cell².
-    """
+    """A moved source: tilt along y and x in waves per cell, curvature in waves per cell²; places in cells."""
 
     axis: Float[Array, " x"]
     motion: Float[Array, "3"]
@@ -54,21 +50,13 @@ class _MovedColumns(NamedTuple):
 
 
 class _Optic(eqx.Module):
-    """One depth: its plan and source, and what a motion means in waves per cell.
-
-    Attributes:
-        plan: transform to the sensor.
-        source_waves: `[y, x]` wave of the source.
-        axis: cells from the middle.
-        rates: waves per cell and unit of motion (twice) and per cell² (defocus).
-        factor: Fresnel transmission.
-    """
+    """One depth: transform to the sensor, wave of the source, and what a motion means in waves per cell."""
 
     plan: FarField
     source_waves: Float[Array, "y x"]
-    axis: Float[Array, " x"]
-    rates: Float[Array, "3"]
-    factor: float = eqx.field(static=True)
+    axis: Float[Array, " x"]  # cells from the middle
+    rates: Float[Array, "3"]  # waves per cell and unit of motion (twice) and per cell² (defocus)
+    factor: float = eqx.field(static=True)  # Fresnel transmission
 
 
 @eqx.filter_jit
@@ -141,19 +129,17 @@ class DoeImages:
     plate: VariedDoe
     grid: Grid
 
-    def image(self, index: int, motion: Motion) -> Float[np.ndarray, "y x"]:
+    def image(self, index: int, motion: Motion) -> Image:
         """Energy in every pixel of an image, per unit power on the clear aperture, Fresnel loss included."""
         optic = self.model.optic(index, self.grid)
         return np.asarray(_energy(optic, self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
 
-    def image_and_vjp(
-        self, index: int, motion: Motion
-    ) -> tuple[Float[np.ndarray, "y x"], Callable[[Float[np.ndarray, "y x"]], tuple[VariedDoe, Motion]]]:
+    def image_and_vjp(self, index: int, motion: Motion) -> tuple[Image, Callable[[Image], tuple[VariedDoe, Motion]]]:
         """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
         energy = partial(_energy, self.model.optic(index, self.grid))
         image, pull = jax.vjp(energy, self.plate, jnp.asarray(motion, jnp.float32))
 
-        def back(gradient: Float[np.ndarray, "y x"]) -> tuple[VariedDoe, Motion]:
+        def back(gradient: Image) -> tuple[VariedDoe, Motion]:
             to_plate, to_motion = pull(jnp.asarray(gradient, jnp.float32))
             return to_plate, np.asarray(to_motion, np.float64)
 

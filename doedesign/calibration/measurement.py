@@ -1,4 +1,4 @@
-"""What was measured: a TOML file that names the images of a point source and says how they were taken.
+"""Measurements: a TOML file that names the images of a point source and says how they were taken.
 
     probe = "520 nm"            # wavelength of the source
     pixel = "1.85 um"           # pixel pitch of the images

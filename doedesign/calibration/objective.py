@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.forward_model import DoeImages, ForwardModel, Motion, VariedDoe
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, Image, Motion, VariedDoe
 from doedesign.calibration.target import Match, Target, match
 from doedesign.calibration.unknowns import Unknowns
 
@@ -28,7 +28,7 @@ WIDEST_STEP, _NARROWEST_STEP = 0.05, 0.004  # scores, for central differences
 _MOST_THREADS = 8  # each holds a fabricated DOE, 0.3 GB for 2400 x 2400 cells
 
 Scores = Float[np.ndarray, " s"]
-Weights = tuple[Float[np.ndarray, "y x"], ...]
+Weights = tuple[Image, ...]
 OnModel = Callable[[str], None]
 
 
@@ -46,7 +46,7 @@ class FitObjective:
 
     @property
     def errors(self) -> int:
-        """Number of errors looked for; the scores after them are motions."""
+        """Number of errors; the scores after them are motions."""
         return len(self.unknowns.names)
 
     @property
@@ -122,14 +122,7 @@ class Jacobian(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """The model linearised at some scores.
-
-    Attributes:
-        at: the model there.
-        jacobian: its derivatives.
-        hessians: `[image]` half the Gauss-Newton Hessian of each image's chi2.
-        descents: `[image]` half the negative gradient of each image's chi2.
-    """
+    """The model linearised at some scores: half the Gauss-Newton Hessian and negative gradient of each image's chi2."""
 
     at: Evaluation
     jacobian: Jacobian
@@ -185,10 +178,7 @@ def difference_steps(sigma: Scores) -> Scores:
 
 
 def difference_jacobian(at: Evaluation, steps: Scores, on_model: OnModel = lambda _: None) -> Jacobian:
-    """Derivatives of all images with respect to all scores, by central differences of `steps` scores.
-
-    `on_model` is called after every error.
-    """
+    """Derivatives with respect to all scores by central differences; `on_model` is called after every error."""
     objective, scores, unknowns = at.objective, at.scores, at.objective.unknowns
     columns = tuple(np.zeros((len(scores), *found.model.shape)) for found in at.matches)
     zeroth = np.zeros(len(scores))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.fft import irfft2, rfft2
 from scipy.ndimage import gaussian_filter
 
+from doedesign.calibration.forward_model import Image
 from fab.errors import InputError
 from sim.measured import MeasuredPsf, cut_window, parabola_vertex, smoothed
 
@@ -20,7 +21,7 @@ class MeasuredImage(NamedTuple):
     """A measured image as it came.
 
     Attributes:
-        name: what it is called.
+        name: its name.
         depth_m: depth of the point source.
         psf: the whole merged frame.
         centre: row and column about which its light lies.
@@ -82,11 +83,11 @@ class Match(NamedTuple):
     """
 
     target: Target
-    weights: Float[np.ndarray, "y x"]
-    model: Float[np.ndarray, "y x"]
+    weights: Image
+    model: Image
     gain: float
     background: float
-    residual: Float[np.ndarray, "y x"]
+    residual: Image
     chi2: float
 
     @property
@@ -100,10 +101,7 @@ class Match(NamedTuple):
         return np.append(pixels, (self.gain - 1.0) / sigma) if sigma else pixels
 
     def residual_jacobian(self, columns: Float[np.ndarray, "p y x"]) -> Float[np.ndarray, "p n"]:
-        """Derivatives of `residuals` from those of the model's image, gain and background solved for.
-
-        After Kaufman, BIT 15, 49 (1975).
-        """
+        """Derivatives of `residuals`, gain and background solved for (Kaufman, BIT 15, 49, 1975)."""
         root, sigma = np.sqrt(self.weights).ravel(), self.target.gain_sigma
         flat = self.gain * columns.reshape(len(columns), -1) * root
         basis = np.stack([self.model.ravel(), np.ones(root.size)]) * root
@@ -115,7 +113,7 @@ class Match(NamedTuple):
         return np.column_stack([pixels, -shares[0] / sigma]) if sigma else pixels
 
 
-def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Match:
+def match(target: Target, weights: Image, model: Image) -> Match:
     """Best gain and background, and what is left."""
     rate, total, sigma = target.psf.rate, weights.sum(), target.gain_sigma
     mean_model, mean_rate = (float((weights * v).sum() / total) for v in (model, rate))
@@ -129,13 +127,8 @@ def match(target: Target, weights: Float[np.ndarray, "y x"], model: Float[np.nda
     return Match(target, weights, model, gain, background, residual, chi2)
 
 
-def target_of(image: MeasuredImage, window: int, model: Float[np.ndarray, "y x"]) -> Target:
-    """Cut an image to the window and find its centre by comparison with a model.
-
-    Args:
-        image: the image.
-        window: pixels per side.
-        model: `[y, x]` what the image should look like, centred.
+def target_of(image: MeasuredImage, window: int, model: Image) -> Target:
+    """Cut an image to a window, pixels per side, and find its centre by comparison with a centred model of it.
 
     Raises:
         InputError: the image is smaller than the window, or its middle is no light at all.
@@ -168,7 +161,7 @@ def _window(image: MeasuredImage, centre: tuple[float, float], window: int) -> t
     return psf, rest
 
 
-def _correlation(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "v u"]:
+def _correlation(image: Image, model: Image) -> Float[np.ndarray, "v u"]:
     """Correlation of the roots of two intensities for every shift of the first, normalised, in FFT order.
 
     The model is blurred like the image (`sim.measured.smoothed`).
@@ -181,7 +174,7 @@ def _correlation(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"
     return np.asarray(irfft2(ahead * behind.conj(), size)) / max(norm, np.finfo(float).tiny)
 
 
-def _shift_px(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) -> tuple[float, float]:
+def _shift_px(image: Image, model: Image) -> tuple[float, float]:
     """By how many pixels (y, x) an image lies off a model: the peak of their correlation."""
     likeness = _correlation(image, model)
     row, column = (int(i) for i in np.unravel_index(np.argmax(likeness), likeness.shape))
@@ -192,7 +185,7 @@ def _shift_px(image: Float[np.ndarray, "y x"], model: Float[np.ndarray, "y x"]) 
     return place(likeness[:, column], row), place(likeness[row], column)
 
 
-def likeness(target: Target, model: Float[np.ndarray, "y x"], quarter_turns: int, mirrored: bool) -> float:
+def likeness(target: Target, model: Image, quarter_turns: int, mirrored: bool) -> float:
     """How much an image, turned to the left after it was mirrored left to right, looks like a model: 1 if equal."""
     picture = smoothed(target.psf)
     # Rows count upwards, so numpy's turn to the left is one to the right.
@@ -200,7 +193,7 @@ def likeness(target: Target, model: Float[np.ndarray, "y x"], quarter_turns: int
     return float(_correlation(turned, model).max())
 
 
-def measured_weights(target: Target, model_error: float) -> Float[np.ndarray, "y x"]:
+def measured_weights(target: Target, model_error: float) -> Image:
     """Inverse variances with the signal taken from the measurement itself, smoothed a little against its noise."""
     valid = target.psf.valid.astype(np.float64)
     light = gaussian_filter(np.maximum(target.psf.rate, 0.0) * valid, 0.7)
@@ -208,16 +201,10 @@ def measured_weights(target: Target, model_error: float) -> Float[np.ndarray, "y
     return weights_at(target, light / np.maximum(gaussian_filter(valid, 0.7), 1e-3), model_error)
 
 
-def weights_at(
-    target: Target, signal: Float[np.ndarray, "y x"], model_error: float, background: float = 0.0
-) -> Float[np.ndarray, "y x"]:
-    """Inverse variances where the light is `signal`; zero where a pixel says nothing.
+def weights_at(target: Target, signal: Image, model_error: float, background: float = 0.0) -> Image:
+    """Inverse variances where light `signal` lies on a background that the model does not make; zero where not valid.
 
-    Args:
-        target: the image.
-        signal: light of the plate, in the target's units.
-        model_error: relative error that the model expects of itself.
-        background: further light, which the model does not make.
+    `model_error` is the relative error that the model expects of itself.
     """
     # What the transform gets wrong at a bright pixel it gets wrong beside it, too.
     nearby = gaussian_filter(signal**2, 1.0)

@@ -1,4 +1,4 @@
-"""How well the errors are known after a fit, and whether the fit is to be believed.
+"""Uncertainty of the errors after a fit, and checks of the fit.
 
 The posterior is normal round the best scores: its precision is the Gauss-Newton Hessian of the images' chi2 plus that
 of the prior. Nothing more is claimed than the images bear out:
@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.calibration.forward_model import Image
 from doedesign.calibration.objective import Linearization, Scores
 from doedesign.calibration.target import match
 from fab.grid import Grid
@@ -107,14 +108,12 @@ def _scatter(fit: Linearization) -> Float[np.ndarray, "s s"]:
 
 
 def left_out(fit: Linearization) -> list[float]:
-    """Chi2 per pixel of every image predicted from the others: one Gauss-Newton step on their part of the objective.
-
-    Its own motion, gain and background stay what they were, for they are the image's and not the DOE's.
-    """
+    """Chi2 per pixel of every image predicted from the others: one Gauss-Newton step on their part of the objective."""
     objective, at, out = fit.at.objective, fit.at, []
     for i, found in enumerate(at.matches):
         step = np.linalg.solve(fit.half_hessian - fit.hessians[i], sum(fit.descents, -at.scores) - fit.descents[i])
         scores = at.scores.copy()
+        # The image's own motion stays what it was.
         scores[: objective.errors] += step[: objective.errors]
         image = objective.model.plate(objective.values(scores)).image(i, objective.motion(scores, i))
         out.append(match(found.target, found.weights, image).chi2_per_pixel)
@@ -138,7 +137,7 @@ class Reading(NamedTuple):
 
 
 def readings(fit: Linearization, posterior: Posterior) -> list[Reading]:
-    """What a lab reads off every image, and the DOE's zeroth order.
+    """Numbers that a lab reads off every image, and the DOE's zeroth order.
 
     Unusable pixels are taken from the model. Ring and disc are told apart as in `sim.metrics.ring_to_disc`, the spot as
     in `sim.metrics.spot_radius_m`, about where the fit finds the chief ray.
@@ -171,9 +170,7 @@ def readings(fit: Linearization, posterior: Posterior) -> list[Reading]:
     return [*out, Reading("plate", "zeroth_order", None, order)]
 
 
-def _ratio(
-    inner: Float[np.ndarray, "y x"], light: Float[np.ndarray, "y x"], near: bool
-) -> tuple[float, Float[np.ndarray, "y x"]]:
+def _ratio(inner: Image, light: Image, near: bool) -> tuple[float, Image]:
     """Ring:disc ratio or share in the spot, and its derivative with respect to every pixel."""
     inside, total = float((inner * light).sum()), float(light.sum())
     if near:

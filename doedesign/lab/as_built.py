@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from doedesign.lab.predictions import grating_orders, predicted_metrics
-from fab.process import Process, Variation, error_names, variation_of
+from fab.process import Normal, Process, Variation, error_names, variation_of
 from fab.runsheet.as_built import AsBuilt, MaskMeasured
 from fab.runsheet.tables import PredictedMetrics
 from fab.units import NM
 
+COMPARED = ("strehl", "zeroth_order", "throughput", "ring_to_disc", "far_spot")
 _ROUNDS = 20
-_PARTS = {"depth_scale": "common_depth_scale", "cd_bias_m": "common_cd_bias_m"}
-_COMPARED = ("strehl", "zeroth_order", "throughput", "ring_to_disc", "far_spot")
+_COMMON = ("common_depth_scale", "common_cd_bias_m")
 
 
 class ErrorValue(NamedTuple):
@@ -47,19 +47,14 @@ class AsBuiltDoe(NamedTuple):
     lag_per_nm: float | None
 
 
-class _Lag(NamedTuple):
-    """Etch lag, the depths of wide openings by mask, and how fast the lag follows an error of a depth, 1 / m."""
-
-    lag: float
-    depths_m: dict[int, float]
-    per_m: float | None
-
-
-def _fitted(masks: Sequence[MaskMeasured], lag: float) -> _Lag:
-    """Find depths and etch lag by least squares over all pads of all masks; a lag is never negative.
+def _fitted(masks: Sequence[MaskMeasured], lag: float) -> tuple[float, dict[int, float], float | None]:
+    """Find etch lag and depths by least squares over all pads of all masks; a lag is never negative.
 
     A pad of width w is D (1 - lag D / w) deep, with a depth D of each mask; `lag` is taken where no mask has pads of
     two widths.
+
+    Returns:
+        the lag, the depths of wide openings by mask, and how fast the lag follows an error of a depth, 1/m.
     """
     pads = {k: [(1 / w, depth) for w, depth in mask.depths_m] for k, mask in enumerate(masks) if mask.depths_m}
     depths = {k: max(depth for _, depth in found) for k, found in pads.items()}
@@ -74,43 +69,26 @@ def _fitted(masks: Sequence[MaskMeasured], lag: float) -> _Lag:
             lag, per_m = max(0.0, fall / square), 1 / math.sqrt(square)
         for k, found in pads.items():
             depths[k] = math.fsum(d + lag * x for (_, d), x in zip(found, factors[k], strict=True)) / len(found)
-    return _Lag(lag, depths, per_m)
+    return lag, depths, per_m
 
 
-def _mean(process: Process, name: str) -> float:
-    spread = process.spreads.get(name)
-    return 0.0 if spread is None else spread.mean
-
-
-def _assumed(process: Process) -> dict[str, float]:
-    """Return every error at its mean, the common parts counted with the mask's own."""
-    found = {name: _mean(process, name) for name in error_names(process.masks)}
-    for mask in range(process.masks):
-        scale, bias = f"depth_scale[{mask}]", f"cd_bias_m[{mask}]"
-        found[scale] = (1 + found["common_depth_scale"]) * (1 + found[scale]) - 1
-        found[bias] += found["common_cd_bias_m"]
-    return found | dict.fromkeys(_PARTS.values(), 0.0)
-
-
-def _depth_share_at_die(process: Process) -> float:
-    """Return the depth at the die over that in the middle of the wafer, with the process's mean non-uniformity."""
-    y, x = (at / process.wafer_radius_m for at in process.die_m)
-    tilt = _mean(process, "linear_nonuniformity_y") * y + _mean(process, "linear_nonuniformity_x") * x
-    return 1 + _mean(process, "radial_nonuniformity") * (y * y + x * x) + tilt
-
-
-def _mask_errors(process: Process, bit: int, mask: MaskMeasured, depth_m: float | None) -> dict[str, float]:
-    """Return what was measured of one mask as errors by flat name."""
+def _mask_errors(
+    process: Process, mean: Mapping[str, float], bit: int, mask: MaskMeasured, depth_m: float | None
+) -> dict[str, float]:
+    """Measured numbers of one mask as errors by flat name, given the process's means."""
     found = {}
     times = 1 if mask.times_etched is None else mask.times_etched
     if depth_m is not None and times:
-        due_m = times * process.depths_m()[bit] * _depth_share_at_die(process)
-        found[f"depth_scale[{bit}]"] = depth_m / due_m - 1
+        # The die is etched as deep as the process's mean non-uniformity has it there.
+        y, x = (at / process.wafer_radius_m for at in process.die_m)
+        tilt = mean["linear_nonuniformity_y"] * y + mean["linear_nonuniformity_x"] * x
+        share = 1 + mean["radial_nonuniformity"] * (y * y + x * x) + tilt
+        found[f"depth_scale[{bit}]"] = depth_m / (times * process.depths_m()[bit] * share) - 1
     if mask.edges_m is not None:
         found[f"cd_bias_m[{bit}]"] = mask.edges_m
     # The verniers stand at the die; an overlay is that of the middle of the wafer.
     y, x = process.die_m
-    turn, growth = _mean(process, f"rotation_rad[{bit}]"), _mean(process, f"magnification[{bit}]")
+    turn, growth = mean[f"rotation_rad[{bit}]"], mean[f"magnification[{bit}]"]
     if mask.overlay_y_m is not None:
         found[f"overlay_y_m[{bit}]"] = mask.overlay_y_m - growth * y - turn * x
     if mask.overlay_x_m is not None:
@@ -124,11 +102,15 @@ def as_built_doe(measured: AsBuilt, process: Process) -> AsBuiltDoe:
     Depths and line widths of all masks are whole, the common parts are 0. Edges that were moved on the mask count with
     the line width.
     """
-    values = _assumed(process)
-    fit = _fitted(measured.masks, _mean(process, "etch_lag"))
-    found = {} if fit.per_m is None else {"etch_lag": fit.lag}
+    mean = {name: process.spreads.get(name, Normal()).mean for name in error_names(process.masks)}
+    values = mean | dict.fromkeys(_COMMON, 0.0)
+    lag, depths_m, per_m = _fitted(measured.masks, mean["etch_lag"])
+    found = {} if per_m is None else {"etch_lag": lag}
     for bit, mask in enumerate(measured.masks):
-        found |= _mask_errors(process, bit, mask, fit.depths_m.get(bit))
+        # The common parts count with the mask's own.
+        values[f"depth_scale[{bit}]"] = (1 + mean["common_depth_scale"]) * (1 + mean[f"depth_scale[{bit}]"]) - 1
+        values[f"cd_bias_m[{bit}]"] += mean["common_cd_bias_m"]
+        found |= _mask_errors(process, mean, bit, mask, depths_m.get(bit))
     plain = {
         "corner_radius_m": measured.corner_radius_m,
         "sidewall_rad": measured.sidewall_rad,
@@ -141,22 +123,19 @@ def as_built_doe(measured: AsBuilt, process: Process) -> AsBuiltDoe:
     for bit, mask in enumerate(measured.masks):
         values[f"cd_bias_m[{bit}]"] += mask.edge_move_m
     repeats = tuple(0 if mask.times_etched is None else mask.times_etched - 1 for mask in measured.masks)
-    taken = [
-        ErrorValue(name, values[name], "measured" if name in found else _unmeasured(values[name]))
-        for name in values
-        if name not in _PARTS.values()
-    ]
+    sources = {
+        name: "measured" if name in found else "process mean" if value else "not measured, taken as 0"
+        for name, value in values.items()
+        if name not in _COMMON
+    }
     given = {name: value for name, value in values.items() if value}
     variation = variation_of(process.masks, given, repeats=repeats if any(repeats) else ())
-    return AsBuiltDoe(variation, tuple(taken), None if fit.per_m is None else fit.per_m * NM)
-
-
-def _unmeasured(value: float) -> str:
-    return "process mean" if value else "not measured, taken as 0"
+    taken = tuple(ErrorValue(name, values[name], source) for name, source in sources.items())
+    return AsBuiltDoe(variation, taken, None if per_m is None else per_m * NM)
 
 
 def _of_sheet(predicted: Mapping[str, Any] | None, kind: str, now: PredictedMetrics) -> Mapping[str, Any]:
-    """Return what a sheet predicted for the same colour and depth; nothing if it did not."""
+    """Prediction of a sheet for the same colour and depth; nothing if it did not."""
     rows = (predicted or {}).get(kind)
     for row in rows if isinstance(rows, list) else []:
         if isinstance(row, Mapping) and row.get("colour") == now.colour and _same(row.get("depth_m"), now.depth_m):
@@ -184,12 +163,10 @@ def compare_with_sheet(rows: Sequence[dict[str, Any]], predicted: Mapping[str, A
     out = []
     for now in predicted_metrics(rows):
         before = {kind: _of_sheet(predicted, kind, now) for kind in ("as_drawn", "expected")}
-        for quantity in _COMPARED:
-            value = getattr(now, quantity)
-            if value is None:
-                continue
-            old = {kind: row.get(quantity) for kind, row in before.items()}
-            out.append({"colour": now.colour, "depth_m": now.depth_m, "quantity": quantity, **old, "as_built": value})
+        for quantity in COMPARED:
+            if (value := getattr(now, quantity)) is not None:
+                place = {"colour": now.colour, "depth_m": now.depth_m, "quantity": quantity}
+                out.append({**place, **{kind: row.get(quantity) for kind, row in before.items()}, "as_built": value})
     return out
 
 

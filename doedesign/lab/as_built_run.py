@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from doedesign.build import resolve_process
 from doedesign.design.design import Design
-from doedesign.lab.as_built import AsBuiltDoe, as_built_doe, compare_gratings, compare_with_sheet
+from doedesign.lab.as_built import COMPARED, AsBuiltDoe, as_built_doe, compare_gratings, compare_with_sheet
 from doedesign.prediction import Prediction, predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import open_design
@@ -20,16 +20,9 @@ from fab.figure import save
 from fab.files import canonical_json, sha256_file
 from fab.process import Process, deviation_of
 from fab.runsheet.as_built import AsBuilt, read_as_built
+from sim.metrics import METRICS
 from sim.plots.psfs import plot_psfs
 from sim.store import write_bank
-
-_TITLES = {
-    "strehl": "Strehl ratio",
-    "zeroth_order": "0th order",
-    "throughput": "throughput",
-    "ring_to_disc": "ring:disc",
-    "far_spot": "far spot",
-}
 
 log = logging.getLogger("doedesign")
 
@@ -90,8 +83,9 @@ def as_built(
         found = AsBuiltPrediction(doe, prediction, compare_with_sheet(prediction.rows, measured.predicted))
         if folder is not None:
             _write(folder, design, made_by, measured, found)
-    for line in _lines(found.comparison):
-        log.info(line)
+    for quantity in COMPARED:
+        if of := [row for row in found.comparison if row["quantity"] == quantity]:
+            log.info(_worst(quantity, of))
     return found
 
 
@@ -115,21 +109,10 @@ def _write(folder: Path, design: Design, process: Process, measured: AsBuilt, fo
     (folder / "variation.toml").write_text(variation_to_toml(doe.variation, head), encoding="utf-8")
 
 
-def _lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the worst row of every quantity in words."""
-    lines = []
-    for quantity, title in _TITLES.items():
-        of = [row for row in rows if row["quantity"] == quantity]
-        if not of:
-            continue
-        row = (max if quantity == "zeroth_order" else min)(of, key=lambda row: row["as_built"])
-        before = [
-            f"{row[kind]:.4g} {kind.replace('_', ' ')}" for kind in ("as_drawn", "expected") if _number(row[kind])
-        ]
-        said = f" (the sheet: {', '.join(before)})" if before else ""
-        lines.append(f"{title}, worst colour and depth: {row['as_built']:.4g}{said}")
-    return lines
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _worst(quantity: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """The worst row of a quantity in words."""
+    row = (max if METRICS[quantity].worse == "high" else min)(rows, key=lambda row: row["as_built"])
+    known = [kind for kind in ("as_drawn", "expected") if type(row[kind]) in (int, float)]  # a sheet may hold anything
+    words = ", ".join(f"{row[kind]:.4g} {kind.replace('_', ' ')}" for kind in known)
+    said = f" (the sheet: {words})" if words else ""
+    return f"{METRICS[quantity].label}, worst colour and depth: {row['as_built']:.4g}{said}"

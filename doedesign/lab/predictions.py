@@ -25,7 +25,6 @@ from fab.draws import EXPECTED, one_at_a_time_keys, variation_at
 from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
-from fab.levels import Levels
 from fab.process import Normal, Process, Variation, deviation_of
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
 from fab.sampling import varying
@@ -44,12 +43,11 @@ _PATCH = 256
 
 
 def predicted_metrics(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
-    """Return the rows of a prediction as a run sheet has them; a ratio without any light in the disc is left out."""
+    """Rows of a prediction as a run sheet has them; a ratio without any light in the disc is left out."""
     metrics = []
     for row in rows:
         ratio = row.get("ring_to_disc")
-        if ratio is not None and not math.isfinite(ratio):
-            ratio = None
+        ratio = ratio if ratio is not None and math.isfinite(ratio) else None
         shared = {name: row[name] for name in ("colour", "depth_m", "strehl", "zeroth_order", "throughput")}
         metrics.append(PredictedMetrics(**shared, ring_to_disc=ratio, far_spot=row.get("far_spot")))
     return tuple(metrics)
@@ -58,11 +56,11 @@ def predicted_metrics(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics,
 def grating_orders(
     depths_m: Sequence[float] | NDArray[np.floating], material: str, wavelength_m: float
 ) -> tuple[float, float]:
-    """Return the shares of the light that the binary and the blazed test grating send straight on.
+    """Shares of the light through an empty window that the binary and the blazed test grating send straight on.
 
-    They are shares of the light through an empty window. The deepest etch opens half of the binary grating: cos^2(phi /
-    2), where phi is an etch's phase at the vacuum wavelength (metres). All combinations of masks share the blazed one
-    alike: the product of cos^2(phi / 2) over all etches. `depths_m` is the depth of every mask's etch, metres.
+    The deepest etch opens half of the binary grating: cos^2(phi / 2), where phi is an etch's phase at the vacuum
+    wavelength (metres). All combinations of masks share the blazed one alike: the product of cos^2(phi / 2) over all
+    etches. `depths_m` is the depth of every mask's etch, metres.
     """
     waves = np.asarray(depths_m) * (refractive_index(material, wavelength_m) - 1) / wavelength_m
     orders = np.cos(np.pi * waves) ** 2
@@ -70,7 +68,7 @@ def grating_orders(
 
 
 def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera, Process]:
-    """Cut the middle of the right half out of a design, with the place on the wafer where it lies."""
+    """The middle of the right half of a design, its camera, and the process with the place where it lies."""
     ny, nx = design.level_map.level.shape
     side = min(_PATCH, ny, nx // 2)
     y0, x0 = (ny - side) // 2, min(nx - side, 3 * nx // 4 - side // 2)
@@ -82,12 +80,6 @@ def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera,
     level = np.ascontiguousarray(design.level_map.level[y0 : y0 + side, x0 : x0 + side])
     on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))
     return level, small, replace(process, die_m=die_m, wafer_radius_m=on_wafer)
-
-
-def _row(surface: FabricatedDoe, nominal: FabricatedDoe) -> dict[str, Any]:
-    """Strehl ratio and 0th order of a patch with one wavelength."""
-    found = {"strehl": float(strehl(surface, nominal)[0]), "zeroth_order": float(zeroth_order(surface)[0])}
-    return {"colour": "", "depth_m": None, **found}
 
 
 def rank_importance(design: Design, process: Process, wavelength_m: float) -> tuple[Importance, ...]:
@@ -108,13 +100,16 @@ def rank_importance(design: Design, process: Process, wavelength_m: float) -> tu
     keys = [EXPECTED, *one_at_a_time_keys(kept)]
     made = partial(as_fabricated, level, small, wavelengths_m=(wavelength_m,))
     nominal = made(Process(kept.levels), Variation())
-    draws = {key: [_row(made(there, variation_at(there, 0, side_m, key)), nominal)] for key in keys}
+    draws = {}
+    for key in keys:
+        surface = made(there, variation_at(there, 0, side_m, key))
+        found = {"strehl": float(strehl(surface, nominal)[0]), "zeroth_order": float(zeroth_order(surface)[0])}
+        draws[key] = [{"colour": "", "depth_m": None, **found}]
     variances: dict[str, dict[str, float]] = {"strehl": {}, "zeroth_order": {}}
-    for change in one_at_a_time(kept, sample_of(draws)):
-        if change.colour is None and change.quantity in variances:
-            of = variances[change.quantity]
-            name = _measured(change.error)
-            of[name] = of.get(name, 0.0) + change.variance
+    for effect in one_at_a_time(kept, sample_of(draws)):
+        if effect.colour is None:
+            of, name = variances[effect.quantity], _measured(effect.error)
+            of[name] = of.get(name, 0.0) + effect.variance
     totals = {quantity: sum(of.values()) or 1.0 for quantity, of in variances.items()}
     found = [
         Importance(name, variance / totals["strehl"], variances["zeroth_order"][name] / totals["zeroth_order"])
@@ -124,19 +119,12 @@ def rank_importance(design: Design, process: Process, wavelength_m: float) -> tu
 
 
 def _measured(error: str) -> str:
-    """Name what is measured to find an error: "overlay of mask 3", "depth of every mask"."""
+    """The number that is measured to find an error: "overlay of mask 3", "depth of every mask"."""
     key, bracket, mask = error.partition("[")
     name = deviation_of(error).measured
     if bracket:
         return f"{name} of mask {int(mask.removesuffix(']')) + 1}"
     return f"{name} of every mask" if key.startswith("common_") else name
-
-
-def _full_wave_m(levels: Levels, material: str) -> float | None:
-    try:
-        return full_wave_wavelength_m(material, levels.period_m)
-    except InputError:
-        return None  # the sheet says so
 
 
 class SheetPrediction(NamedTuple):
@@ -146,22 +134,18 @@ class SheetPrediction(NamedTuple):
     picture: bytes
 
 
-def _on_grid_of(plate: FabricatedDoe, nominal: FabricatedDoe, aperture_m: float) -> FabricatedDoe:
-    """Return a DOE as drawn on the raster of another, whose propagation is then compiled already."""
-    parts = plate.grid.shape[0] // nominal.grid.shape[0]
-    field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
-    coverage = jnp.asarray(circle_coverage(plate.grid, aperture_m))
-    return FabricatedDoe(plate.camera, coverage, field, field, nominal.wavelengths_m)
-
-
 def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
     """Predict the DOE as drawn (its rows) and the one with mean errors."""
-    variation = process.expected()
+    variation, camera = process.expected(), design.camera
     expected = predict(design, process, variation)
     if variation.nominal:
         return expected.rows, expected
-    nominal = as_fabricated(design.level_map.level, design.camera, process, Variation())
-    alike = _on_grid_of(expected.surface, nominal, design.camera.aperture_m)
+    nominal, grid = as_fabricated(design.level_map.level, camera, process, Variation()), expected.surface.grid
+    # On the raster of the other, whose propagation is compiled already.
+    parts = grid.shape[0] // nominal.grid.shape[0]
+    field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
+    coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
+    alike = FabricatedDoe(expected.surface.camera, coverage, field, field, nominal.wavelengths_m)
     return plate_rows(design, alike, psf(alike, depths=design.depths_m)), expected
 
 
@@ -187,6 +171,10 @@ def predict_sheet(
     """
     levels, material = design.levels, design.camera.material
     waves_per_m = (refractive_index(material, probe_m) - 1) / probe_m
+    try:
+        full_wave_m = full_wave_wavelength_m(material, levels.period_m)
+    except InputError:
+        full_wave_m = None  # the sheet says so
     moved = with_edge_moves(process, edge_moves_m)
     middle = len(design.near_m) // 2
     # All depths would take most of the time of a whole order, and say the same.
@@ -201,7 +189,7 @@ def predict_sheet(
         drawn=predicted_metrics(as_drawn),
         expected=predicted_metrics(expected.rows),
         design_m=design_m,
-        full_wave_m=_full_wave_m(levels, material),
+        full_wave_m=full_wave_m,
         probe_m=probe_m,
         probe_waves=levels.period_m * waves_per_m,
         gratings=tuple(

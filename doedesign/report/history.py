@@ -15,13 +15,10 @@ __all__ = ["plot_history", "plot_training"]
 
 
 def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None) -> "Axes":
-    """Draw the loss of an optimisation and its terms over the steps.
+    """Draw the loss of an optimisation and its terms over the steps, on `ax` or the axes of a new figure.
 
-    A long history is drawn faintly under its running mean, since every step sees another depth.
-
-    Args:
-        records: one per step with "step", "loss", "terms" (values, not weighted) and "names" (of the terms).
-        ax: axes to draw on; those of a new figure by default.
+    A long history is drawn faintly under its running mean, since every step sees another depth. A record per step has
+    "step", "loss", "terms" (values, not weighted) and "names" (of the terms).
 
     Raises:
         ValueError: no records.
@@ -52,13 +49,8 @@ def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None)
 def plot_training(records: Sequence[Mapping[str, Any]], title: str = "", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the loss and its parts over the steps, and beside them the PSNR on scenes that were not trained on.
 
-    Every step sees another scene, so the loss is drawn as a running mean.
-
-    Args:
-        records: lines of the history (`doedesign.training.history`) with "step", "loss", "parts" and, at some,
-            "validation".
-        title: a line above the picture.
-        ax: axes whose place the picture takes; a new figure by default.
+    Every step sees another scene, so the loss is drawn as a running mean. Records are lines of the history
+    (`doedesign.training.history`) with "step", "loss", "parts" and, at some, "validation".
 
     Raises:
         ValueError: no records.

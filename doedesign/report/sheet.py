@@ -19,15 +19,15 @@ _MOST_CONTACTS, _MOST_VALIDATIONS = 12, 4
 
 
 class ContactRow(NamedTuple):
-    """One simulated capture.
+    """One simulated capture: linear light in red, green and blue, and its obstruction.
 
     Attributes:
         label: its caption.
-        clean: `[c, y, x]` linear light, red, green and blue, without an obstruction.
+        clean: light without an obstruction.
         conventional: recorded by the camera without a DOE.
         doe: recorded with it.
-        mask: `[y, x]` sharp mask of the obstruction.
-        alpha: `[y, x]` share of the background's light that is lost with the DOE.
+        mask: sharp mask of the obstruction.
+        alpha: share of the background's light that is lost with the DOE.
     """
 
     label: str
@@ -39,14 +39,7 @@ class ContactRow(NamedTuple):
 
 
 class ValidationRow(NamedTuple):
-    """One scene that was not trained on, display values.
-
-    Attributes:
-        label: its caption.
-        capture: `[c, y, x]` red, green and blue as the camera records it.
-        reconstruction: output of the network.
-        scene: the true scene.
-    """
+    """One scene that was not trained on: display values of the capture, the network's output and the scene."""
 
     label: str
     capture: Float[np.ndarray, "3 y x"]
@@ -70,19 +63,12 @@ def plot_contact(rows: Sequence[ContactRow], title: str, words: str, ax: "Axes |
     for row in rows[:_MOST_CONTACTS]:
         # Averaged in linear light, cut at white.
         light = [srgb_from_linear(_reduced(image, _CONTACT_SIDE)) for image in (row.clean, row.conventional, row.doe)]
-        shown.append((row.label, [*light, *(shrunk(one, _dots(_CONTACT_SIDE)) for one in (row.mask, row.alpha))]))
+        shown.append((row.label, [*light, *(shrunk(one, round(_CONTACT_SIDE * DPI)) for one in (row.mask, row.alpha))]))
     return _plot_sheet(heads, shown, _CONTACT_SIDE, title, words, ax)
 
 
 def plot_validation(rows: Sequence[ValidationRow], title: str, words: str, ax: "Axes | None" = None) -> "FigureBase":
-    """Draw scenes one below the other: capture, reconstruction, scene.
-
-    Args:
-        rows: the scenes; beyond four, the first.
-        title: a line above all.
-        words: how they were made, for the foot.
-        ax: axes whose place the sheet takes; a new figure by default.
-    """
+    """Draw scenes one below the other: capture, reconstruction, scene; arguments as in `plot_contact`, four rows."""
     shown = [
         (row.label, [_reduced(np.clip(one, 0, 1), _VALIDATION_SIDE) for one in row[1:]])
         for row in rows[:_MOST_VALIDATIONS]
@@ -90,13 +76,9 @@ def plot_validation(rows: Sequence[ValidationRow], title: str, words: str, ax: "
     return _plot_sheet(("capture", "reconstruction", "scene"), shown, _VALIDATION_SIDE, title, words, ax)
 
 
-def _dots(side_in: float) -> int:
-    return round(side_in * DPI)
-
-
 def _reduced(image: Float[np.ndarray, "c y x"], side_in: float) -> Float[np.ndarray, "v u c"]:
     """Colours averaged to no more than a picture of this width can show."""
-    return np.stack([shrunk(plane, _dots(side_in)) for plane in image], axis=-1)
+    return np.stack([shrunk(plane, round(side_in * DPI)) for plane in image], axis=-1)
 
 
 def _plot_sheet(

@@ -243,7 +243,7 @@ def limit_from_text(text: str) -> LimitSpec:
     cure = f'For example "zeroth_order <= 5 %" or "far_spot >= 0.3 for 656nm at 5 m". Of: {", ".join(QUANTITIES)}.'
     try:
         if found is None or found[1] not in QUANTITIES:
-            raise ValueError(text)  # noqa: TRY301 - told below, as any other mistake
+            raise ValueError(text)  # noqa: TRY301 - explained below, as any other mistake
         bound = float(f"{float(found[3]) / (100 if found[4] else 1):.15g}")
         depth = None if found[6] is None else math.inf if found[6] == "inf" else parse_length(found[6])
         side = {"max" if found[2] == "<=" else "min": bound}

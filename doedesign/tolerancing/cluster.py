@@ -1,7 +1,7 @@
 """Draws evaluated by the workers of a Dask cluster, wherever they run.
 
     dask scheduler                                   # prints ADDRESS
-    dask worker ADDRESS --nthreads 1                 # on as many machines as there are, with doedesign installed
+    dask worker ADDRESS                              # of one thread, on as many machines as there are, with doedesign
     tolerance(design, scheduler=ADDRESS)
 
 Dask hands out the draws and hands those of a lost worker to another; this module only asks and listens.
@@ -85,14 +85,14 @@ def _client(address: str) -> "Iterator[Client]":
         try:
             client.wait_for_workers(1, timeout=_PATIENCE_S)
         except TimeoutError as error:
-            cure = f"Start some with: dask worker {address} --nthreads 1"
+            cure = f"Start some, each with one thread: dask worker {address}"
             raise InputError(address, "the cluster must have workers", "none", cure) from error
         yield client
 
 
 def _next(finished: "queue.SimpleQueue[Future]", client: "Client", address: str) -> "Future":
     """The next future that is done, however long it takes."""
-    told = False
+    warned = False
     while True:
         try:
             return finished.get(timeout=_PATIENCE_S)
@@ -101,9 +101,9 @@ def _next(finished: "queue.SimpleQueue[Future]", client: "Client", address: str)
                 working = client.nthreads()
             except OSError as error:
                 raise _lost(address) from error
-            if not working and not told:
+            if not working and not warned:
                 log.warning(f"no worker is left at {address}; waiting for new ones")
-                told = True
+                warned = True
 
 
 def _rows(future: "Future", key: str, address: str) -> Any:

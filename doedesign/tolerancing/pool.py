@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Rows = list[dict[str, Any]]
 Evaluate = Callable[["Design", Process, Variation], Any]
-"""What is asked of a draw; a study asks for `Rows`."""
+"""Evaluation of a draw; a study needs `Rows`."""
 
 _STRIKES = 3
 _GIB = 2**30
@@ -86,10 +86,10 @@ def predicted_bank(design: "Design", process: Process, variation: Variation) -> 
 
 def single_thread_settings() -> dict[str, str]:
     """Environment of a process that computes with one thread on the CPU, the same numbers on every machine like it."""
-    flags = "--xla_cpu_multi_thread_eigen=false"
+    flag = "xla_cpu_multi_thread_eigen"
     libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
     return {
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(),
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --{flag}=false".strip(),
         "JAX_PLATFORMS": "cpu",
         "NPROC": "1",  # threads of XLA's own pool, beside those of Eigen
         **{f"{library}_NUM_THREADS": "1" for library in libraries},
