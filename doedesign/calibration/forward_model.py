@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, UInt8
 
+from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
 from sim.camera import Camera, source_path_m, wrapped_waves
@@ -26,7 +27,6 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
 
-Image = Float[np.ndarray, "y x"]
 Motion = Float[np.ndarray, "3"]  # of an image: shifts along y and x in pixels, defocus in 1/m
 
 

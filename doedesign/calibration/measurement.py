@@ -239,7 +239,8 @@ def _measured_image(
     spec: MeasurementSpec, image: ImageSpec, psf: MeasuredPsf, camera: Camera, window: int
 ) -> MeasuredImage:
     clean, _ = without_background(psf)
-    centre = _stated_centre(spec, image, psf.rate.shape) or centre_of_light(clean)
+    stated = image.centre and _stated_centre(spec, image.centre, psf.rate.shape)
+    centre = stated or centre_of_light(clean)
     # The rest of the frame has served; half a window to either side is kept for a better centre.
     size = max(window, min(2 * window, *psf.rate.shape))
     cut, rest = cut_window(clean, centre, size)
@@ -254,13 +255,11 @@ def _measured_image(
     )
 
 
-def _stated_centre(spec: MeasurementSpec, image: ImageSpec, shape: tuple[int, ...]) -> tuple[float, float] | None:
-    """Row, counted upwards, and column of the chief ray on the plate's axes."""
-    if image.centre is None:
-        return None
+def _stated_centre(spec: MeasurementSpec, centre: tuple[float, float], shape: tuple[int, ...]) -> tuple[float, float]:
+    """Row, counted upwards, and column of a chief ray on the plate's axes."""
     # As the picture lies in its file; a quarter turn exchanges rows and columns.
     rows, columns = shape if spec.quarter_turns % 2 == 0 else shape[::-1]
-    y, x = (rows - 1) / 2 - image.centre[0], image.centre[1] - (columns - 1) / 2
+    y, x = (rows - 1) / 2 - centre[0], centre[1] - (columns - 1) / 2
     x = -x if spec.mirrored else x
     for _ in range(spec.quarter_turns):
         y, x = x, -y

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.forward_model import DoeImages, ForwardModel, Image, Motion, VariedDoe
-from doedesign.calibration.target import Match, Target, match
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, Motion, VariedDoe
+from doedesign.calibration.target import Image, Match, Target, match
 from doedesign.calibration.unknowns import Unknowns
 
 _SHIFT_SIGMA = 2.0  # pixels by which an image may lie off where it was found

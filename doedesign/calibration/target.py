@@ -12,9 +12,10 @@ from jaxtyping import Float
 from scipy.fft import irfft2, rfft2
 from scipy.ndimage import gaussian_filter
 
-from doedesign.calibration.forward_model import Image
 from fab.errors import InputError
 from sim.measured import MeasuredPsf, cut_window, parabola_vertex, smoothed
+
+Image = Float[np.ndarray, "y x"]
 
 
 class MeasuredImage(NamedTuple):

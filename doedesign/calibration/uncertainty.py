@@ -22,9 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.forward_model import Image
 from doedesign.calibration.objective import Linearization, Scores
-from doedesign.calibration.target import match
+from doedesign.calibration.target import Image, match
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.metrics import spot_radius_m
