@@ -70,7 +70,7 @@ def make_training(spec: Spec) -> tuple[Trainer, JointState, Batch]:
     """A training, its first state, and a scene."""
     rng = np.random.default_rng(0)
     height = 1e-6 * rng.random((spec.doe.samples, spec.doe.samples), np.float32)
-    trainer = Trainer.of(spec, {}, "", occlusion_from_spec(spec, ""), obstruction_from_spec(spec, ""), height)
+    trainer = Trainer.of(spec, "", occlusion_from_spec(spec, ""), obstruction_from_spec(spec, ""), height)
     size = spec.train.size
     background, radiance = (rng.random((3, size, size), np.float32) for _ in range(2))
     mask = np.kron(rng.random((8, 8)) > 0.8, np.ones((size // 8, size // 8))).astype(np.float32)

@@ -27,11 +27,11 @@ class CaptureModel:
     Attributes:
         camera: lens and pixels, with an odd window, so that a capture lies on its scene.
         occlusion: occlusion model.
-        outside: what eq. 10 takes for the obstruction's picture where there is none (`sim.imaging.formation.capture`).
+        outside: the obstruction's picture in eq. 10 where there is none (`sim.imaging.formation.capture`).
         sensor: the sensor.
         shadow_px: window of the shadow discs.
-        border: what lies beyond a scene. With `own` a scene brings its surroundings along, so that light comes in over
-            the edges as it does in the world, and everything captured is smaller than the scene, by `margin_px`.
+        border: continuation of a scene beyond its edges. With `own` a scene brings its surroundings along, so that
+            light comes in over the edges, and everything captured is smaller than the scene, by `margin_px`.
     """
 
     camera: Camera

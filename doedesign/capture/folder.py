@@ -27,7 +27,7 @@ import numpy as np
 
 from doedesign.capture.camera import CaptureModel
 from doedesign.capture.from_spec import plain_parameters
-from doedesign.capture.image_files import Stored, read_image, write_image
+from doedesign.capture.image_files import read_image, write_image
 from doedesign.capture.images import Pictures, picture_files
 from doedesign.capture.scenes import SceneData
 from doedesign.capture.simulate import Psfs, SimulatedCapture, Stage, flat_psfs, photograph, psfs_by_depth
@@ -50,13 +50,7 @@ _log = logging.getLogger("doedesign")
 
 
 class PlateErrors(NamedTuple):
-    """Which DOE as fabricated to look through.
-
-    Attributes:
-        process: the process that makes it.
-        errors: its errors.
-        words: a few words on where they come from.
-    """
+    """The process and the errors of a DOE as fabricated to look through, and a few words on where they come from."""
 
     process: Process
     errors: Variation
@@ -64,13 +58,7 @@ class PlateErrors(NamedTuple):
 
 
 class SimulationResult(NamedTuple):
-    """What a simulation left behind.
-
-    Attributes:
-        folder: the folder.
-        items: names of the items' folders.
-        skipped: why each picture that could not be used was skipped.
-    """
+    """The folder of a simulation, names of its items' folders, and why each skipped picture could not be used."""
 
     folder: Path
     items: tuple[str, ...]
@@ -233,14 +221,14 @@ def _write_item(folder: Path, number: int, found: SimulatedCapture, model: Captu
             "depth_m": found.depth_near_m,
             "background_depth_m": None if np.isinf(found.depth_far_m) else found.depth_far_m,
             "covered": float(found.mask.mean(dtype=np.float64)),
-            "images": {title: one.described() for title, one in stored.items()},
-            "sha256": {one.file: sha256_file(fresh / one.file) for one in stored.values()},
+            "images": stored,
+            "sha256": {one["file"]: sha256_file(fresh / one["file"]) for one in stored.values()},
         }
         (fresh / MANIFEST_NAME).write_bytes(canonical_json(described))
     return name
 
 
-def _write_images(folder: Path, found: SimulatedCapture, most: float, png: bool) -> dict[str, Stored]:
+def _write_images(folder: Path, found: SimulatedCapture, most: float, png: bool) -> dict[str, Any]:
     colours = ("R", "G", "B") if len(found.clean) == 3 else ("Y",)
     share = colours if len(found.alpha) == len(colours) else ("A",)
     images = {

@@ -5,7 +5,7 @@ A spec may leave all of it out but the occlusion model, which has no default: th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
+from dataclasses import Field, asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,12 +28,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def occlusion_from_spec(spec: Spec | None, source: str, given: str | None = None) -> Model:
-    """The occlusion model: the one given, or that of the spec.
-
-    Args:
-        spec: the spec, if there is one.
-        source: the spec's file, for messages.
-        given: the name of a model.
+    """The occlusion model: the one given, or that of the spec, whose file messages name (`source`).
 
     Raises:
         InputError: neither names one, or there is none of that name.
@@ -43,16 +38,13 @@ def occlusion_from_spec(spec: Spec | None, source: str, given: str | None = None
         raise InputError("occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
     model = given or (spec and spec.scene.occlusion)
     if model is None:
-        cure = (
-            'Add occlusion = "reciprocal" to [scene], which is nearest to wave optics, "radiometric", or "paper" for '
-            "eq. 10; or give `occlusion`."
-        )
+        cure = 'Give "reciprocal", which is nearest to wave optics, "radiometric", or "paper" for eq. 10.'
         raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
     return cast("Model", model)
 
 
 def outside_from_kind(kind: ObstructionKind) -> Outside:
-    """What eq. 10 takes for an obstruction's picture where there is none: for drops nothing, as in the public code."""
+    """The obstruction's picture in eq. 10 where there is none: for drops nothing, as in the public code."""
     return "nothing" if "raindrop" in str(getattr(kind, "name", "")) else "scene"
 
 
@@ -64,23 +56,13 @@ def sensor_from_spec(spec: Spec | None) -> Sensor:
     """
     if spec is None:
         return Sensor()
-    given = spec.sensor
-    said = {
-        "full_well_e": given.full_well_e,
-        "exposure": given.exposure,
-        "quantum_efficiency": given.quantum_efficiency or None,
-        "read_noise_e": given.read_noise_e,
-        "dark_e": given.dark_e,
-        "black_level": given.black_level,
-        "bits": given.bits,
-        "pattern": given.bayer,
-        "noise": given.noise,
-    }
+    names = {field.name: "bayer" if field.name == "pattern" else field.name for field in fields(Sensor)}
+    said = {name: getattr(spec.sensor, key) for name, key in names.items()}
     try:
-        return Sensor(**{name: value for name, value in said.items() if value is not None})
+        return Sensor(**{name: value for name, value in said.items() if value not in (None, ())})
     except ValueError as error:
         rule, _, got = str(error).partition(", but got ")
-        raise InputError("sensor", rule.replace("`", ""), got, "Change it in [sensor].") from error
+        raise InputError("sensor", rule.replace("`", ""), got, "Change the sensor of the spec.") from error
 
 
 def obstruction_from_spec(
@@ -105,7 +87,7 @@ def obstruction_from_spec(
     name = given or (own.kind if own else None)
     if name is None:
         kinds = ", ".join(OBSTRUCTIONS)
-        cure = f'Add [obstruction] with kind = "dirt", or give `obstruction`. There are {kinds}.'
+        cure = f'Give one, such as "dirt". There are {kinds}.'
         raise InputError(f"{source}: obstruction.kind", "an obstruction must be named", "nothing", cure)
     if name not in OBSTRUCTIONS:
         if not Path(name).is_dir():
@@ -125,15 +107,15 @@ def obstruction_from_spec(
     except TypeError as error:  # a parameter without which there is nothing
         raise InputError(where, "must hold all that the kind needs", f'"{error}"', "Add it.") from error
     near = near_m if spec is None else spec.scene.near_m
-    return at_depth(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
+    return _at_depth(made, (min(near), max(near))) if near and "depth_m" not in parameters else made
 
 
-def at_depth(kind: Any, depth_m: tuple[float, float]) -> Any:
+def _at_depth(kind: Any, depth_m: tuple[float, float]) -> Any:
     """The same kind of obstruction, or both that it is mixed of, at another distance."""
     names = {field.name for field in fields(kind)}
     if "depth_m" in names:
         return replace(kind, depth_m=depth_m)
-    inner = {name: at_depth(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
+    inner = {name: _at_depth(getattr(kind, name), depth_m) for name in names if is_dataclass(getattr(kind, name))}
     return replace(kind, **inner)
 
 
@@ -153,8 +135,7 @@ def _parameter(field: Field[Any], value: Any, where: str) -> Any:
         return tuple(_parameter_item(field, item, where) for item in value)
     item = _parameter_item(field, value, where)
     # A range is two numbers; one stands for both.
-    usual = field.default
-    is_range = usual is not MISSING and isinstance(usual, tuple) and len(usual) == 2
+    is_range = isinstance(field.default, tuple) and len(field.default) == 2
     return (item, item) if is_range and isinstance(item, float | int) else item
 
 
@@ -179,7 +160,7 @@ def plain_parameters(kind: Any) -> dict[str, Any]:
 
 
 def longest_first(wavelengths_m: Sequence[float]) -> list[int]:
-    """Positions of colours from the longest wavelength to the shortest, which stand for red, green and blue."""
+    """Positions of colours from the longest wavelength to the shortest: red, green and blue."""
     return sorted(range(len(wavelengths_m)), key=lambda c: -wavelengths_m[c])
 
 

@@ -6,7 +6,7 @@ EXR holds the numbers as they are. PNG holds `count / 65535 * full_scale`, round
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,32 +15,6 @@ from fab.pictures import read_pixels, write_pixels
 from sim.store import read_picture, write_picture
 
 _COUNTS = 65535
-
-
-class Stored(NamedTuple):
-    """One image of an item, as its JSON describes it.
-
-    Attributes:
-        file: its name.
-        what: a few words on it.
-        channels: names of its channels, in order.
-        full_scale: value of 65535 counts in a PNG; None in an EXR, which holds the values.
-        inverse: whether a PNG holds the inverse of the values.
-    """
-
-    file: str
-    what: str
-    channels: tuple[str, ...]
-    full_scale: float | None = None
-    inverse: bool = False
-
-    def described(self) -> dict[str, Any]:
-        """The same for JSON, without what is not said."""
-        return {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in self._asdict().items()
-            if value not in (None, False)
-        }
 
 
 def write_image(
@@ -53,8 +27,8 @@ def write_image(
     png: bool = False,
     full_scale: float = 1.0,
     inverse: bool = False,
-) -> Stored:
-    """Write one image of an item.
+) -> dict[str, Any]:
+    """Write one image of an item, and describe it for JSON.
 
     Args:
         folder: where to.
@@ -66,24 +40,24 @@ def write_image(
         full_scale: in a PNG, the value (or with `inverse`, its inverse) of the highest count.
         inverse: in a PNG, store inverses.
 
+    Returns:
+        "file", "what" and "channels"; of a PNG "full_scale", the value of 65535 counts, and "inverse" if it is so.
+
     Raises:
         InputError: the system refuses the path.
     """
     if not png:
         write_picture(folder / f"{name}.exr", dict(zip(channels, image, strict=True)), {"what": what})
-        return Stored(f"{name}.exr", what, channels)
+        return {"file": f"{name}.exr", "what": what, "channels": list(channels)}
     values = 1 / image if inverse else image
     counts = np.rint(np.clip(values / full_scale, 0, 1) * _COUNTS).astype(np.uint16)
     write_pixels(folder / f"{name}.png", counts[0] if len(counts) == 1 else counts.transpose(1, 2, 0))
-    return Stored(f"{name}.png", what, channels, full_scale, inverse)
+    about = {"file": f"{name}.png", "what": what, "channels": list(channels), "full_scale": full_scale}
+    return {**about, "inverse": True} if inverse else about
 
 
 def read_image(folder: Path, stored: Mapping[str, Any]) -> Float[np.ndarray, "c y x"]:
-    """Read an image that `write_image` wrote.
-
-    Args:
-        folder: where it lies.
-        stored: its description, as `Stored.described` gives it.
+    """Read an image that `write_image` wrote into a folder, by the description that it returned.
 
     Raises:
         InputError: the file is missing, broken, or changed.

@@ -98,11 +98,7 @@ class Pictures:
         return len(self.files)
 
     def get(self, index: int) -> Picture | None:
-        """One picture, or None if its file has to be skipped.
-
-        Raises:
-            InputError: every file was skipped.
-        """
+        """One picture, or None if its file has to be skipped; InputError if every file has to be."""
         path = self.files[index]
         with self._lock:
             alone = self._busy.setdefault(path, threading.Lock())
@@ -139,11 +135,7 @@ class Pictures:
         return f"{len(self.skipped)} of {len(self)} pictures skipped: {_names(sorted(self.skipped))}"
 
     def digest(self) -> str:
-        """SHA-256 of the files' names and sizes: equal for equal folders, whatever was decoded yet.
-
-        Raises:
-            InputError: a file is gone.
-        """
+        """SHA-256 of the files' names and sizes: equal for equal folders, whatever was decoded yet."""
         try:
             return sha256_bytes(canonical_json([[path.name, path.stat().st_size] for path in self.files]))
         except OSError as error:
@@ -158,13 +150,9 @@ def _names(paths: Sequence[Path]) -> str:
 def crop(
     picture: Picture, shape: tuple[int, int], place: tuple[float, float], mirror: bool = False
 ) -> UInt8[np.ndarray, "v u 3"]:
-    """Cut a window out of a picture, which is enlarged first if the window does not fit.
+    """Cut a window of `shape` (y, x) out of a picture, which is enlarged first if the window does not fit.
 
-    Args:
-        picture: `[y, x, colour]`.
-        shape: rows and columns of the window.
-        place: where the window lies between the lowest and highest row, and the first and last column, 0 to 1 each.
-        mirror: exchange left and right.
+    Its `place` between the lowest and highest row, and the first and last column, is 0 to 1 each.
     """
     scale = max(n / m for n, m in zip(shape, picture.shape[:2], strict=True))
     if scale > 1:

@@ -17,7 +17,7 @@ them; an error in one of them ends the stream, and says from which item and pict
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -31,12 +31,7 @@ from sim.obstruction import CameraView, ObstructionKind
 
 
 class NamedScene(NamedTuple):
-    """A scene and where it comes from.
-
-    Attributes:
-        name: name of the picture's file.
-        scene: one obstruction before the picture; colours are red, green and blue, arrays float32.
-    """
+    """One obstruction before the picture of this name; colours are red, green and blue, arrays float32."""
 
     name: str
     scene: Scene
@@ -81,11 +76,7 @@ class SceneData:
     mirrored: bool = True
 
     def __post_init__(self) -> None:
-        """Validate the numbers.
-
-        Raises:
-            ValueError: counts below one, distances out of order, or no pictures.
-        """
+        """Raise ValueError for counts below one, distances out of order, or no pictures."""
         for name in ("batch", "workers", "ahead"):
             if getattr(self, name) < 1:
                 raise ValueError(f"`{name}` must be at least 1, but got {getattr(self, name)}")
@@ -95,10 +86,7 @@ class SceneData:
             raise ValueError("`pictures` must hold one, but got none")
 
     def item(self, number: int) -> NamedScene:
-        """Make one scene.
-
-        Args:
-            number: of the scene; every epoch has as many as there are pictures.
+        """Make the scene of a number; every epoch has as many as there are pictures.
 
         Raises:
             InputError: no picture is whole, or the obstruction cannot be drawn.
@@ -122,11 +110,9 @@ class SceneData:
         folder, rule = str(self.pictures.files[0].parent), "at least one picture must be whole"
         raise InputError(folder, rule, "none", "Give other pictures.")
 
-    @contextmanager
-    def batches(self, start: int = 0, stop: int | None = None) -> Iterator[Iterator[Batch]]:
+    def batches(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[Batch]]:
         """Open the stream, from batch number `start` to the one before `stop`, without end by default."""
-        with batches_ahead(self.item, self.batch, start, stop, self.workers, self.ahead) as stream:
-            yield stream
+        return batches_ahead(self.item, self.batch, start, stop, self.workers, self.ahead)
 
 
 def draw_scene(
@@ -144,7 +130,7 @@ def draw_scene(
         kind: what stands before it.
         view: the frame.
         far_m: least and greatest distance of the background, drawn evenly in 1/z.
-        rng: where the randomness comes from.
+        rng: source of the randomness.
         mirrored: exchange left and right at random.
     """
     place, mirror = (rng.uniform(), rng.uniform()), bool(rng.integers(2)) and mirrored

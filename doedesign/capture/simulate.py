@@ -14,12 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel
-from doedesign.capture.from_spec import (
-    obstruction_from_spec,
-    occlusion_from_spec,
-    rgb_from_channels,
-    sensor_from_spec,
-)
+from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, rgb_from_channels, sensor_from_spec
 from doedesign.capture.images import display_values
 from doedesign.capture.scenes import NamedScene, draw_scene
 from doedesign.design.design import Design
@@ -49,7 +44,7 @@ _USUAL_SIDE, _MOST_SIDE = 512, 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCapture:
-    """What a camera records of one scene. Light is linear with white 1, in the colours of the camera; row 0 is lowest.
+    """A scene as a camera records it. Light is linear with white 1, in the colours of the camera; row 0 is lowest.
 
     Attributes:
         clean: `[c, y, x]` scene alone, sharp.
@@ -158,7 +153,7 @@ def simulate(
 
 
 class Stage(NamedTuple):
-    """What a design looks at, and with which camera.
+    """The scenes of a design, and the camera that looks at them.
 
     Attributes:
         kind: the kind of obstruction.
@@ -176,11 +171,7 @@ class Stage(NamedTuple):
     def of(
         cls, design: Design, obstruction: str | ObstructionKind | None, occlusion: str | None, size: int | None
     ) -> "Stage":
-        """Take what is not given from the design's spec; see `simulate`.
-
-        Raises:
-            InputError: something is named nowhere, or cannot be used.
-        """
+        """Take all that is not given from the design's spec; see `simulate`."""
         spec, source = design.spec, str((design.folder or Path()) / "spec.toml")
         chosen = occlusion_from_spec(spec, source, occlusion)
         if obstruction is None or isinstance(obstruction, str):
@@ -206,15 +197,7 @@ def _side(spec: Spec | None, size: int | None) -> int:
 def photograph(
     sample: NamedScene, model: CaptureModel, with_doe: Psfs, without: Psfs, key: Key[Array, ""]
 ) -> SimulatedCapture:
-    """Photograph one scene with two cameras.
-
-    Args:
-        sample: the scene, in red, green and blue.
-        model: what both cameras share.
-        with_doe: PSFs of the camera with the DOE, by depth.
-        without: PSFs of the conventional camera.
-        key: key of the noise, which differs from camera to camera.
-    """
+    """Photograph one scene with two cameras, whose PSFs are given by depth and whose noise differs."""
     scene, near_m = model.scene(sample.scene), float(sample.scene.obstructions[0].depth_m)
     far_m = float(sample.scene.background_depth_m)
     pairs = [(psfs(far_m), psfs(near_m)) for psfs in (without, with_doe)]
@@ -226,10 +209,8 @@ def photograph(
     first = (slice(None), *_middle(alpha, model.margin_px))
     mask = np.asarray(seen.obstructions[0].mask)
     depth = np.where(mask >= 0.5, np.float32(near_m), np.float32(far_m))
-    facts = (near_m, far_m, model.camera, model.occlusion, sample.name)
-    return SimulatedCapture(
-        np.asarray(seen.background), conventional, doe, mask, alpha[first], depth, *pairs[1], *facts
-    )
+    images = (np.asarray(seen.background), conventional, doe, mask, alpha[first], depth, *pairs[1])
+    return SimulatedCapture(*images, near_m, far_m, model.camera, model.occlusion, sample.name)
 
 
 def inner(scene: Scene, margin_px: int) -> Scene:

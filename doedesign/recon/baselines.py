@@ -27,23 +27,13 @@ from sim.imaging.convolve import convolve, plan_otf
 from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
 from sim.sensor import Sensor
 
-__all__ = ["ITERATIONS", "noise_to_signal", "noise_variance", "richardson_lucy", "wiener"]
-
 ITERATIONS = 100
 # Light below which a blurred estimate counts as dark: far below what any sensor tells from black.
 _DARK = 1e-6
 
 
 def noise_variance(capture: Float[np.ndarray, "c y x"], sensor: Sensor) -> Float[np.ndarray, " c"]:
-    """Mean variance of a capture's noise by the model of its sensor, rounding included.
-
-    Args:
-        capture: `[c, y, x]` developed capture, white 1.
-        sensor: the sensor that took it.
-
-    Returns:
-        variance for each colour, in units of white squared.
-    """
+    """Mean variance of a developed capture's noise by the model of its sensor, rounding included, in white squared."""
     light = np.maximum(capture, 0).mean(axis=(1, 2), dtype=np.float64)
     white_e = sensor.white_e(len(light))[:, 0, 0].astype(np.float64)
     by_model = {
@@ -57,14 +47,9 @@ def noise_variance(capture: Float[np.ndarray, "c y x"], sensor: Sensor) -> Float
 
 
 def noise_to_signal(capture: Float[np.ndarray, "c y x"], variance: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-    """Ratio of the noise's variance to that of the picture under it, for `wiener`.
+    """Ratio of the noise's variance (`noise_variance`) to that of the picture under it, for `wiener`.
 
-    Args:
-        capture: `[c, y, x]` developed capture.
-        variance: of its noise, for each colour (`noise_variance`).
-
-    Returns:
-        the ratio for each colour, at most 1: a capture that is all noise is halved, not more.
+    At most 1: a capture that is all noise is halved, not more.
     """
     seen = capture.var(axis=(1, 2), dtype=np.float64)
     return variance / np.maximum(seen - variance, np.maximum(variance, np.finfo(np.float32).tiny))
@@ -83,9 +68,6 @@ def wiener(
         psf: `[c, y, x]` PSFs in energy per pixel, odd windows with the chief ray in the middle. Light that they lose is
             given back.
         noise_to_signal: power of noise over that of the picture, for each colour or one for all.
-
-    Returns:
-        `[c, y, x]` linear light, noise below 0 included.
 
     Raises:
         ValueError: an even window.
@@ -114,9 +96,6 @@ def richardson_lucy(
         iterations: the most iterations.
         noise_variance: of the capture, for each colour or one for all; a colour stops where the mean square of
             capture - A u falls below it.
-
-    Returns:
-        `[c, y, x]` linear light, at least 0.
 
     Raises:
         ValueError: an even window.

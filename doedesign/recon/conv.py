@@ -57,16 +57,9 @@ mirrored.defvjp(_mirrored_forward, _mirrored_backward)
 def convolution(
     image: Float[Array, "b y x i"], weights: Float[Array, "ky kx i o"], stride: int = 1, *, half: bool = False
 ) -> Float[Array, "b v u o"]:
-    """Correlate an image with kernels of odd size; it is mirrored beyond its edges.
+    """Correlate an image, mirrored beyond its edges, with kernels of odd size; float32.
 
-    Args:
-        image: `[b, y, x, channel]`.
-        weights: `[ky, kx, channel, output]`.
-        stride: step between outputs; output k lies on input k * stride.
-        half: multiply in bfloat16 and add up in float32.
-
-    Returns:
-        `[b, y / stride, x / stride, output]`, float32.
+    Output k lies on input k * `stride`. With `half`, products are in bfloat16 and sums in float32.
     """
     return _valid(mirrored(image, weights.shape[0] // 2), weights, stride, half)
 

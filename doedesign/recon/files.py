@@ -41,7 +41,7 @@ def reconstruct_files(
     tile: int = TILE,
     overlap: int = OVERLAP,
 ) -> list[Path]:
-    """Reconstruct captures and write the results.
+    """Reconstruct captures and write the results; return their paths.
 
     Args:
         model: the model.
@@ -54,14 +54,11 @@ def reconstruct_files(
         tile: the most pixels of a tile's side.
         overlap: pixels that tiles share.
 
-    Returns:
-        the files written.
-
     Raises:
         InputError: a capture or number that cannot be used, or a folder that holds something else.
     """
     names = _names(captures, kind)
-    require_own_folder(folder, captures, names)
+    _require_own_folder(folder, captures, names)
     multiple = model.network.layout.multiple
     try:
         plan_tiles((1, 1), tile, overlap, multiple)
@@ -70,8 +67,8 @@ def reconstruct_files(
         raise InputError("tile, overlap", rule.replace("`", ""), got, "Leave them out, or correct them.") from error
     psfs = psfs or model.psfs()
     if {"obstruction", "occlusion"} <= model.about.keys():
-        said = f"trained behind {model.about['obstruction']}, occlusion model {model.about['occlusion']}"
-        _log.info("%s: %s", model.folder, said)
+        behind, by = model.about["obstruction"], model.about["occlusion"]
+        _log.info("%s: trained behind %s, occlusion model %s", model.folder, behind, by)
     _log.info("obstruction at %s, scene at %s", length_text(psfs.near_m), length_text(psfs.far_m))
     written: list[Path] = []
     with alone_in(folder):
@@ -118,12 +115,8 @@ def _names(captures: Sequence[Path], kind: str | None) -> list[str]:
     return [stem + (ending if ending in WRITTEN_FILES else ".png") for stem, ending in zip(stems, endings, strict=True)]
 
 
-def require_own_folder(folder: Path, captures: Sequence[Path] = (), names: Sequence[str] = ()) -> None:
-    """Refuse a folder with anything else in it: no other picture is overwritten.
-
-    Raises:
-        InputError: it holds something else, or one of the captures.
-    """
+def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[str]) -> None:
+    """Refuse a folder with anything else in it, or with one of the captures: no other picture is overwritten."""
     if not folder.is_dir():
         return  # `alone_in` makes it, or says why it cannot be made
     content = {path.name for path in folder.iterdir() if not path.name.startswith(".")}

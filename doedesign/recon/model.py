@@ -32,8 +32,6 @@ from sim.metrics import mean_wavelength_m
 from sim.psf_bank import PsfBank
 from sim.store import read_bank
 
-__all__ = ["RELEASED", "Model", "PsfPair"]
-
 RELEASED = Path("masks/released")
 
 _PITCH_TOLERANCE = 1e-3  # a ring of 500 pixels is then off by half a pixel
@@ -101,26 +99,21 @@ class Model:
         found = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
         if found is None:
             rule = "without a model the released one is taken, and must be there"
-            raise InputError(
-                str(RELEASED), rule, "no such folder here or in the checkout", "Give the folder of a model."
-            )
+            got, cure = "no such folder here or in the checkout", "Give the folder of a model."
+            raise InputError(str(RELEASED), rule, got, cure)
         return cls.open(found)
 
     @classmethod
     def open(cls, folder: str | Path) -> "Model":
-        """Read a model.
-
-        Args:
-            folder: the folder with its files, or a run whose `trained` folder has them.
+        """Read a model from the folder with its files, or from a run whose `trained` folder has them.
 
         Raises:
             InputError: files that are missing, broken, or do not belong together.
         """
-        home = next(
-            (each for each in (Path(folder) / "trained", Path(folder)) if (each / NETWORK_NAME).is_file()), None
-        )
+        places = (Path(folder) / "trained", Path(folder))
+        home = next((place for place in places if (place / NETWORK_NAME).is_file()), None)
         if home is None:
-            cure = "Train one with doedesign train RUN --images DIR, or give the folder of a released model."
+            cure = "Train one (`doedesign.train`), or give the folder of a released model."
             raise InputError(str(folder), f"must hold a trained network ({NETWORK_NAME})", "none", cure)
         where = home / NETWORK_NAME
         network, about = read_network(where)

@@ -24,6 +24,7 @@ second stage does not see the capture.
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any, Literal
 
 import equinox as eqx
@@ -76,11 +77,7 @@ class NetworkShape:
     variant: Variant = "paper"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
-
-        Raises:
-            ValueError: a width that colours do not divide, or a depth beyond 1 to 4.
-        """
+        """Raise ValueError for a width that colours do not divide, or a depth beyond 1 to 4."""
         if self.colours < 1 or self.width < self.colours or self.width % self.colours:
             raise ValueError(f"`width` must be a multiple of the {self.colours} colours, but got {self.width}")
         if not 1 <= self.depth < len(_WIDTHS):
@@ -93,7 +90,7 @@ class NetworkShape:
 
     @property
     def multiple(self) -> int:
-        """What the sides of a capture must be multiples of."""
+        """Divisor of the sides of a capture."""
         return int(2**self.depth)
 
 
@@ -145,21 +142,10 @@ def normalised(image: Float[Array, "b y x c"]) -> Float[Array, "b y x c"]:
 
 
 class Scale(eqx.Module):
-    """What one scale has on the way down.
-
-    Attributes:
-        blocks: blocks one after the other.
-        log_regulariser: of its Wiener filter; None without one.
-    """
+    """Blocks of one scale on the way down, and the regulariser of its Wiener filter, or None without one."""
 
     blocks: tuple[Block, ...]
     log_regulariser: Float[Array, " k"] | None
-
-    def __call__(self, image: Float[Array, "b y x i"], half: bool) -> Float[Array, "b v u o"]:
-        """Extract features."""
-        for block in self.blocks:
-            image = block(image, half)
-        return image
 
 
 class UpBlock(eqx.Module):
@@ -210,8 +196,7 @@ class Network(eqx.Module):
     def make(cls, layout: NetworkShape, seed: int) -> "Network":
         """Draw a network that all but hands the capture through: its corrections begin near nothing.
 
-        Raises:
-            ValueError: neither learnt features nor a Wiener filter.
+        ValueError with neither learnt features nor a Wiener filter.
         """
         rng = np.random.default_rng(seed)
         release, c, widths = layout.variant == "release", layout.colours, layout.widths
@@ -235,10 +220,11 @@ class Network(eqx.Module):
         bottom = (Block.make(rng, deepest, wide), Block.make(rng, wide, widths[-1]))
         up = tuple(
             UpBlock(
-                _spread(rng, widths[level + 1], widths[level]),
-                Block.make(rng, widths[level] + beside(level), widths[level]),
+                # Of a transposed convolution.
+                jnp.asarray(rng.standard_normal((coarse, 2, 2, fine)) / np.sqrt(coarse), jnp.float32),
+                Block.make(rng, fine + beside(level), fine),
             )
-            for level in reversed(range(layout.depth))
+            for level, (fine, coarse) in reversed([*enumerate(pairwise(widths))])
         )
         middle = c if release else layout.width
         head = (
@@ -339,11 +325,6 @@ def _bare(layout: NetworkShape) -> tuple[Scale, ...]:
     return tuple(Scale((), wiener) for _ in range(layout.depth + 1))
 
 
-def _spread(rng: np.random.Generator, inputs: int, outputs: int) -> Float[Array, "i 2 2 o"]:
-    """Weights of a transposed convolution."""
-    return jnp.asarray(rng.standard_normal((inputs, 2, 2, outputs)) / np.sqrt(inputs), jnp.float32)
-
-
 def _down(
     scale: Scale, image: Array, plain: Array, blur: Blur | None, *, half: bool, features: bool
 ) -> tuple[Array, list[Array]]:
@@ -352,10 +333,11 @@ def _down(
         assert blur is not None  # `_bare` refuses a network without both
         assert scale.log_regulariser is not None
         return image, [deblurred(plain, blur, scale.log_regulariser)]
-    found = scale(image, half)
+    for block in scale.blocks:
+        image = block(image, half)
     if blur is None or scale.log_regulariser is None:
-        return found, [found]
-    return found, [found, deblurred(found, blur, scale.log_regulariser)]
+        return image, [image]
+    return image, [image, deblurred(image, blur, scale.log_regulariser)]
 
 
 def shrunk(image: Float[Array, "b y x c"], factor: int) -> Float[Array, "b v u c"]:
@@ -365,5 +347,5 @@ def shrunk(image: Float[Array, "b y x c"], factor: int) -> Float[Array, "b v u c
 
 
 def count_parameters(tree: Any) -> int:
-    """Numbers that are learnt."""
+    """Count of the numbers that are learnt."""
     return sum(int(leaf.size) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))

@@ -26,8 +26,6 @@ from sim.frames import RAW_FILES, open_raw
 from sim.light import linear_from_srgb
 from sim.store import read_picture, write_picture
 
-__all__ = ["PHOTO_FILES", "WRITTEN_FILES", "Photo", "photo_from_array", "read_capture", "write_reconstruction"]
-
 WRITTEN_FILES = (".png", ".tif", ".tiff", ".exr")
 PHOTO_FILES = (*WRITTEN_FILES, *RAW_FILES)
 
@@ -117,11 +115,7 @@ def write_reconstruction(path: str | Path, display: Float[np.ndarray, "c y x"], 
 
 
 def _described(path: Path) -> dict[str, Any] | None:
-    """Entry of the manifest of `simulate` beside a file, or None where there is no such manifest.
-
-    Raises:
-        InputError: the file is no picture of light, or changed since.
-    """
+    """Entry of the manifest of `simulate` beside a file, which must be a picture of light; None without a manifest."""
     if not (path.parent / MANIFEST_NAME).is_file():
         return None
     manifest = read_json(path.parent / MANIFEST_NAME)

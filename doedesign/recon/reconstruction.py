@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What a network made of a capture.
+    """The picture that a network made of a capture.
 
     Attributes:
         picture: `[c, y, x]` display values (sRGB), 0 to 1 but for the network's errors; red, green and blue, or one.

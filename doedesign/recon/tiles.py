@@ -26,7 +26,6 @@ from jaxtyping import Array, Float
 
 TILE, OVERLAP = 1536, 256
 
-
 # A network, or anything that is called like one: from `[b, c, y, x]` capture, far and near PSFs to display values.
 Reconstructs = Callable[[Array, Array, Array], Array]
 
@@ -59,7 +58,7 @@ def plan_tiles(shape: tuple[int, int], tile: int = TILE, overlap: int = OVERLAP,
         shape: pixels (y, x) of the picture.
         tile: the most pixels of a tile's side.
         overlap: pixels that neighbours share.
-        multiple: what sides and overlap have to be multiples of (`Layout.multiple`).
+        multiple: divisor of sides and overlap (`NetworkShape.multiple`).
 
     Raises:
         ValueError: a tile or an overlap that is no such multiple, or an overlap of more than half a tile.
@@ -101,16 +100,13 @@ def reconstruct_tiled(
         capture: `[c, y, x]` linear light, white 1.
         far: `[c, y, x]` PSFs of the scene, energy per pixel, odd windows with the chief ray in the middle.
         near: the same of the obstruction.
-        tile: the most pixels of a tile's side. Time and seams shrink as it grows, memory grows with its square.
+        tile: see `plan_tiles`, as the next two; time and seams shrink as it grows, memory grows with its square.
         overlap: pixels that neighbouring tiles share.
-        multiple: what sides and overlap have to be multiples of (`Layout.multiple`).
-        on_tile: told after each tile how many are done.
+        multiple: divisor of sides and overlap.
+        on_tile: called after each tile with the number of those done.
 
     Returns:
         `[c, y, x]` display values as the network gives them.
-
-    Raises:
-        ValueError: see `plan_tiles`.
     """
     plan = plan_tiles((capture.shape[1], capture.shape[2]), tile, overlap, multiple)
     rows, columns = (list(_pieces(plan, axis)) for axis in (0, 1))
@@ -133,19 +129,12 @@ def _called(network: Reconstructs, capture: Array, far: Array, near: Array) -> A
 
 
 class _Piece(NamedTuple):
-    """One tile along one axis.
+    """One tile along one axis."""
 
-    Attributes:
-        source: which pixel of the picture each of its pixels shows.
-        share: weight of each.
-        place: where it goes.
-        kept: how many of its pixels that are.
-    """
-
-    source: np.ndarray
-    share: np.ndarray
-    place: slice
-    kept: int
+    source: np.ndarray  # which pixel of the picture each of its pixels shows
+    share: np.ndarray  # weight of each
+    place: slice  # where it goes
+    kept: int  # how many of its pixels that are
 
 
 def _pieces(plan: Tiling, axis: int) -> Iterator[_Piece]:

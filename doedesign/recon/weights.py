@@ -32,8 +32,6 @@ from fab.errors import InputError
 from sim.camera import Camera
 from sim.metrics import mean_wavelength_m
 
-__all__ = ["BANK_NAME", "FORMAT", "NETWORK_NAME", "camera_facts", "read_network", "write_network"]
-
 FORMAT = "doedesign network 1"
 NETWORK_NAME, BANK_NAME = "network.npz", "psf.exr"  # as they lie beside each other in a model's folder
 
@@ -41,12 +39,7 @@ _CURE = "Copy it again from where it was made, or train again."
 
 
 def camera_facts(camera: Camera, near_m: Sequence[float]) -> dict[str, Any]:
-    """What a network's file has to say of the camera.
-
-    Args:
-        camera: the camera it was trained for.
-        near_m: depths of obstructions it was trained on, metres; at least one.
-    """
+    """Entries of a network's file on its camera, and on the depths of obstructions (at least one, metres)."""
     return {
         "colours": [colour.name for colour in camera.colours],
         "wavelengths_m": [mean_wavelength_m(colour) for colour in camera.colours],
@@ -61,7 +54,7 @@ def write_network(path: str | Path, network: Network, about: Mapping[str, Any], 
     Args:
         path: the file; its folder is made if missing.
         network: the network.
-        about: what it was trained for and on, for JSON; see the top of this file.
+        about: its camera and training, for JSON; see the top of this file.
         half: store float16.
 
     Raises:
@@ -73,20 +66,14 @@ def write_network(path: str | Path, network: Network, about: Mapping[str, Any], 
         stored = {name: array.astype(np.float16) if half else array for name, array in arrays.items()}
     for name, array in stored.items():
         if not np.isfinite(array).all():
-            got = f"others in {name}"
-            raise InputError(str(path), "weights must be finite", got, "Go back to a checkpoint before training broke.")
+            cure = "Go back to a checkpoint before training broke."
+            raise InputError(str(path), "weights must be finite", f"others in {name}", cure)
     header = {"format": FORMAT, "layout": asdict(network.layout), "about": dict(about)}
     write_archive(path, header, stored)
 
 
 def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
-    """Read a network, and what its file says about it.
-
-    Args:
-        path: a file of `write_network`.
-
-    Returns:
-        the network, its weights in single precision, and `about`.
+    """Read a network, its weights in single precision, and `about` from a file of `write_network`.
 
     Raises:
         InputError: the file is missing, cut off, changed since, of another format or a layout that this version does
@@ -97,7 +84,13 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
     if header.get("format") != FORMAT:
         cure = "Give the network.npz of a training or of a released model, written by this version."
         raise InputError(str(path), f'the format must be "{FORMAT}"', repr(header.get("format")), cure)
-    layout, about = _layout(path, header.get("layout")), header.get("about")
+    said: Any = header.get("layout")
+    try:
+        layout = NetworkShape(**said)
+    except (TypeError, ValueError) as error:
+        rule, cure = "the layout must be one that this version knows", "Use the version that wrote it."
+        raise InputError(str(path), rule, f'"{error}"', cure) from error
+    about = header.get("about")
     if not isinstance(about, dict):
         raise InputError(str(path), "must say what it is about", repr(about), _CURE)
     return _filled(path, layout, arrays), about
@@ -107,14 +100,6 @@ def _named(tree: Any) -> dict[str, Any]:
     """Arrays of a tree by where they stand."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))
     return {jax.tree_util.keystr(where): leaf for where, leaf in leaves}
-
-
-def _layout(path: Path, said: Any) -> NetworkShape:
-    try:
-        return NetworkShape(**said)
-    except (TypeError, ValueError) as error:
-        cure = "Use the version that wrote it."
-        raise InputError(str(path), "the layout must be one that this version knows", f'"{error}"', cure) from error
 
 
 def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) -> Network:
@@ -131,9 +116,8 @@ def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) 
             raise InputError(str(path), "weights must be finite", f"others in {name}", _CURE)
     if extra := sorted(arrays.keys() - slots.keys()):
         raise InputError(str(path), "must hold the layout's arrays alone", f"also {extra[0]}", _CURE)
-    return jax.tree_util.tree_map_with_path(
-        lambda where, leaf: (
-            jnp.asarray(arrays[jax.tree_util.keystr(where)], leaf.dtype) if eqx.is_array(leaf) else leaf
-        ),
-        empty,
-    )
+
+    def filled(where: Any, leaf: Any) -> Any:
+        return jnp.asarray(arrays[jax.tree_util.keystr(where)], leaf.dtype) if eqx.is_array(leaf) else leaf
+
+    return jax.tree_util.tree_map_with_path(filled, empty)

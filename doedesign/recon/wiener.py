@@ -19,7 +19,7 @@ from jaxtyping import Array, Complex, Float
 
 
 class Blur(NamedTuple):
-    """What a scale knows of a PSF.
+    """A PSF as images of one scale show it.
 
     Attributes:
         transfer: `[b, c, y, fx]` transform of the PSF, unit sum unless said otherwise.
@@ -35,13 +35,8 @@ class Blur(NamedTuple):
 def sharing(window: int, length: int, scale: int) -> Float[np.ndarray, "length window"]:
     """Share of a PSF's samples that each pixel of a scale takes, its middle moved to pixel 0 and round the end.
 
-    Args:
-        window: samples of the PSF along an axis, odd; what lies beyond half of `length` pixels is left out.
-        length: pixels of the scale.
-        scale: samples per pixel of the scale, a power of two.
-
-    Raises:
-        ValueError: an even window, which has no middle sample.
+    Along an axis with `window` samples and `length` pixels of `scale` samples, a power of two; samples beyond half of
+    the pixels are left out. ValueError for an even window, which has no middle sample.
     """
     if window % 2 == 0:
         raise ValueError(f"`window` must be odd, so that the PSF has a middle, but got {window}")
@@ -53,16 +48,13 @@ def sharing(window: int, length: int, scale: int) -> Float[np.ndarray, "length w
 
 
 def blur_at(psf: Float[Array, "b c ky kx"], shape: tuple[int, int], scale: int = 1, *, unit: bool = True) -> Blur:
-    """The blur of a PSF as images of a scale show it.
+    """The blur of PSFs with odd windows as images of a scale show it.
 
     Args:
-        psf: `[b, c, y, x]` PSFs with odd windows, at full scale.
+        psf: `[b, c, y, x]` PSFs, at full scale.
         shape: pixels (y, x) of the scale.
         scale: samples of the PSF per pixel of the scale, a power of two.
-        unit: bring the PSF to unit sum; otherwise what it loses stays lost.
-
-    Raises:
-        ValueError: an even window.
+        unit: bring the PSF to unit sum; otherwise lost light stays lost.
     """
     by_y, by_x = (sharing(psf.shape[k - 2], shape[k], scale) for k in (0, 1))
     kernel = jnp.einsum("bcyx,vy,ux->bcvu", psf, by_y, by_x, precision="highest")
@@ -99,9 +91,6 @@ def deblurred(
         blur: what the PSFs do to images of this scale.
         log_regulariser: r, the logarithm of the power of noise over that of the image, one for every channel.
         taper: blend the edges first.
-
-    Returns:
-        `[b, y, x, channel]`.
     """
     b, y, x, channels = image.shape
     colours = blur.transfer.shape[1]
@@ -127,11 +116,8 @@ def sharpened(
 
     Args:
         image: `[b, y, x, c]` a picture, one channel for every colour.
-        psf: `[b, c, y, x]` PSFs with odd windows; what they lose is made up for.
+        psf: `[b, c, y, x]` PSFs with odd windows; light that they lose is made up for.
         log_regulariser: see `deblurred`.
-
-    Returns:
-        `[b, y, x, c]`.
     """
     y, x = image.shape[1:3]
     image = jnp.concatenate([image, image[:, ::-1]], axis=1)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM during long work: the end between two steps, agreed on by all hosts."""
+"""SIGINT and SIGTERM during long work: the end between two steps."""
 
 import signal
 import threading
@@ -35,17 +35,6 @@ class StopRequest:
             yield
         finally:
             self._waits = False
-
-    def agreed(self) -> bool:
-        """Whether any host was asked; one that stopped alone would leave the others waiting for ever."""
-        import jax
-
-        if jax.process_count() == 1:
-            return self.asked
-        import numpy as np
-        from jax.experimental.multihost_utils import process_allgather
-
-        return bool(np.any(process_allgather(np.array(self.asked))))
 
 
 @contextmanager

@@ -7,7 +7,7 @@ activations and pools count too, so that weights keep their names.
 
 from collections.abc import Container, Iterator, Mapping
 from functools import reduce
-from itertools import accumulate, chain, count
+from itertools import chain
 from typing import Literal, NamedTuple
 
 import jax
@@ -21,7 +21,7 @@ class Conv(NamedTuple):
     """A convolution and the ReLU after it.
 
     Attributes:
-        key: what its weights are called, after "features.".
+        key: the name of its weights, after "features.".
         size: rows and columns of the kernel.
         inputs: channels that come in.
         outputs: channels that go out.
@@ -44,15 +44,17 @@ class Fire(NamedTuple):
     narrow: Conv
     wide: Conv
 
+    @property
+    def outputs(self) -> int:
+        """Channels that go out."""
+        return self.narrow.outputs + self.wide.outputs
+
 
 class Pool(NamedTuple):
     """The largest value of every `size` x `size` window, two pixels apart; `partial` windows at the end may count."""
 
     size: int
     partial: bool = False
-
-
-Layer = Conv | Fire | Pool
 
 
 def _same(index: int, inputs: int, outputs: int) -> Conv:
@@ -68,7 +70,7 @@ def _fire(index: int, inputs: int, squeeze: int, expand: int) -> Fire:
 
 
 # Layers up to each tap.
-_BACKBONES: Mapping[Backbone, tuple[tuple[Layer, ...], ...]] = {
+_BACKBONES: Mapping[Backbone, tuple[tuple[Conv | Fire | Pool, ...], ...]] = {
     "squeeze": (
         (Conv("0", 3, 3, 64, stride=2),),
         (Pool(3, partial=True), _fire(3, 64, 16, 64), _fire(4, 128, 16, 64)),
@@ -93,6 +95,8 @@ _BACKBONES: Mapping[Backbone, tuple[tuple[Layer, ...], ...]] = {
         (Pool(2), _same(24, 512, 512), _same(26, 512, 512), _same(28, 512, 512)),
     ),
 }
+# Rows and columns that a picture must have, so that something is left of it at every layer.
+LEAST_PX: Mapping[Backbone, int] = {"squeeze": 17, "alex": 31, "vgg": 16}
 # A weight that only this backbone has.
 _MARKS: Mapping[str, Backbone] = {
     "features.3.squeeze.weight": "squeeze",
@@ -112,7 +116,7 @@ def taps_of(
     biases: Mapping[str, Float[Array, " _"]],
     x: Float[Array, "b y x 3"],
 ) -> list[Float[Array, "b _ _ _"]]:
-    """What a backbone makes of pictures, at every tap.
+    """Features of pictures at every tap.
 
     Args:
         backbone: which network.
@@ -121,10 +125,10 @@ def taps_of(
         x: `[b, y, x, colour]`, first row at the top, brought to the mean and spread that it was trained with.
     """
 
-    def applied(x: Array, layer: Layer) -> Array:
+    def applied(x: Array, layer: Conv | Fire | Pool) -> Array:
         match layer:
-            case Pool():
-                return _pooled(x, layer)
+            case Pool(size, partial):
+                return _pooled(x, size, partial)
             case Fire(squeeze, narrow, wide):
                 few = applied(x, squeeze)
                 return jnp.concatenate([applied(few, narrow), applied(few, wide)], -1)
@@ -143,37 +147,14 @@ def taps_of(
     return taps
 
 
-def _pooled(x: Float[Array, "b y x c"], pool: Pool) -> Float[Array, "b v u c"]:
+def _pooled(x: Float[Array, "b y x c"], size: int, partial: bool) -> Float[Array, "b v u c"]:
     # Strided slices along one axis after the other: XLA's own windowed maximum has a gradient ten times as slow.
     for axis in (1, 2):
-        places = _side(pool, x.shape[axis])
-        lacking = max(0, 2 * (places - 1) + pool.size - x.shape[axis])
+        places = (x.shape[axis] - size + partial) // 2 + 1
+        lacking = max(0, 2 * (places - 1) + size - x.shape[axis])
         padded = jnp.pad(x, [(0, lacking * (k == axis)) for k in range(4)], constant_values=-jnp.inf)
-        parts = [jax.lax.slice_in_dim(padded, k, k + 2 * places - 1, 2, axis) for k in range(pool.size)]
-        x = parts[0]
-        for part in parts[1:]:
-            x = jnp.maximum(x, part)
+        x = reduce(jnp.maximum, (jax.lax.slice_in_dim(padded, k, k + 2 * places - 1, 2, axis) for k in range(size)))
     return x
-
-
-def _side(layer: Layer, side: int) -> int:
-    """Rows that a layer makes of `side` rows."""
-    match layer:
-        case Conv():
-            return (side + 2 * layer.margin - layer.size) // layer.stride + 1
-        case Pool():
-            return (side - layer.size + layer.partial) // 2 + 1
-        case Fire():
-            return side
-
-
-def least_px(backbone: Backbone) -> int:
-    """Rows and columns that a picture must have, so that something is left of it at every layer."""
-
-    def sides(side: int) -> Iterator[int]:
-        return accumulate(chain.from_iterable(_BACKBONES[backbone]), lambda n, layer: _side(layer, n), initial=side)
-
-    return next(n for n in count(1) if min(sides(n)) > 0)
 
 
 def convolutions(backbone: Backbone) -> Iterator[Conv]:
@@ -185,26 +166,12 @@ def convolutions(backbone: Backbone) -> Iterator[Conv]:
             yield from layer
 
 
-def _channels(layer: Layer, inputs: int) -> int:
-    """Channels that a layer makes of `inputs` channels."""
-    match layer:
-        case Conv():
-            return layer.outputs
-        case Fire():
-            return layer.narrow.outputs + layer.wide.outputs
-        case Pool():
-            return inputs
-
-
 def weight_shapes(backbone: Backbone) -> dict[str, tuple[int, ...]]:
     """Name and shape of every weight in a file: torchvision's for the backbone, lin0, lin1, ... for the taps."""
     shapes: dict[str, tuple[int, ...]] = {}
     for conv in convolutions(backbone):
         shapes[f"features.{conv.key}.weight"] = (conv.outputs, conv.inputs, conv.size, conv.size)
         shapes[f"features.{conv.key}.bias"] = (conv.outputs,)
-    channels = 3
-    for k, layers in enumerate(_BACKBONES[backbone]):
-        for layer in layers:
-            channels = _channels(layer, channels)
-        shapes[f"lin{k}"] = (channels,)
-    return shapes
+    # A tap is after a layer with weights.
+    heads = (layers[-1].outputs for layers in _BACKBONES[backbone] if not isinstance(layers[-1], Pool))
+    return shapes | {f"lin{k}": (channels,) for k, channels in enumerate(heads)}

@@ -23,20 +23,18 @@ import numpy as np
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 
-__all__ = ["FORMAT", "read_checkpoint", "settled", "write_checkpoint"]
-
 FORMAT = "doedesign training checkpoint 1"
 
 _State = TypeVar("_State")
 
 
 def write_checkpoint(path: Path, state: Any, step: int, owner: str) -> None:
-    """Store a state.
+    """Store a state after a number of steps.
 
     Args:
         path: the file.
         state: a tree of arrays and numbers; what else stands in it (shapes, functions) belongs to the spec.
-        step: number of steps done.
+        step: number of steps.
         owner: digest of all that the training depends on.
 
     Raises:
@@ -46,9 +44,8 @@ def write_checkpoint(path: Path, state: Any, step: int, owner: str) -> None:
     for name, array in leaves:
         if not np.isfinite(array).all():
             cure = "Lower train.learning_rate or train.optics_learning_rate; the earlier checkpoint stays."
-            raise InputError(
-                f"training, step {step}", "every number must stay finite", f"one that is not in {name}", cure
-            )
+            rule, got = "every number must stay finite", f"one that is not in {name}"
+            raise InputError(f"training, step {step}", rule, got, cure)
     header = {
         "format": FORMAT,
         "owner": owner,
@@ -59,15 +56,9 @@ def write_checkpoint(path: Path, state: Any, step: int, owner: str) -> None:
 
 
 def read_checkpoint(path: Path, like: _State, owner: str) -> tuple[_State, int] | None:
-    """Read what `write_checkpoint` stored, or None if there is no checkpoint.
+    """Read the state and the number of steps that `write_checkpoint` stored, or None if there is no checkpoint.
 
-    Args:
-        path: the file.
-        like: a state of the same training, for the structure and for the devices that arrays are bound to.
-        owner: see `write_checkpoint`.
-
-    Returns:
-        the state and the number of steps done.
+    Structure, and the devices that arrays are bound to, are those of the state `like` of the same training.
 
     Raises:
         InputError: the file is cut off, corrupt, or of another training.

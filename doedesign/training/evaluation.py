@@ -1,19 +1,94 @@
-"""How well a network does on what it was never trained on: scores by region, their means, and pictures to look at."""
+"""How well a network does on pictures that it is never trained on: their choice, their scores by region, and means.
+
+Without a folder of their own they are the last of the training folder in an order shuffled by the seed; whatever has
+the same bytes as one of them under another name is not trained on either. (Neighbouring frames of a film are almost the
+same picture: hold out another film, in a folder of its own.) Their scenes are the same at every look: one crop, one
+obstruction and one noise each. Another seed of the training deals the same obstructions out to other pictures.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.capture.images import picture_files
 from doedesign.report.sheet import ValidationRow
 from doedesign.training.perceptual import Lpips
-from doedesign.training.scores import Scores, scores
-from doedesign.training.validation import ValidationSample
+from doedesign.training.scores import scores
+from fab.errors import InputError
+from fab.files import explain_os_error, sha256_file
+
+SCENE_SEED = 0
+
+_ORDER = 1  # apart from the epochs' orders
+_MOST_ROWS = 4
+
+
+class Split(NamedTuple):
+    """Files of pictures, or of pairs, to train on, and those that are held out, without a view in common."""
+
+    training: tuple[Any, ...]
+    held_out: tuple[Any, ...]
+    left_out: tuple[Any, ...] = ()  # neither, since they share a file's content with one held out
+
+
+def split_pictures(images: Path | None, validation: Path | None, count: int, seed: int) -> Split:
+    """Find pictures to train on, and some to keep away from training.
+
+    Args:
+        images: folder of pictures; scikit-image's samples if None.
+        validation: folder to take the held-out ones from; the same folder if None.
+        count: number to hold out; all of the folder of their own if it has fewer.
+        seed: seed of the order that they are the last of.
+
+    Raises:
+        InputError: a folder that cannot be used, or nothing left to train on.
+    """
+    files = picture_files(images)
+    pool = files if validation is None else picture_files(validation)
+    where = str(images or "scikit-image's pictures")
+    if validation is None and len(files) <= count:
+        cure = f"Set train.validation below {len(files)}, or give the pictures to hold out a folder of their own."
+        raise InputError(where, f"must hold more than the {count} pictures of train.validation", len(files), cure)
+    order = np.random.default_rng((seed, _ORDER)).permutation(len(pool))[-count:]
+    held_out = tuple(pool[k] for k in order)
+    training = _without(files, held_out if validation is None else pool)
+    if not training:
+        cure = "Hold out other pictures than those to train on."
+        raise InputError(where, "a picture must be left to train on", "only those held out", cure)
+    return Split(training, held_out)
+
+
+def _without(files: Sequence[Path], held_out: Sequence[Path]) -> tuple[Path, ...]:
+    """Files whose content is not that of one held out."""
+    try:
+        sizes = {path.stat().st_size for path in held_out}
+        digests = {sha256_file(path) for path in held_out}
+        return tuple(p for p in files if p.stat().st_size not in sizes or sha256_file(p) not in digests)
+    except OSError as error:
+        raise explain_os_error(error, str(error.filename)) from error
+
+
+class HeldOutScene(NamedTuple):
+    """One scene that is never trained on, in the camera's colours and display values.
+
+    Attributes:
+        name: name of the picture or pair.
+        shown: `[c, y, x]` pictures by name, "capture" and "reconstruction" among them.
+        scene: `[c, y, x]` the scene alone.
+        mask: `[y, x]` sharp mask of the obstruction.
+    """
+
+    name: str
+    shown: Mapping[str, Float[np.ndarray, "c y x"]]
+    scene: Float[np.ndarray, "c y x"]
+    mask: Float[np.ndarray, "y x"]
 
 
 class EvaluationResult(NamedTuple):
-    """What a look at held-out scenes found.
+    """Scores on held-out scenes.
 
     Attributes:
         means: scores by kind of picture ("capture", "reconstruction", others), region and name, averaged over the
@@ -28,28 +103,17 @@ class EvaluationResult(NamedTuple):
 
 
 def judge(
-    looks: Iterable[ValidationSample],
+    looks: Iterable[HeldOutScene],
     lpips: Lpips | None,
     to_rgb: Callable[[Float[np.ndarray, "c y x"]], Float[np.ndarray, "3 y x"]],
-    most_rows: int = 4,
 ) -> EvaluationResult:
-    """Judge the pictures of scenes.
-
-    Args:
-        looks: the scenes with their pictures, "capture" and "reconstruction" among them.
-        lpips: weights of LPIPS, if at hand.
-        to_rgb: the camera's colours -> red, green and blue, for a picture.
-        most_rows: scenes to keep for a picture.
-    """
+    """Judge scenes with their pictures; `to_rgb` turns the camera's colours into red, green and blue to look at."""
     scenes, found, rows = [], [], []
     for look in looks:
-        judged = {
-            name: _told(scores(image[None], look.scene[None], look.mask[None], lpips))
-            for name, image in look.shown.items()
-        }
+        judged = {name: _scores_of(image, look, lpips) for name, image in look.shown.items()}
         found.append(judged)
         scenes.append({"name": look.name, "covered": float(look.mask.mean(dtype=np.float64)), **judged})
-        if len(rows) < most_rows:
+        if len(rows) < _MOST_ROWS:
             shown = (to_rgb(image) for image in (look.shown["capture"], look.shown["reconstruction"], look.scene))
             rows.append(ValidationRow(_label(look.name, judged), *shown))
     means = {
@@ -62,15 +126,15 @@ def judge(
     return EvaluationResult(means, scenes, rows)
 
 
-def _told(found: Scores) -> dict[str, dict[str, float | None]]:
-    """Scores of one scene for JSON; None where there is none."""
+def _scores_of(image: np.ndarray, look: HeldOutScene, lpips: Lpips | None) -> dict[str, dict[str, float | None]]:
+    """Scores of one picture for JSON; None where there is none."""
     return {
         region: {
             name: float(values[0]) if np.isfinite(values[0]) else None
             for name, values in of_region._asdict().items()
             if values is not None
         }
-        for region, of_region in found._asdict().items()
+        for region, of_region in scores(image[None], look.scene[None], look.mask[None], lpips)._asdict().items()
     }
 
 

@@ -13,16 +13,13 @@ A folder of a fine-tuning (`doedesign.training.job`) is a model. It has besides
 """
 
 import logging
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -34,16 +31,13 @@ from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.network import Network
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.runtime.compiling import compiled_step
-from doedesign.runtime.stopping import stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
-from doedesign.training.evaluation import EvaluationResult, judge
-from doedesign.training.job import TrainingJob, perceptual_distance, run_job
-from doedesign.training.joint import TrainingRecord, rates_at
-from doedesign.training.loss import TERMS, Weights, losses
+from doedesign.training.evaluation import EvaluationResult, HeldOutScene, judge
+from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
+from doedesign.training.joint import rates_at
+from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.pairs import PairData, Pairs, crop_shape, cut, find_pairs, pairs_digest, split_pairs
-from doedesign.training.perceptual import Lpips
-from doedesign.training.validation import ValidationSample
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes, write_atomic
 from sim.light import srgb_from_linear
@@ -88,33 +82,22 @@ def finetune(
         linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
         mirrored: exchange left and right at random, of captures and PSFs.
 
-    Returns:
-        the fine-tuned model.
-
     Raises:
         InputError: a pair or number that cannot be used, a folder that belongs to something else, or a loss that is no
             longer finite.
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
-    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
-    with stoppable() as stop, place as folder:
+
+    def prepare() -> FineTuning:
         options = _options(model, steps, learning_rate, seed)
-        chosen = psfs or model.psfs()
-        run_job(
-            FineTuning.prepare(model, chosen, Path(pairs), options, validation, size, lpips_weights, linear, mirrored),
-            Path(folder),
-            stop,
-        )
-        model = Model.open(folder)
-    return replace(model, folder=None) if out is None else model
+        given = psfs or model.psfs(), Path(pairs), options, validation, size, lpips_weights, linear, mirrored
+        return FineTuning.prepare(model, *given)
+
+    return trained_model(prepare, out)
 
 
 def _options(model: Model, steps: int, learning_rate: float | None, seed: int) -> TrainSpec:
-    """How the model was trained, with what is asked for now.
-
-    Raises:
-        InputError: a number out of range.
-    """
+    """Options of the model's own training, with those that are given now."""
     path = None if model.folder is None else model.folder / "spec.toml"
     before = load_spec(path).train if path is not None and path.is_file() else TrainSpec()
     rate = before.learning_rate / 10 if learning_rate is None else learning_rate
@@ -134,21 +117,18 @@ class FineTuning(TrainingJob):
     """A training on real pairs.
 
     Attributes:
-        model: what to begin with.
+        model: the model to begin with.
         psfs: PSFs of the camera.
-        tuner: what a step does.
-        data: crops to train on.
-        held_out: pairs to judge by.
-        lpips: weights of LPIPS, if at hand.
+        perceptual: perceptual distance, or None.
+        held_out: pairs to judge by, cut to the same shape.
         pairs: names of the pairs.
     """
 
     model: Model
     psfs: PsfPair
-    tuner: "Tuner"
+    perceptual: Any
     data: PairData
     held_out: Pairs
-    lpips: Lpips | None
     pairs: Mapping[str, Any]
 
     @classmethod
@@ -203,7 +183,7 @@ class FineTuning(TrainingJob):
             validates_first=True,
             model=model,
             psfs=psfs,
-            tuner=Tuner.of(psfs, options, perceptual),
+            perceptual=perceptual,
             data=PairData(training, shape, options.seed, options.batch, mirrored),
             held_out=held_out,
             lpips=lpips,
@@ -212,36 +192,43 @@ class FineTuning(TrainingJob):
 
     def initial(self) -> "FinetuneState":
         """The state before the first step."""
-        return self.tuner.initial(self.model.network)
-
-    def batches(self, start: int, stop: int) -> AbstractContextManager[Iterator[Batch]]:
-        """Crops from step `start` to step `stop`."""
-        return self.data.batches(start, stop)
+        network = self.model.network
+        return FinetuneState(0, network, optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array)))
 
     def step(self, state: "FinetuneState", batch: Batch) -> tuple["FinetuneState", dict[str, Any]]:
-        """Take one step."""
-        rate = self.tuner.rate(state.step)
-        state, record = self.tuner.step(state, batch)
-        return state, {**record._asdict(), "learning_rates": {"network": rate}}
+        """Take one step with crops of pairs; the memory of the state that is given is used again.
+
+        Raises:
+            InputError: the loss is no longer finite.
+        """
+        images = (jnp.asarray(np.stack(each)) for each in zip(*(item.pair for item in batch.items), strict=True))
+        capture, reference, mask = images
+        mirrored, rate = [item.mirrored for item in batch.items], rates_at(self.options, state.step).network
+        options = self.perceptual, self.options, jnp.float32(rate)
+        given = _Given(*self._psfs(), capture, reference, mask, jnp.asarray(mirrored), *options)
+        (network, moments), loss, terms = _update()(given, (state.network, state.moments))
+        line = history_line("finetune", state.step, loss, terms, {"network": rate}, "Lower the learning rate.")
+        return FinetuneState(state.step + 1, network, moments), line
+
+    def _psfs(self) -> tuple[Float[Array, "c ky kx"], Float[Array, "c kv ku"]]:
+        return jnp.asarray(self.psfs.far), jnp.asarray(self.psfs.near)
 
     def evaluate(self, state: "FinetuneState") -> EvaluationResult:
         """Judge a state by the middle of the held-out pairs."""
+        far, near = (psf[None] for psf in self._psfs())
 
-        def samples() -> Iterator[ValidationSample]:
+        def looks() -> Iterator[HeldOutScene]:
             for k, files in enumerate(self.held_out.files):
                 pair = cut(self.held_out.get(k), self.data.shape)
-                pictures = {
-                    "capture": srgb_from_linear(pair.capture),
-                    "reconstruction": self.tuner.reconstruct(state, pair.capture),
-                }
-                clipped = {name: np.clip(picture, 0, 1) for name, picture in pictures.items()}
-                yield ValidationSample(files.name, clipped, np.clip(pair.reference, 0, 1), pair.mask)
+                found = _reconstructed(state.network, far, near, jnp.asarray(pair.capture)[None])
+                shown = {"capture": srgb_from_linear(pair.capture), "reconstruction": np.asarray(found)[0]}
+                yield HeldOutScene(files.name, shown, pair.reference, pair.mask)
 
         def to_rgb(image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "3 y x"]:
             picture = self.model.rgb(image)
             return np.repeat(picture, 3, axis=0) if len(picture) == 1 else picture
 
-        return judge(samples(), self.lpips, to_rgb)
+        return judge(looks(), self.lpips, to_rgb)
 
     def caption(self, state: "FinetuneState") -> tuple[str, str]:
         """Title and words for a picture of validation."""
@@ -285,107 +272,46 @@ class FinetuneState(NamedTuple):
     moments: optax.OptState
 
 
-class Tuner(eqx.Module):
-    """What stays the same from step to step. `Tuner.of` makes one.
-
-    Attributes:
-        far: `[c, y, x]` PSFs of the scene.
-        near: `[c, y, x]` PSFs of the obstruction.
-        perceptual: perceptual distance, or None.
-        options: steps, step sizes and weights of the loss.
-    """
-
-    far: Float[Array, "c ky kx"]
-    near: Float[Array, "c kv ku"]
-    perceptual: Any
-    options: TrainSpec = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, psfs: PsfPair, options: TrainSpec, perceptual: Any = None) -> "Tuner":
-        """Prepare fine-tuning.
-
-        Args:
-            psfs: PSFs of the camera.
-            options: how to train; what it says of the optics is not looked at.
-            perceptual: distance of two batches (`doedesign.training.perceptual`); None leaves the term out.
-        """
-        return cls(jnp.asarray(psfs.far), jnp.asarray(psfs.near), perceptual, options)
-
-    def initial(self, network: Network) -> FinetuneState:
-        """The state before the first step."""
-        return FinetuneState(0, network, optax.scale_by_adam().init(eqx.filter(network, eqx.is_inexact_array)))
-
-    def rate(self, step: int) -> float:
-        """Step size of Adam."""
-        return rates_at(self.options, step).network
-
-    def step(self, state: FinetuneState, batch: Batch) -> tuple[FinetuneState, TrainingRecord]:
-        """Take one step.
-
-        Args:
-            state: the state; its memory is used again.
-            batch: crops of pairs.
-
-        Raises:
-            InputError: the loss is no longer finite.
-        """
-        images = (jnp.asarray(np.stack(each)) for each in zip(*(item.pair for item in batch.items), strict=True))
-        capture, reference, mask = images
-        given = Given(capture, reference, mask, jnp.asarray([item.mirrored for item in batch.items]))
-        constants = self, given, jnp.float32(self.rate(state.step))
-        (network, moments), loss, terms = _update()(constants, (state.network, state.moments))
-        record = TrainingRecord(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
-        if not np.isfinite(record.loss):
-            rule, cure = "the loss must stay finite", "Lower the learning rate."
-            raise InputError(f"finetune, step {state.step}", rule, record.loss, cure)
-        return FinetuneState(state.step + 1, network, moments), record
-
-    def reconstruct(self, state: FinetuneState, capture: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "c y x"]:
-        """One capture through the network, in display values."""
-        return np.asarray(_reconstructed(state.network, self.far[None], self.near[None], jnp.asarray(capture)[None]))[0]
-
-
 def mirrored_as(psf: Float[Array, "c ky kx"], mirrored: Bool[Array, " b"]) -> Float[Array, "b c ky kx"]:
     """The PSFs of every item: those of the mirrored DOE where left and right are exchanged."""
     return jnp.where(mirrored[:, None, None, None], psf[None, ..., ::-1], psf[None])
 
 
-class Given(NamedTuple):
-    """The arrays of a batch."""
+class _Given(NamedTuple):
+    """All that a step depends on besides the state."""
 
+    far: Array
+    near: Array
     capture: Array
     reference: Array
     mask: Array
     mirrored: Array
+    perceptual: Any
+    options: TrainSpec
+    rate: Array
 
 
-def _loss(network: Network, tuner: Tuner, given: Given) -> tuple[Array, Array]:
-    options = tuner.options
-    picture = network(
-        given.capture,
-        mirrored_as(tuner.far, given.mirrored),
-        mirrored_as(tuner.near, given.mirrored),
-        half=options.precision == "mixed",
-        checkpointed=options.checkpointing,
-    )
-    weights = Weights(options.l1, options.perceptual, options.masked)
-    return losses(picture, given.reference, given.mask, weights, tuner.perceptual)
+_Learnt = tuple[Network, optax.OptState]
 
 
-Learnt = tuple[Network, optax.OptState]
+@partial(eqx.filter_value_and_grad, has_aux=True)
+def _slopes(network: Network, given: _Given) -> tuple[Array, Array]:
+    """The loss and its terms, with the gradient by the network."""
+    psfs = mirrored_as(given.far, given.mirrored), mirrored_as(given.near, given.mirrored)
+    half, checkpointed = given.options.precision == "mixed", given.options.checkpointing
+    picture = network(given.capture, *psfs, half=half, checkpointed=checkpointed)
+    return losses(picture, given.reference, given.mask, given.options, given.perceptual)
 
 
-def _take(constants: tuple[Tuner, Given, Array], learnt: Learnt) -> tuple[Learnt, Array, Array]:
+def _take(given: _Given, learnt: _Learnt) -> tuple[_Learnt, Array, Array]:
     """One step in arrays."""
-    (tuner, given, rate), (network, moments) = constants, learnt
-    (loss, terms), gradient = eqx.filter_value_and_grad(_loss, has_aux=True)(network, tuner, given)
-    direction, moments = optax.scale_by_adam().update(gradient, moments)
-    moved = eqx.apply_updates(network, jax.tree.map(lambda d: -rate * d, direction))
-    return (moved, moments), loss, terms
+    network, moments = learnt
+    (loss, terms), slope = _slopes(network, given)
+    return adam_step(network, slope, moments, given.rate), loss, terms
 
 
 @cache
-def _update() -> Callable[[tuple[Tuner, Given, Array], Learnt], Any]:
+def _update() -> Callable[[_Given, _Learnt], Any]:
     """The compiled step."""
     return compiled_step(_take)
 

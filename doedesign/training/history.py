@@ -11,14 +11,14 @@ left behind, so every step is there once.
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from fab.errors import InputError
-from fab.files import explain_os_error, write_atomic
+from fab.files import os_errors_explained, write_atomic
 
 HISTORY_NAME = "history.jsonl"
 
@@ -30,28 +30,16 @@ class History:
         self._path, self._handle = path, handle
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Append one record.
-
-        Raises:
-            InputError: the disk is full, or refuses otherwise.
-        """
+        """Append one record."""
         data = (json.dumps(record, sort_keys=True, allow_nan=False) + "\n").encode()
-        try:
+        with os_errors_explained(self._path):
             while data:
                 data = data[os.write(self._handle, data) :]
-        except OSError as error:
-            raise explain_os_error(error, self._path) from error
 
     def sync(self) -> None:
-        """Return when all records are on the disk: a checkpoint must not know of steps that the history lacks.
-
-        Raises:
-            InputError: the disk is full, or refuses otherwise.
-        """
-        try:
+        """Return when all records are on the disk: a checkpoint must not know of steps that the history lacks."""
+        with os_errors_explained(self._path):
             os.fsync(self._handle)
-        except OSError as error:
-            raise explain_os_error(error, self._path) from error
 
 
 def read_history(path: Path, steps: int) -> list[dict[str, Any]]:
@@ -60,12 +48,8 @@ def read_history(path: Path, steps: int) -> list[dict[str, Any]]:
     Raises:
         InputError: a line is no record, or the system refuses the path.
     """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+    with os_errors_explained(path):
+        data = path.read_bytes() if path.exists() else b""
     whole = data[: data.rfind(b"\n") + 1]
     records = []
     for number, line in enumerate(whole.splitlines(), 1):
@@ -82,58 +66,44 @@ def read_history(path: Path, steps: int) -> list[dict[str, Any]]:
 
 @contextlib.contextmanager
 def open_history(path: Path, steps: int) -> Iterator[History]:
-    """Open the history of a training of which a number of steps are done.
-
-    Args:
-        path: the file; made if missing.
-        steps: steps that the checkpoint knows; later records are dropped.
+    """Open the history, made if missing, of a training with a checkpoint of so many steps; drop later records.
 
     Raises:
-        InputError: a line is no record, or the system refuses the path.
+        InputError: a line is no record, or the system refuses the path, then or later.
     """
     kept = read_history(path, steps)
     write_atomic(path, "".join(json.dumps(record, sort_keys=True) + "\n" for record in kept).encode())
-    try:
+    with os_errors_explained(path):
         handle = os.open(path, os.O_WRONLY | os.O_APPEND)
-    except OSError as error:
-        raise explain_os_error(error, path) from error
     try:
         yield History(path, handle)
     finally:
         os.close(handle)
 
 
-class Board:
-    """Records for TensorBoard; made by `open_board`."""
-
-    def __init__(self, writer: Any) -> None:
-        self._writer = writer
-
-    def add(self, record: Mapping[str, Any]) -> None:
-        """Hand one record over, every number under a name of its own: "parts/l1", "validation/capture/full"."""
-        for name, value in _numbers(record):
-            if name != "step":
-                self._writer.add_scalar(name, value, record["step"])
-
-
 def require_tensorboard() -> None:
-    """Refuse where the package that writes for TensorBoard is not there.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise InputError where the package that writes for TensorBoard is not there."""
     if find_spec("tensorboardX") is None:
         cure = f"Run: pip install tensorboardX. Or leave the option out; {HISTORY_NAME} holds the same numbers."
         raise InputError("tensorboard", "needs the package tensorboardX", "none", cure)
 
 
 @contextlib.contextmanager
-def open_board(folder: Path, steps: int) -> Iterator[Board]:
-    """Open TensorBoard's folder; what it has of later steps than those done is hidden."""
+def open_board(folder: Path, steps: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Open TensorBoard's folder, and hide its later steps than those done; yield a call that adds a record.
+
+    Every number has a name of its own: "parts/l1", "validation/capture/full".
+    """
     require_tensorboard()
     writer = import_module("tensorboardX").SummaryWriter(str(folder), purge_step=steps)
+
+    def add(record: Mapping[str, Any]) -> None:
+        for name, value in _numbers(record):
+            if name != "step":
+                writer.add_scalar(name, value, record["step"])
+
     try:
-        yield Board(writer)
+        yield add
     finally:
         writer.close()
 

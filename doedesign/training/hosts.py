@@ -1,12 +1,9 @@
 """Several hosts in one training: how they find each other, what they agree on, and arrays that lie on all of them.
 
-Every host runs the same command, each with its own number:
-
-    doedesign train RUN --coordinator 10.0.0.1:1234 --hosts 2 --host 0
-    doedesign train RUN --coordinator 10.0.0.1:1234 --hosts 2 --host 1
-
-or, where the cluster tells (SLURM, Open MPI, Kubernetes, TPU pods), `--coordinator auto` alone. All of them see the
-same folders, and host 0 alone writes. A host that fails takes the others with it after some minutes: they miss it.
+Every host makes the same call, each with its own number: the address HOST:PORT of host 0, the number of hosts, and its
+own from 0; or, where the cluster tells (SLURM, Open MPI, Kubernetes, TPU pods), "auto" for the address alone. All of
+them see the same folders, and host 0 alone writes. A host that fails takes the others with it after some minutes: they
+miss it.
 
 With one host, all of this does nothing and costs nothing.
 """
@@ -21,40 +18,31 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from fab.errors import InputError
 
-__all__ = ["gathered", "join_hosts", "on_all", "own_copy", "parts_of"]
-
-AUTO = "auto"
+_AUTO = "auto"
 
 _Tree = TypeVar("_Tree")
 
 
 def join_hosts(coordinator: str | None, hosts: int | None = None, host: int | None = None, wait_s: int = 300) -> None:
-    """Find the other hosts. It has to come before anything asks for devices.
-
-    Args:
-        coordinator: address HOST:PORT of host 0, where it listens; "auto" where jax can ask the cluster; None for a
-            host alone.
-        hosts: their number.
-        host: number of this one, from 0.
-        wait_s: seconds to wait for the others.
+    """Find the other hosts, before anything asks for devices; a host alone has None for a coordinator.
 
     Raises:
         InputError: an option is missing or out of range, the cluster says nothing, or the others do not come.
     """
+    if coordinator in (None, _AUTO):
+        rule, cure = "must be left out with the coordinator auto", "The cluster says it."
+        if coordinator is None:
+            rule, cure = "must be given with a coordinator", "Add its address, HOST:PORT."
+        for name, value in (("hosts", hosts), ("host", host)):
+            if value is not None:
+                raise InputError(name, rule, value, cure)
     if coordinator is None:
-        for name, value in (("hosts", hosts), ("host", host)):
-            if value is not None:
-                raise InputError(name, "must be given with a coordinator", value, "Add its address, HOST:PORT.")
         return
-    if coordinator == AUTO:
-        for name, value in (("hosts", hosts), ("host", host)):
-            if value is not None:
-                raise InputError(name, "must be left out with the coordinator auto", value, "The cluster says it.")
-    else:
+    if coordinator != _AUTO:
         _require_numbers(coordinator, hosts, host)
         if host:
             _require_listening(coordinator, wait_s)
-    address = None if coordinator == AUTO else coordinator
+    address = None if coordinator == _AUTO else coordinator
     try:
         jax.distributed.initialize(address, hosts, host, initialization_timeout=wait_s)
     # A port in use, a cluster unknown to jax: each comes as an error of its own.

@@ -14,28 +14,31 @@ end it after the step it is at, with a checkpoint.
 """
 
 import logging
+import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from doedesign import __version__
-from doedesign.capture.scenes import Batch
+from doedesign.capture.scenes import Batch, SceneData
+from doedesign.recon.model import Model
 from doedesign.report.history import plot_training
 from doedesign.report.sheet import plot_validation
 from doedesign.runs.folder import CHECKPOINT, alone_in
 from doedesign.runtime.progress import meter
-from doedesign.runtime.stopping import StopRequest
+from doedesign.runtime.stopping import StopRequest, stoppable
 from doedesign.spec.training import TrainSpec
 from doedesign.training.checkpoint import read_checkpoint, settled, write_checkpoint
 from doedesign.training.evaluation import EvaluationResult
 from doedesign.training.history import HISTORY_NAME, open_board, open_history, read_history
 from doedesign.training.hosts import gathered
+from doedesign.training.pairs import PairData
 from doedesign.training.perceptual import Lpips, Perceptual, read_lpips
 from doedesign.training.similarity import MsSsim
 from fab.errors import InputError
@@ -50,13 +53,15 @@ class TrainingJob(ABC):
     """A training that is prepared. Its states are trees of arrays and numbers, with the number of steps as `step`.
 
     Attributes:
-        name: what it is called in messages: "training".
+        name: "training" or "fine-tuning", for messages.
         title: name of the design, for pictures.
         options: steps, and after how many of them to validate and to write a checkpoint.
         settings: everything that the result depends on, for the manifest; its "format" tells the kinds apart.
-        remarks: what the manifest says besides.
+        remarks: other entries of the manifest.
         inputs: files that are written before the first step.
         differs: in what another training of the same kind may differ, for messages.
+        data: batches to train on.
+        lpips: weights of LPIPS, if at hand.
         validates_first: whether to validate before the first step, too.
     """
 
@@ -66,6 +71,8 @@ class TrainingJob(ABC):
     settings: Mapping[str, Any]
     inputs: Mapping[str, bytes]
     differs: str
+    data: SceneData | PairData
+    lpips: Lpips | None
     remarks: Mapping[str, Any] = field(default_factory=dict)
     validates_first: bool = False
 
@@ -74,16 +81,12 @@ class TrainingJob(ABC):
         """The state before the first step."""
 
     @abstractmethod
-    def batches(self, start: int, stop: int) -> AbstractContextManager[Iterator[Batch]]:
-        """Open the stream that the steps from `start` to `stop` look at."""
-
-    @abstractmethod
     def step(self, state: Any, batch: Batch) -> tuple[Any, dict[str, Any]]:
         """Take one step; return the new state and the line of the history."""
 
     @abstractmethod
     def evaluate(self, state: Any) -> EvaluationResult:
-        """Judge a state by what is never trained on."""
+        """Judge a state on scenes that are never trained on."""
 
     @abstractmethod
     def caption(self, state: Any) -> tuple[str, str]:
@@ -91,22 +94,27 @@ class TrainingJob(ABC):
 
     @abstractmethod
     def write_results(self, folder: Path, state: Any) -> list[str]:
-        """Write what was learnt; return the names of the files."""
+        """Write the trained network and all that belongs to it; return the names of the files."""
 
 
-def run_job(job: TrainingJob, folder: Path, stop: StopRequest, *, tensorboard: bool = False) -> None:
-    """Train, or go on where an earlier call was stopped.
+def trained_model(prepare: Callable[[], TrainingJob], out: str | Path | None, *, tensorboard: bool = False) -> Model:
+    """Run a training in a folder, or in a temporary one, which is removed, if it is None; return the model.
 
-    Args:
-        job: the training.
-        folder: its folder; a new or empty one, or its own.
-        stop: who asks for an end gets it after a step, with a checkpoint.
-        tensorboard: write for TensorBoard, too.
+    A signal ends it while it is prepared, and after a step, with a checkpoint, once it runs.
 
     Raises:
-        InputError: a folder that belongs to something else, or a loss that is no longer finite.
+        InputError: as `prepare`; a folder that belongs to something else; a loss that is no longer finite.
         KeyboardInterrupt: it was stopped.
     """
+    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
+    with stoppable() as stop, place as folder:
+        _run(prepare(), Path(folder), stop, tensorboard)
+        model = Model.open(folder)
+    return replace(model, folder=None) if out is None else model
+
+
+def _run(job: TrainingJob, folder: Path, stop: StopRequest, tensorboard: bool) -> None:
+    """Train, or go on where an earlier call was stopped."""
     digest, leads = sha256_bytes(canonical_json(job.settings)), jax.process_index() == 0
     manifest = {**job.settings, "settings_sha256": digest, "state": "running", "version": __version__, **job.remarks}
     with alone_in(folder) if leads else nullcontext():
@@ -122,7 +130,7 @@ def run_job(job: TrainingJob, folder: Path, stop: StopRequest, *, tensorboard: b
         if len(set(found := gathered(state.step))) > 1:
             rule, got = "every host must find the same checkpoint", f"those of steps {found}"
             raise InputError(str(folder), rule, got, "Put the run where all hosts see it.")
-        state = _take_steps(folder, job, state, digest, stop, leads, tensorboard)
+        state = _take_steps(folder, job, state, digest, stop, tensorboard)
         if leads:
             _log.info("judging the network and writing results")
             names = [*job.write_results(folder, state), *job.inputs]
@@ -130,19 +138,14 @@ def run_job(job: TrainingJob, folder: Path, stop: StopRequest, *, tensorboard: b
                 save(plot_training(records, job.title), folder / "curves.png")
                 names += ["curves.png", HISTORY_NAME]
             digests = {name: sha256_file(folder / name) for name in sorted(names)}
-            write_atomic(
-                folder / MANIFEST_NAME, canonical_json({**manifest, "state": "done", "results_sha256": digests})
-            )
+            done = {**manifest, "state": "done", "results_sha256": digests}
+            write_atomic(folder / MANIFEST_NAME, canonical_json(done))
             (folder / CHECKPOINT).unlink(missing_ok=True)
         gathered(0)  # nobody leaves before all is written
 
 
 def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
-    """Whether a training is finished; clear away what a killed one was writing.
-
-    Raises:
-        InputError: the folder is that of something else, or a result was changed.
-    """
+    """Whether a training is finished; refuse the folder of another, and clear away leftovers of a killed one."""
     for path in (folder / "validation").glob(".*"):
         path.unlink()
     path = folder / MANIFEST_NAME
@@ -170,11 +173,7 @@ def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
 
 
 def _resumed(folder: Path, start: Any, digest: str) -> Any:
-    """The state to go on from: that of the last checkpoint, or the one to start with.
-
-    Raises:
-        InputError: a checkpoint that is broken, or belongs to something else.
-    """
+    """The state to go on from: that of the last checkpoint, or the one to start with."""
     stored = read_checkpoint(folder / CHECKPOINT, start, digest)
     if stored is None:
         return start
@@ -194,21 +193,15 @@ def _validated(folder: Path, job: TrainingJob, state: Any) -> dict[str, Any]:
     return found.means
 
 
-def _take_steps(
-    folder: Path, job: TrainingJob, state: Any, digest: str, stop: StopRequest, leads: bool, tensorboard: bool
-) -> Any:
-    """Take the remaining steps; of several hosts, the one that leads writes.
-
-    Raises:
-        KeyboardInterrupt: it was stopped.
-    """
-    options, first = job.options, state.step
+def _take_steps(folder: Path, job: TrainingJob, state: Any, digest: str, stop: StopRequest, tensorboard: bool) -> Any:
+    """Take the remaining steps; of several hosts, host 0 writes."""
+    options, first, leads = job.options, state.step, jax.process_index() == 0
     if job.validates_first and first == 0:
         _validated(folder, job, state)
     if first == options.steps:
         return state
     with ExitStack() as stack:
-        stream = stack.enter_context(job.batches(first, options.steps))
+        stream = stack.enter_context(job.data.batches(first, options.steps))
         history = stack.enter_context(open_history(folder / HISTORY_NAME, first)) if leads else None
         board = stack.enter_context(open_board(folder / "tensorboard", first)) if tensorboard and leads else None
         progress = stack.enter_context(meter(job.name, options.steps, first))
@@ -221,10 +214,13 @@ def _take_steps(
                 line["validation"] = _validated(folder, job, state)
             now = time.monotonic()
             line["seconds"], begun = round(now - begun, 4), now
-            for sink in filter(None, (history, board)):
-                sink.add(line)
+            if history:
+                history.add(line)
+            if board:
+                board(line)
             progress.advance(state.step, f"loss {line['loss']:.4f}")
-            stopping = stop.agreed()
+            # One host that stopped alone would leave the others waiting for ever.
+            stopping = any(gathered(stop.asked))
             if history and (stopping or last or state.step % options.checkpoint_every == 0):
                 history.sync()
                 write_checkpoint(folder / CHECKPOINT, state, state.step, digest)
@@ -242,7 +238,7 @@ def perceptual_distance(
     Args:
         options: with the weight of the perceptual term.
         size: pixels of a crop's shorter side.
-        where: what says so, for messages.
+        where: its source, for messages.
         files: weights of LPIPS.
 
     Raises:

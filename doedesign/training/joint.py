@@ -8,10 +8,9 @@ More than one device: the batch is shared out over a mesh with the one axis "dat
 the same state, and gradients are averaged. With several hosts each hands in its own part of every batch.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,13 +32,8 @@ from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
 from doedesign.spec.training import TrainSpec
 from doedesign.training.hosts import on_all, own_copy, parts_of
-from doedesign.training.loss import TERMS, Weights, losses
-from doedesign.training.optics import (
-    Capture,
-    TrainingDoe,
-    TrainingScene,
-    shots,
-)
+from doedesign.training.loss import adam_step, history_line, losses
+from doedesign.training.optics import Capture, TrainingDoe, TrainingScene, shots
 from fab.draws import variation_at
 from fab.errors import InputError
 from fab.levels import height_of
@@ -48,6 +42,7 @@ from sim.camera import Camera
 from sim.imaging.occlusion import Model
 from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.source import SeparableSource
 from sim.surface import as_fabricated
@@ -65,9 +60,9 @@ class JointState(NamedTuple):
     Attributes:
         step: number of steps done.
         network: the network.
-        free: phases of the plate, radians; None for a plate at rest.
+        free: parameters of the DOE; None for one at rest.
         network_moments: Adam's moments.
-        optics_moments: Adam's moments; None for a plate at rest.
+        optics_moments: Adam's moments; None for a DOE at rest.
     """
 
     step: int
@@ -75,20 +70,6 @@ class JointState(NamedTuple):
     free: Array | None
     network_moments: optax.OptState
     optics_moments: optax.OptState | None
-
-
-class TrainingRecord(NamedTuple):
-    """One line of the history: the loss of a step before its update.
-
-    Attributes:
-        step: number of the step.
-        loss: the loss.
-        parts: its terms before they are weighted.
-    """
-
-    step: int
-    loss: float
-    parts: dict[str, float]
 
 
 class Rates(NamedTuple):
@@ -99,13 +80,12 @@ class Rates(NamedTuple):
 
 
 class Trainer(eqx.Module):
-    """What stays the same from step to step. `Trainer.of` makes one.
+    """All that does not change from step to step. `Trainer.of` makes one.
 
     Attributes:
         doe: the DOE that training looks through.
-        bench: the rest of the camera.
-        weights: of the loss.
         perceptual: perceptual distance, or None.
+        bench: the rest of the camera.
         process: process whose errors every step's plate has, or None.
         spec: the spec.
         mesh: devices, or None for one.
@@ -114,7 +94,6 @@ class Trainer(eqx.Module):
     doe: TrainingDoe
     perceptual: Any
     bench: CaptureModel = eqx.field(static=True)
-    weights: Weights = eqx.field(static=True)
     process: Process | None = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
     mesh: Mesh | None = eqx.field(static=True)
@@ -123,7 +102,6 @@ class Trainer(eqx.Module):
     def of(
         cls,
         spec: Spec,
-        files: Mapping[str, Path],
         source: str,
         model: Model,
         kind: ObstructionKind,
@@ -135,21 +113,19 @@ class Trainer(eqx.Module):
         """Prepare a training.
 
         Args:
-            spec: the spec.
-            files: its input files by key.
+            spec: the spec; its objectives are done with.
             source: the spec's file, for messages.
             model: occlusion model.
             kind: obstruction.
-            height_m: `[y, x]` map of the plate, for one that stays at rest.
+            height_m: `[y, x]` heights of a DOE that stays at rest; flat glass replaces them in a conventional camera.
             perceptual: distance of two batches (`doedesign.training.perceptual`); None leaves the term out.
             mesh: devices (`devices_mesh`).
 
         Raises:
-            InputError: what cannot be trained: a sensor with a mosaic, rings off the axis or with errors, a batch that
-                the devices do not divide.
+            InputError: a training that is not possible: a sensor with a mosaic, rings off the axis or with errors, a
+                batch that the devices do not divide.
         """
-        train = spec.train
-        sensor = sensor_from_spec(spec)
+        spec, train, sensor = spec.model_copy(update={"objectives": ()}), spec.train, sensor_from_spec(spec)
         if sensor.pattern is not None:
             rule = "must be left out for training: demosaicing has no gradient"
             raise InputError(f"{source}: sensor.bayer", rule, f'"{sensor.pattern}"', "Train on pixels of all colours.")
@@ -160,23 +136,14 @@ class Trainer(eqx.Module):
         if train.camera == "conventional":
             height_m = np.zeros(camera.grid.shape, np.float32)
         alive = train.moves_optics or train.fabricated or train.field == "random"
-        doe = _learnt_doe(spec, files, source) if alive else resting_doe(spec, camera, kind, height_m)
+        doe = _learnt_doe(spec, source) if alive else resting_doe(spec, camera, kind, height_m)
         bench = CaptureModel.make(camera, kind, model, sensor)
-        weights = Weights(train.l1, train.perceptual, train.masked)
         process = process_from_spec(spec.process) if train.fabricated else None
-        doe = doe if mesh is None else on_all(doe, mesh)
-        return cls(doe, perceptual, bench, weights, process, spec, mesh)
+        return cls(doe if mesh is None else on_all(doe, mesh), perceptual, bench, process, spec, mesh)
 
-    def initial(self, height_m: Float[np.ndarray, "*s"], network: Network | None = None) -> JointState:
-        """The state before the first step.
-
-        Args:
-            height_m: heights to begin with, a map or a profile of rings, before quantisation.
-            network: network to begin with; a fresh one if None.
-        """
-        layout = layout_of(self.spec, len(self.bench.camera.colours))
-        if network is None:
-            network = Network.make(layout, self.spec.train.seed)
+    def initial(self, height_m: Float[np.ndarray, "*s"]) -> JointState:
+        """The state before the first step, from heights (a map or a profile of rings) before quantisation."""
+        network = Network.make(layout_of(self.spec, len(self.bench.camera.colours)), self.spec.train.seed)
         adam = optax.scale_by_adam()
         moments = adam.init(eqx.filter(network, eqx.is_inexact_array))
         free, optics_moments = None, None
@@ -187,12 +154,10 @@ class Trainer(eqx.Module):
         # Where the step will leave it: otherwise the second step would be compiled anew.
         return state if self.mesh is None else on_all(state, self.mesh)
 
-    def step(self, state: JointState, batch: Batch) -> tuple[JointState, TrainingRecord]:
-        """Take one step.
+    def step(self, state: JointState, batch: Batch) -> tuple[JointState, dict[str, Any]]:
+        """Take one step, with this host's part of a batch; return the line of the history, too.
 
-        Args:
-            state: the state; its memory is used again.
-            batch: scenes; with several hosts, this host's part of them.
+        The memory of the state that is given is used again.
 
         Raises:
             InputError: the loss is no longer finite.
@@ -200,7 +165,7 @@ class Trainer(eqx.Module):
         train = self.spec.train
         rates = rates_at(train, state.step)
         trainer = self._with_errors(state, batch.step)
-        seen, keys = self._seen(batch, train.seed, train.field == "random", part=self.mesh is not None)
+        seen, keys = self._seen(batch, train.seed, train.field == "random", shared=self.mesh is not None)
         if self.mesh is not None:
             seen, keys = parts_of((seen, keys), self.mesh)
         softness = jnp.float32(softness_at(self.spec.optimize.quantisation, state.step, train.steps))
@@ -209,17 +174,14 @@ class Trainer(eqx.Module):
         moments = (state.network_moments, state.optics_moments)
         constants = trainer, seen, keys, softness, jnp.asarray(rates, jnp.float32), moves
         (network, free), moments, loss, terms = _update()(constants, (learnt, moments))
-        record = TrainingRecord(state.step, float(loss), dict(zip(TERMS, np.asarray(terms).tolist(), strict=True)))
-        if not np.isfinite(record.loss):
-            cure = "Lower train.learning_rate or train.optics_learning_rate."
-            raise InputError(f"train, step {state.step}", "the loss must stay finite", record.loss, cure)
-        return JointState(state.step + 1, network, free, *moments), record
+        cure = "Lower train.learning_rate or train.optics_learning_rate."
+        line = history_line("train", state.step, loss, terms, rates._asdict(), cure)
+        return JointState(state.step + 1, network, free, *moments), line
 
     def reconstruct(self, state: JointState, batch: Batch) -> tuple[Capture, Float[Array, "b c y x"]]:
-        """Photograph and reconstruct scenes on one device, on the axis and without errors of a process.
+        """Captures of scenes, and their reconstructions in display values, on the axis and without process errors.
 
-        Returns:
-            the captures, and the pictures `[b, c, y, x]` in display values.
+        One device does it alone.
         """
         seen, keys = self._seen(batch, _SALT_LOOK, False)
         network, free, trainer = state.network, state.free, self
@@ -228,18 +190,18 @@ class Trainer(eqx.Module):
         return _look(network, free, trainer, seen, keys)
 
     def _seen(
-        self, batch: Batch, seed: int, off_axis: bool, *, part: bool = False
+        self, batch: Batch, seed: int, off_axis: bool, *, shared: bool = False
     ) -> tuple[TrainingScene, Key[Array, " b"]]:
-        """A batch, or this host's part of one, as the compiled step takes it, with a key of noise for every scene."""
-        count = len(batch.items)
+        """A batch, or this host's part of one that is shared, for the compiled step, with a noise key per scene."""
+        hosts, host = (jax.process_count(), jax.process_index()) if shared else (1, 0)
+        count = len(batch.items) // hosts
         # Scenes are numbered across hosts, so that sharing them out differently changes nothing.
-        hosts, host = (jax.process_count(), jax.process_index()) if part else (1, 0)
         first = (batch.step * hosts + host) * count
         items = []
-        for k in range(count):
+        for k, item in enumerate(batch.items[host * count : (host + 1) * count]):
             angles = _field_rad(self.spec, seed, first + k) if off_axis else (0.0, 0.0)
             # In single precision, as the compiled step has them.
-            scene = jax.tree.map(np.float32, self.bench.scene(batch.items[k].scene))
+            scene = jax.tree.map(np.float32, self.bench.scene(item.scene))
             depths = scene.background_depth_m, scene.obstructions[0].depth_m
             items.append(TrainingScene(scene, *(self.doe.sources(float(depth), angles) for depth in depths)))
         seen: TrainingScene = jax.tree.map(lambda *leaves: np.stack(leaves), *items)
@@ -264,23 +226,13 @@ class Trainer(eqx.Module):
 
 @eqx.filter_jit
 def _deviation(transmission: Array, height_m: Array, waves_per_metre: Array | float) -> Array:
-    """What a DOE as fabricated does to light beside its nominal heights."""
+    """Transmission of a DOE as fabricated over that of its nominal heights."""
     return transmission * jnp.exp(-2j * np.pi * height_m * waves_per_metre)
 
 
 def layout_of(spec: Spec, colours: int) -> NetworkShape:
     """Shape of a spec's network."""
-    given = spec.network
-    return NetworkShape(
-        colours,
-        given.width,
-        given.depth,
-        given.wiener,
-        given.features,
-        given.near_estimate,
-        given.refine,
-        given.variant,
-    )
+    return NetworkShape(colours, **dict(spec.network))
 
 
 def rates_at(train: TrainSpec, step: int) -> Rates:
@@ -296,10 +248,7 @@ def rates_at(train: TrainSpec, step: int) -> Rates:
 
 
 def devices_mesh(count: int | None = None) -> Mesh | None:
-    """A mesh of devices for `Trainer.of`; None for a single one.
-
-    Args:
-        count: number of devices; all there are, on all hosts, if None.
+    """A mesh of devices, all on all hosts by default; None for a single one.
 
     Raises:
         InputError: more than there are.
@@ -312,22 +261,18 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
     return None if wanted == 1 else Mesh(np.array(devices[:wanted]), (AXIS,))
 
 
-def _learnt_doe(spec: Spec, files: Mapping[str, Path], source: str) -> TrainingDoe:
+def _learnt_doe(spec: Spec, source: str) -> TrainingDoe:
     """A DOE that is learnt, or looked at off the axis, or with errors."""
-    problem = plans_of(spec.model_copy(update={"sensor": _odd_window(spec)}), files)
-    if not problem.radial:
-        # One compiled step serves all depths and fields.
-        optic = replace(problem.optic, source_kind=SeparableSource)
-        return TrainingDoe(optic, problem.plans, problem.parametrization)
-    if spec.train.field == "random" or spec.train.fabricated:
+    odd = spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
+    problem = plans_of(spec.model_copy(update={"sensor": odd}), {})
+    optic = problem.optic
+    if isinstance(optic, HeightOptic):  # one compiled step serves all depths and fields
+        optic = replace(optic, source_kind=SeparableSource)
+    elif spec.train.field == "random" or spec.train.fabricated:
         key = "field" if spec.train.field == "random" else "fabricated"
         cure = 'Use parametrization = "freeform" with this design as its start.'
         raise InputError(f"{source}: train.{key}", "must be left out for a design of rings", "it", cure)
-    return TrainingDoe(problem.optic, problem.plans, problem.parametrization)
-
-
-def _odd_window(spec: Spec) -> Any:
-    return spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
+    return TrainingDoe(optic, problem.plans, problem.parametrization)
 
 
 def resting_doe(spec: Spec, camera: Camera, kind: ObstructionKind, height_m: Float[np.ndarray, "y x"]) -> TrainingDoe:
@@ -354,61 +299,42 @@ def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
     return float(y), float(x)
 
 
-Learnt = tuple[Network, Any]
-
-
-def _loss(
+@partial(eqx.filter_value_and_grad, has_aux=True)
+def _slopes(
     moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array
 ) -> tuple[Array, Array]:
+    """The loss and its terms, with the gradient by all that moves."""
     network, free = eqx.combine(moving, still)
     train = trainer.spec.train
     found = shots(seen, trainer.doe, free, softness, trainer.bench, keys)
-    picture = network(
-        found.capture,
-        found.far,
-        found.near,
-        half=train.precision == "mixed",
-        checkpointed=train.checkpointing,
-    )
+    half, checkpointed = train.precision == "mixed", train.checkpointing
+    picture = network(found.capture, found.far, found.near, half=half, checkpointed=checkpointed)
     reference, mask = srgb_from_linear(jnp.asarray(seen.scene.background)), seen.scene.obstructions[0].mask
-    return losses(picture, reference, jnp.asarray(mask), trainer.weights, trainer.perceptual)
+    return losses(picture, reference, jnp.asarray(mask), train, trainer.perceptual)
 
 
-def _slopes(
-    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array
-) -> tuple[tuple[Array, Array], Any]:
-    return eqx.filter_value_and_grad(_loss, has_aux=True)(moving, still, trainer, seen, keys, softness)
-
-
-def _averaged(trainer: Trainer) -> Callable[..., Any]:
-    """`_slopes` over all devices of the trainer."""
+def _mean_slopes(moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array) -> Any:
+    """`_slopes`, averaged over all devices of the trainer."""
     if trainer.mesh is None:
-        return _slopes
-    here, shared = PartitionSpec(AXIS), PartitionSpec()
-    arrays, rest = eqx.partition(trainer, eqx.is_array)
+        return _slopes(moving, still, trainer, seen, keys, softness)
+    arrays, rest = eqx.partition((still, trainer), eqx.is_array)
 
-    def local(moving: Any, still: Any, arrays: Any, seen: TrainingScene, keys: Array, softness: Array) -> Any:
-        found = _slopes(moving, still, eqx.combine(arrays, rest), seen, keys, softness)
+    def local(moving: Any, arrays: Any, seen: TrainingScene, keys: Array, softness: Array) -> Any:
+        still, trainer = eqx.combine(arrays, rest)
+        found = _slopes(moving, still, trainer, seen, keys, softness)
         return jax.tree.map(lambda leaf: jax.lax.pmean(leaf, AXIS), found)
 
-    def whole(moving: Any, still: Any, _: Trainer, seen: TrainingScene, keys: Array, softness: Array) -> Any:
-        solid, hollow = eqx.partition(still, eqx.is_array)
-        call = jax.shard_map(
-            lambda m, s, a, x, k, f: local(m, eqx.combine(s, hollow), a, x, k, f),
-            mesh=trainer.mesh,
-            in_specs=(shared, shared, shared, here, here, shared),
-            out_specs=shared,
-            check_vma=False,
-        )
-        return call(moving, solid, arrays, seen, keys, softness)
-
-    return whole
+    here, shared = PartitionSpec(AXIS), PartitionSpec()
+    specs = (shared, shared, here, here, shared)
+    call = jax.shard_map(local, mesh=trainer.mesh, in_specs=specs, out_specs=shared, check_vma=False)
+    return call(moving, arrays, seen, keys, softness)
 
 
-Constants = tuple[Trainer, TrainingScene, Array, Array, Array, tuple[bool, bool]]
+_Learnt = tuple[Network, Any]
+_Constants = tuple[Trainer, TrainingScene, Array, Array, Array, tuple[bool, bool]]
 
 
-def _take(constants: Constants, changing: tuple[Learnt, tuple[Any, Any]]) -> Any:
+def _take(constants: _Constants, changing: tuple[_Learnt, tuple[Any, Any]]) -> Any:
     """One step in arrays."""
     trainer, seen, keys, softness, rates, moves = constants
     learnt, moments = changing
@@ -417,22 +343,16 @@ def _take(constants: Constants, changing: tuple[Learnt, tuple[Any, Any]]) -> Any
         for part, move in zip(learnt, moves, strict=True)
     )
     moving, still = eqx.partition(learnt, chosen)
-    (loss, terms), slopes = _averaged(trainer)(moving, still, trainer, seen, keys, softness)
+    (loss, terms), slopes = _mean_slopes(moving, still, trainer, seen, keys, softness)
     fresh = [
-        _moved(part, slope, moment, rate) if move else (part, moment)
+        adam_step(part, slope, moment, rate) if move else (part, moment)
         for part, slope, moment, rate, move in zip(learnt, slopes, moments, rates, moves, strict=True)
     ]
     return tuple(part for part, _ in fresh), tuple(moment for _, moment in fresh), loss, terms
 
 
-def _moved(part: Any, slope: Any, moment: optax.OptState, rate: Array) -> tuple[Any, optax.OptState]:
-    """One step of Adam."""
-    direction, moment = optax.scale_by_adam().update(slope, moment)
-    return eqx.apply_updates(part, jax.tree.map(lambda d: -rate * d, direction)), moment
-
-
 @cache
-def _update() -> Callable[[Constants, tuple[Learnt, tuple[Any, Any]]], Any]:
+def _update() -> Callable[[_Constants, tuple[_Learnt, tuple[Any, Any]]], Any]:
     """The compiled step. Made on first use: several hosts have to find each other first."""
     return compiled_step(_take)
 

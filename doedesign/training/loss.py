@@ -1,50 +1,67 @@
-"""What training minimises (paper eq. 13): mean absolute error, perceptual distance, and the error where it was hidden.
+"""The loss of training (paper eq. 13), a step of Adam along it, and its line in the history.
 
-All of it is in display values, which is how pictures are looked at. The masked term is a mean over the whole picture,
-so a small obstruction weighs little; its mask is the sharp one, before any blur.
+The loss is the mean absolute error, the perceptual distance and the error where the scene was hidden, each with its
+weight, in display values, which is how pictures are looked at. The masked term is a mean over the whole picture, so a
+small obstruction weighs little; its mask is the sharp one, before any blur.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+import optax
 from jaxtyping import Array, Float
 
+from doedesign.spec.training import TrainSpec
+from fab.errors import InputError
 
-class Weights(NamedTuple):
-    """Weight of every term; see `losses`."""
-
-    l1: float = 1.0
-    perceptual: float = 1.0
-    masked: float = 1.0
-
-
-TERMS = Weights._fields
+_TERMS = ("l1", "perceptual", "masked")
 
 
 def losses(
     reconstruction: Float[Array, "b c y x"],
     reference: Float[Array, "b c y x"],
     mask: Float[Array, "b y x"],
-    weights: Weights,
+    options: TrainSpec,
     perceptual: Any = None,
 ) -> tuple[Float[Array, ""], Float[Array, " term"]]:
-    """The loss, and its terms before they are weighted.
+    """The loss, a mean over the batch, and its terms `[l1, perceptual, masked]` before they are weighted.
 
     Args:
         reconstruction: `[b, c, y, x]` display values, not clipped.
         reference: `[b, c, y, x]` display values of the scene alone.
         mask: `[b, y, x]` share of each direction that was blocked.
-        weights: weight of every term.
+        options: weights of the terms.
         perceptual: distance of two batches, `[b]` (`doedesign.training.perceptual`); left out where its weight is 0.
-
-    Returns:
-        the loss, a mean over the batch, and `[l1, perceptual, masked]`.
     """
     error = jnp.abs(reconstruction - reference)
     parts = [
         jnp.mean(error),
-        jnp.mean(perceptual(reconstruction, reference)) if weights.perceptual and perceptual is not None else 0.0,
+        jnp.mean(perceptual(reconstruction, reference)) if options.perceptual and perceptual is not None else 0.0,
         jnp.mean(error * mask[:, None]),
     ]
     terms = jnp.stack([jnp.asarray(part, jnp.float32) for part in parts])
-    return jnp.dot(jnp.asarray(weights, jnp.float32), terms), terms
+    return jnp.dot(jnp.asarray((options.l1, options.perceptual, options.masked), jnp.float32), terms), terms
+
+
+def adam_step(part: Any, slope: Any, moments: optax.OptState, rate: Array) -> tuple[Any, optax.OptState]:
+    """One step of Adam: the moved part, and the new moments."""
+    direction, moments = optax.scale_by_adam().update(slope, moments)
+    return eqx.apply_updates(part, jax.tree.map(lambda d: -rate * d, direction)), moments
+
+
+def history_line(
+    name: str, step: int, loss: Array, terms: Array, rates: Mapping[str, float], cure: str
+) -> dict[str, Any]:
+    """The line of the history (`doedesign.training.history`): the loss of a step before its update.
+
+    Raises:
+        InputError: the loss is no longer finite.
+    """
+    if not np.isfinite(loss):
+        raise InputError(f"{name}, step {step}", "the loss must stay finite", float(loss), cure)
+    parts = dict(zip(_TERMS, np.asarray(terms).tolist(), strict=True))
+    return {"step": step, "loss": float(loss), "parts": parts, "learning_rates": rates}

@@ -38,11 +38,7 @@ class TrainingDoe(eqx.Module):
         return cls(optic, tuple(optic.plan(line, np.inf) for line in optic.lines))
 
     def sources(self, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> tuple[Any, ...]:
-        """A point source, for every line.
-
-        Raises:
-            ValueError: a source off the axis of a DOE of rings.
-        """
+        """A point source, for every line; ValueError for one off the axis of a DOE of rings."""
         return tuple(self.optic.source(line, depth_m, field_rad) for line in self.optic.lines)
 
     def psf(self, free: Array | None, softness: Array, sources: tuple[Any, ...]) -> Float[Array, "c y x"]:
@@ -69,13 +65,7 @@ class TrainingDoe(eqx.Module):
 
 
 class TrainingScene(NamedTuple):
-    """One scene as the training sees it.
-
-    Attributes:
-        scene: one obstruction before a background, colours those of the camera, depths in single precision.
-        far: source in the background, (`TrainingDoe.sources`).
-        near: source in the obstruction.
-    """
+    """One obstruction before a background, in the camera's colours, with the `TrainingDoe.sources` in both."""
 
     scene: Scene
     far: Any
@@ -83,34 +73,11 @@ class TrainingScene(NamedTuple):
 
 
 class Capture(NamedTuple):
-    """A developed capture and the PSFs behind it.
+    """Developed captures, linear light with noise and white 1, and the PSFs of background and obstruction behind it."""
 
-    Attributes:
-        capture: `[c, y, x]` linear light with noise, white 1.
-        far: `[c, y, x]` PSFs of the background.
-        near: `[c, y, x]` PSFs of the obstruction.
-    """
-
-    capture: Float[Array, "c y x"]
-    far: Float[Array, "c y x"]
-    near: Float[Array, "c y x"]
-
-
-def shot(
-    seen: TrainingScene, doe: TrainingDoe, free: Array | None, softness: Array, bench: CaptureModel, key: Key[Array, ""]
-) -> Capture:
-    """Photograph a scene through a DOE.
-
-    Args:
-        seen: the scene.
-        doe: the DOE.
-        free: its parameters; None for one at rest.
-        softness: of the quantisation (`doedesign.design.parametrize.softness_at`).
-        bench: the rest of the camera.
-        key: key of the noise.
-    """
-    far, near = (doe.psf(free, softness, sources) for sources in (seen.far, seen.near))
-    return Capture(bench.developed(jax.tree.map(jnp.asarray, seen.scene), far, near, key), far, near)
+    capture: Float[Array, "*b c y x"]
+    far: Float[Array, "*b c ky kx"]
+    near: Float[Array, "*b c ky kx"]
 
 
 def shots(
@@ -121,8 +88,22 @@ def shots(
     bench: CaptureModel,
     keys: Key[Array, " b"],
 ) -> Capture:
-    """Photograph a batch, one scene after the other: every array of `seen`, and `keys`, has a first axis for it."""
+    """Photograph a batch, one scene after the other: every array of `seen`, and `keys`, has a first axis for it.
+
+    Args:
+        seen: the scenes.
+        doe: the DOE.
+        free: its parameters; None for one at rest.
+        softness: of the quantisation (`doedesign.design.parametrize.softness_at`).
+        bench: the rest of the camera.
+        keys: keys of the noise.
+    """
+
+    def shot(given: tuple[TrainingScene, Key[Array, ""]]) -> Capture:
+        one, key = given
+        far, near = (doe.psf(free, softness, sources) for sources in (one.far, one.near))
+        return Capture(bench.developed(jax.tree.map(jnp.asarray, one.scene), far, near, key), far, near)
+
     if len(keys) == 1:
-        one = shot(jax.tree.map(lambda leaf: leaf[0], seen), doe, free, softness, bench, keys[0])
-        return jax.tree.map(lambda leaf: leaf[None], one)
-    return jax.lax.map(lambda given: shot(given[0], doe, free, softness, bench, given[1]), (seen, keys))
+        return jax.tree.map(lambda leaf: leaf[None], shot(jax.tree.map(lambda leaf: leaf[0], (seen, keys))))
+    return jax.lax.map(shot, (seen, keys))

@@ -1,4 +1,4 @@
-"""Real pairs for fine-tuning: captures through a DOE, and what was to be seen; found, split, read, and cut into crops.
+"""Real pairs for fine-tuning: captures through a DOE with their references; found, split, read, and cut into crops.
 
     DIR/NAME_capture.png     DIR/capture/NAME.png       through the DOE and the obstruction
     DIR/NAME_reference.png   DIR/reference/NAME.png     the same frame without either, pixel for pixel
@@ -28,6 +28,7 @@ from jaxtyping import Float
 from doedesign.capture.scenes import Batch, batches_ahead, epoch_order
 from doedesign.recon.model import Model
 from doedesign.recon.photos import PHOTO_FILES, read_capture
+from doedesign.training.evaluation import Split
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes, sha256_file
 from sim.light import srgb_from_linear
@@ -40,14 +41,7 @@ _THREADS, _AHEAD = 4, 8
 
 
 class PairFiles(NamedTuple):
-    """Files of one pair.
-
-    Attributes:
-        name: what both are called.
-        capture: the capture.
-        reference: what was to be seen.
-        mask: where it was covered, if known.
-    """
+    """Files of one pair, and the name that they share; the mask where it is known."""
 
     name: str
     capture: Path
@@ -60,7 +54,7 @@ class CapturePair(NamedTuple):
 
     Attributes:
         capture: `[c, y, x]` linear light, white 1.
-        reference: `[c, y, x]` display values of what was to be seen.
+        reference: `[c, y, x]` display values of the scene alone.
         mask: `[y, x]` share of each pixel that was covered; 0 where it is not known.
     """
 
@@ -109,21 +103,7 @@ def _parts(folder: Path) -> Iterator[tuple[str, str, Path]]:
         raise explain_os_error(error, str(error.filename or folder)) from error
 
 
-class PairSplit(NamedTuple):
-    """Two sets of pairs without a view in common.
-
-    Attributes:
-        training: pairs to train on.
-        held_out: pairs that are never trained on.
-        left_out: pairs that are neither, since they share a file's content with one held out.
-    """
-
-    training: tuple[PairFiles, ...]
-    held_out: tuple[PairFiles, ...]
-    left_out: tuple[PairFiles, ...]
-
-
-def split_pairs(pairs: Sequence[PairFiles], count: int | None, seed: int, where: str) -> PairSplit:
+def split_pairs(pairs: Sequence[PairFiles], count: int | None, seed: int, where: str) -> Split:
     """Keep some pairs away from training.
 
     Args:
@@ -149,7 +129,7 @@ def split_pairs(pairs: Sequence[PairFiles], count: int | None, seed: int, where:
     if not training:
         rule = "a pair must be left to train on, none of whose pictures is held out"
         raise InputError(where, rule, f"{len(pairs)} pairs that share theirs", "Give pairs of other views.")
-    return PairSplit(training, tuple(pairs[int(k)] for k in order), left_out)
+    return Split(training, tuple(pairs[int(k)] for k in order), left_out)
 
 
 def _digests(pair: PairFiles) -> list[str]:
@@ -165,12 +145,7 @@ def pairs_digest(pairs: Sequence[PairFiles]) -> str:
 
 
 def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> CapturePair:
-    """Read one pair.
-
-    Args:
-        files: its files.
-        model: the model, for its colours.
-        linear: whether PNG and TIFF hold linear light; by default what is usual for their kind.
+    """Read one pair in the colours of a model; `linear` as in `doedesign.recon.photos.read_capture`.
 
     Raises:
         InputError: a file that cannot be used, or files of different sizes.
@@ -181,23 +156,16 @@ def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Cap
     if files.mask is not None:
         # A share of a pixel follows no curve. Colours of a mask are all the same.
         mask = np.clip(read_capture(files.mask, linear=True).light.mean(axis=0), 0, 1)
-    for path, image in ((files.reference, reference), (files.mask, mask)):
-        if image.shape[-2:] != capture.shape[1:]:
-            rule = f"must have the {_size(capture)} pixels of {files.capture.name}"
-            raise InputError(str(path), rule, _size(image), "Cut both to the same frame.")
+    wanted, *found = (f"{image.shape[-1]} x {image.shape[-2]}" for image in (capture, reference, mask))
+    for path, size in zip((files.reference, files.mask), found, strict=True):
+        if size != wanted:
+            rule = f"must have the {wanted} pixels of {files.capture.name}"
+            raise InputError(str(path), rule, size, "Cut both to the same frame.")
     return CapturePair(capture, srgb_from_linear(reference).astype(np.float32), mask)
 
 
-def _size(image: np.ndarray) -> str:
-    return f"{image.shape[-1]} x {image.shape[-2]}"
-
-
 class Pairs:
-    """Pairs by their number; those that are read first are kept, as long as there is room.
-
-    Attributes:
-        files: their files.
-    """
+    """Pairs by their number; those that are read first are kept, as long as there is room."""
 
     def __init__(
         self, files: Sequence[PairFiles], model: Model, linear: bool | None = None, most_bytes: int = _MOST_BYTES
@@ -211,11 +179,7 @@ class Pairs:
         return len(self.files)
 
     def get(self, index: int) -> CapturePair:
-        """One pair.
-
-        Raises:
-            InputError: see `read_pair`.
-        """
+        """One pair; see `read_pair`."""
         with self._lock:
             if index in self._kept:
                 return self._kept[index]
@@ -228,24 +192,14 @@ class Pairs:
         return pair
 
     def least_size(self) -> tuple[int, int]:
-        """Rows and columns that every pair has; all are read for it, and refused if they cannot be used.
-
-        Raises:
-            InputError: see `read_pair`.
-        """
+        """Rows and columns that every pair has; all are read for it, and refused if they cannot be used."""
         with ThreadPoolExecutor(_THREADS) as pool:
             sizes = list(pool.map(lambda k: self.get(k).capture.shape[1:], range(len(self))))
         return min(y for y, _ in sizes), min(x for _, x in sizes)
 
 
 class PairCrop(NamedTuple):
-    """A crop of a pair.
-
-    Attributes:
-        name: of the pair.
-        pair: the crop.
-        mirrored: whether left and right are exchanged.
-    """
+    """A crop of the pair of this name, and whether left and right are exchanged."""
 
     name: str
     pair: CapturePair
@@ -287,13 +241,7 @@ class PairData:
 
 
 def cut(pair: CapturePair, shape: tuple[int, int], place: tuple[float, float] = (0.5, 0.5)) -> CapturePair:
-    """The same crop of everything in a pair.
-
-    Args:
-        pair: the pair.
-        shape: pixels (y, x) of the crop.
-        place: where it lies, from 0 (lowest) to 1.
-    """
+    """The same crop of everything in a pair: `shape` pixels (y, x) at a `place` from 0 (lowest) to 1."""
     spare = [have - want for have, want in zip(pair.mask.shape, shape, strict=True)]
     y, x = (min(int(share * (most + 1)), most) for share, most in zip(place, spare, strict=True))
     return CapturePair(*(image[..., y : y + shape[0], x : x + shape[1]] for image in pair))
@@ -305,7 +253,7 @@ def crop_shape(least: tuple[int, int], size: int, multiple: int, where: str) -> 
     Args:
         least: rows and columns that every pair has.
         size: pixels per side that are wanted.
-        multiple: what both have to be multiples of (`NetworkShape.multiple`).
+        multiple: divisor of both (`NetworkShape.multiple`).
         where: the folder, for messages.
 
     Raises:

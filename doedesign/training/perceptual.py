@@ -26,10 +26,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from doedesign.training.backbones import Backbone, backbone_of, convolutions, least_px, taps_of, weight_shapes
+from doedesign.training.backbones import LEAST_PX, Backbone, backbone_of, convolutions, taps_of, weight_shapes
 from doedesign.training.similarity import Images, MsSsim
 from fab.errors import InputError
-from fab.files import explain_os_error, sha256_file
+from fab.files import sha256_file
+from fab.pictures import decoding
 
 # Mean and spread of each colour that the backbones were trained with, for values from -1 to 1.
 _MEAN = np.array([-0.030, -0.088, -0.188], np.float32)
@@ -47,7 +48,7 @@ class Lpips(eqx.Module):
         biases: of every convolution.
         heads: weight of every channel of each tap.
         backbone: which network.
-        digest: SHA-256 of the files that the weights were read from, joined by "+" where there are several.
+        digest: SHA-256 of the files that the weights were read from, joined by "+".
     """
 
     kernels: dict[str, Float[Array, "_ _ _ _"]]
@@ -58,56 +59,43 @@ class Lpips(eqx.Module):
 
     @property
     def name(self) -> str:
-        """What a run's record calls it."""
+        """Name in a run's record."""
         return f"lpips_{self.backbone}"
 
     @property
     def least_px(self) -> int:
         """Rows and columns that a picture must have at least."""
-        return least_px(self.backbone)
+        return LEAST_PX[self.backbone]
 
     def __call__(self, a: Images, b: Images) -> Float[Array, " b"]:
-        """Distance of pictures; see `lpips`."""
-        return lpips(self, a, b)
+        """LPIPS distance of pictures, 0 for equal ones and about 1 for unlike ones.
 
+        Args:
+            a: `[b, c, y, x]` display values, white 1, row 0 at the lowest y; three colours, or one that stands for all.
+            b: the pictures to compare with.
 
-def lpips(model: Lpips, a: Images, b: Images) -> Float[Array, " b"]:
-    """LPIPS distance of pictures, 0 for equal ones and about 1 for unlike ones.
+        Raises:
+            ValueError: unlike shapes, other numbers of colours, or a picture smaller than `least_px`.
+        """
+        return jnp.sum(jnp.stack([jnp.mean(each, (1, 2)) for each in _taps(self, a, b)]), axis=0)
 
-    Args:
-        model: the weights.
-        a: `[b, c, y, x]` display values, white 1, row 0 at the lowest y; three colours, or one that stands for all.
-        b: the pictures to compare with.
+    def map(self, a: Images, b: Images) -> Float[Array, "b y x"]:
+        """Where pictures differ: the maps of all taps, each enlarged to the pictures' size (linearly), and summed.
 
-    Raises:
-        ValueError: unlike shapes, other numbers of colours, or a picture smaller than `model.least_px`.
-    """
-    return jnp.sum(jnp.stack([jnp.mean(each, (1, 2)) for each in _taps(model, a, b)]), axis=0)
-
-
-def lpips_map(model: Lpips, a: Images, b: Images) -> Float[Array, "b y x"]:
-    """Where pictures differ: the maps of all taps, each enlarged to the pictures' size (linearly), and summed.
-
-    This is what the authors' code calls `spatial`. Its mean is `lpips` but for what enlarging does at the edges. A deep
-    feature sees far beyond its own place, so a small region's share is only roughly its own.
-
-    Returns:
-        `[b, y, x]`, row 0 at the lowest y.
-
-    Raises:
-        ValueError: as `lpips`.
-    """
-    size = (a.shape[0], *a.shape[2:])
-    large = [jax.image.resize(each, size, "linear", antialias=False) for each in _taps(model, a, b)]
-    return jnp.sum(jnp.stack(large), axis=0)[:, ::-1]
+        This is what the authors' code calls `spatial`. Its mean is the distance but for what enlarging does at the
+        edges. A deep feature sees far beyond its own place, so a small region's share is only roughly its own.
+        Arguments and errors are those of the distance.
+        """
+        size = (a.shape[0], *a.shape[2:])
+        large = [jax.image.resize(each, size, "linear", antialias=False) for each in _taps(self, a, b)]
+        return jnp.sum(jnp.stack(large), axis=0)[:, ::-1]
 
 
 def _taps(model: Lpips, a: Images, b: Images) -> list[Float[Array, "b _ _"]]:
     """Weighted squared difference at every tap, first row at the top."""
     if a.shape != b.shape or a.shape[1] not in (1, 3):
         raise ValueError(f"both pictures must have one shape and 1 or 3 colours, but got {a.shape} and {b.shape}")
-    if min(a.shape[2:]) < model.least_px:
-        least = model.least_px
+    if min(a.shape[2:]) < (least := model.least_px):
         raise ValueError(f"{model.name} needs pictures of at least {least} x {least} pixels, but got {a.shape[2:]}")
     # One after the other, not as one batch: nothing flows back through the reference.
     pairs = zip(model.heads, _features(model, a), _features(model, b), strict=True)
@@ -174,18 +162,10 @@ def read_lpips(paths: Sequence[Path]) -> Lpips:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Weights of one file; numpy leaves a damaged archive open, so it is opened here."""
     rule = "must be a whole .npz file of numbers"
-    try:
-        # Opened here, since numpy leaves a damaged archive open.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files if re.fullmatch(r"features\..*|lin\d+", key)}
-    except OSError as error:
-        if error.errno is not None:
-            raise explain_os_error(error, path) from error
-        raise InputError(str(path), rule, f'"{error}"', _CURE) from error
-    # What comes of other files depends on how they begin and where they are damaged.
-    except Exception as error:
-        raise InputError(str(path), rule, f'"{" ".join(str(error).split())}"', _CURE) from error
+    with decoding(path, rule, _CURE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files if re.fullmatch(r"features\..*|lin\d+", key)}
 
 
 def _checked(weights: Mapping[str, np.ndarray], where: str) -> tuple[Backbone, dict[str, np.ndarray]]:
@@ -205,7 +185,7 @@ def _checked(weights: Mapping[str, np.ndarray], where: str) -> tuple[Backbone, d
         if weights[key].shape != shape or weights[key].dtype.kind != "f":
             got = f"{weights[key].dtype} {weights[key].shape}"
             raise InputError(where, f"{key} of the {backbone} backbone must be floats {shape}", got, _CURE)
-        with np.errstate(over="ignore"):  # told by the next line
+        with np.errstate(over="ignore"):  # refused below
             checked[key] = weights[key].astype(np.float32)
         if not np.isfinite(checked[key]).all():
             raise InputError(where, f"{key} must be finite in float32", "NaN or infinity", _CURE)

@@ -12,8 +12,8 @@ where a soft mask ends is not said, so this is our own protocol:
   surroundings too, so it says less about small regions than the other two.
 - Scores are taken per picture and then averaged. A picture without occluded pixels has no score there (NaN).
 
-What separates two methods is told by the pictures' own differences, not by the spread between easy and hard pictures:
-`paired_difference`.
+`paired_difference` compares two methods by the differences of every picture, not by the spread between easy and hard
+ones.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float
 
-from doedesign.training.perceptual import Lpips, lpips, lpips_map
+from doedesign.training.perceptual import Lpips
 from doedesign.training.similarity import WINDOW, Images, ssim_maps
 
 Masks = Float[Array, "b y x"] | Float[np.ndarray, "b y x"]
@@ -47,12 +47,7 @@ class Region(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Scores of every picture.
-
-    Attributes:
-        occluded: where the mask is at least one half; NaN where it nowhere is.
-        full: over the full image.
-    """
+    """Scores where the mask is at least one half (NaN where it nowhere is), and over the full image."""
 
     occluded: Region
     full: Region
@@ -74,8 +69,8 @@ def scores(recon: Images, reference: Images, mask: Masks, perceptual: Lpips | No
     a, b = _shown(recon), _shown(reference)
     of_region = of_full = None
     if perceptual is not None:
-        of_region = 1 - _mean_within(lpips_map(perceptual, a, b), occluded(mask))
-        of_full = 1 - lpips(perceptual, a, b)
+        of_region = 1 - _mean_within(perceptual.map(a, b), occluded(mask))
+        of_full = 1 - perceptual(a, b)
     return Scores(
         Region(ssim(a, b, mask), psnr(a, b, mask), of_region),
         Region(ssim(a, b), psnr(a, b), of_full),
@@ -88,29 +83,14 @@ def occluded(mask: Masks) -> Bool[Array, "b y x"]:
 
 
 def psnr(recon: Images, reference: Images, mask: Masks | None = None) -> Float[Array, " b"]:
-    """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error, for a white of 1.
-
-    Args:
-        recon: `[b, c, y, x]` display values; clipped to 0..1.
-        reference: the pictures to compare with.
-        mask: `[b, y, x]` restricts it to where this is at least one half.
-    """
+    """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error, for a white of 1; see `scores`."""
     error = jnp.mean(jnp.square(_shown(recon) - _shown(reference)), axis=1)
     return -10 * jnp.log10(_mean_within(error, None if mask is None else occluded(mask)))
 
 
 def ssim(recon: Images, reference: Images, mask: Masks | None = None) -> Float[Array, " b"]:
-    """Structural similarity, averaged over colours.
-
-    Args:
-        recon: `[b, c, y, x]` display values; clipped to 0..1.
-        reference: the pictures to compare with.
-        mask: `[b, y, x]` restricts it to where this is at least one half.
-
-    Raises:
-        ValueError: unlike shapes, or pictures smaller than the window.
-    """
-    values = jnp.mean(ssim_maps(_shown(recon), _shown(reference)).ssim, axis=1)
+    """Structural similarity, averaged over colours; see `scores`."""
+    values = jnp.mean(ssim_maps(_shown(recon), _shown(reference))[0], axis=1)
     frame = slice(WINDOW // 2, -(WINDOW // 2))
     return _mean_within(values, None if mask is None else occluded(mask)[:, frame, frame])
 
@@ -125,14 +105,7 @@ def _mean_within(values: Float[Array, "b y x"], region: Bool[Array, "b y x"] | N
 
 
 class Interval(NamedTuple):
-    """A mean and where it may lie.
-
-    Attributes:
-        mean: of the values.
-        low: lower end of its confidence interval.
-        high: upper end.
-        size: how many pictures there were.
-    """
+    """A mean over `size` pictures, and the ends of its confidence interval."""
 
     mean: float
     low: float
@@ -150,10 +123,7 @@ def mean_and_interval(values: Values, confidence: float = 0.95) -> Interval:
 
     Args:
         values: `[picture]` or `[seed, picture]` scores; a picture with a NaN (which has no score) is left out.
-        confidence: how often such an interval holds the true mean, between 0 and 1.
-
-    Returns:
-        The mean and the number of pictures; the interval is infinite for a single picture.
+        confidence: how often such an interval holds the true mean, between 0 and 1; it is infinite for one picture.
 
     Raises:
         ValueError: no value, an infinite one, or a confidence out of range.
@@ -179,19 +149,11 @@ def mean_and_interval(values: Values, confidence: float = 0.95) -> Interval:
 
 
 def paired_difference(a: Values, b: Values, confidence: float = 0.95) -> Interval:
-    """By how much `a` is above `b` on the same pictures: the mean of the differences, with its interval.
+    """By how much `a` is above `b`, another method on the same pictures (and seeds): the mean difference.
 
-    Args:
-        a: `[picture]` or `[seed, picture]` scores.
-        b: scores of another method on the same pictures (and with the same seeds), in the same order.
-        confidence: as in `mean_and_interval`.
-
-    Raises:
-        ValueError: unlike numbers of scores, or as in `mean_and_interval`.
+    Arguments and errors are those of `mean_and_interval`; unlike numbers of scores are a ValueError, too.
     """
-    shapes = np.shape(a), np.shape(b)
-    if shapes[0] != shapes[1]:
-        raise ValueError(
-            f"both methods must have one score per picture (and seed), but got {shapes[0]} and {shapes[1]}"
-        )
+    if np.shape(a) != np.shape(b):
+        got = f"{np.shape(a)} and {np.shape(b)}"
+        raise ValueError(f"both methods must have one score per picture (and seed), but got {got}")
     return mean_and_interval(np.asarray(a, np.float64) - np.asarray(b, np.float64), confidence)

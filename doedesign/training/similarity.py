@@ -10,7 +10,7 @@ so maps are smaller than pictures by 5 pixels on every side. Values are display 
 """
 
 from math import log2
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -30,24 +30,13 @@ _EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _FLOOR = 1e-3
 
 
-class SsimMaps(NamedTuple):
-    """Terms of SSIM about every pixel.
-
-    Attributes:
-        ssim: `[b, c, y - 10, x - 10]` all of them.
-        contrast: the same without the comparison of means.
-    """
-
-    ssim: Float[Array, "b c v u"]
-    contrast: Float[Array, "b c v u"]
+Maps = Float[Array, "b c v u"]
 
 
-def ssim_maps(a: Images, b: Images) -> SsimMaps:
-    """SSIM about every pixel whose window lies within the picture; eq. 13 of the 2004 paper.
+def ssim_maps(a: Images, b: Images) -> tuple[Maps, Maps]:
+    """SSIM about every pixel whose window lies within the picture, with and without the comparison of means.
 
-    Args:
-        a: `[b, c, y, x]` display values.
-        b: the pictures to compare with.
+    Eq. 13 of the 2004 paper, for display values `[b, c, y, x]`; maps are `[b, c, y - 10, x - 10]`.
 
     Raises:
         ValueError: unlike shapes, or pictures smaller than the window.
@@ -61,7 +50,7 @@ def ssim_maps(a: Images, b: Images) -> SsimMaps:
     variances = _windowed(a * a) - mean_a**2 + _windowed(b * b) - mean_b**2
     covariance = _windowed(a * b) - mean_a * mean_b
     contrast = (2 * covariance + _C2) / (variances + _C2)
-    return SsimMaps((2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1) * contrast, contrast)
+    return (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1) * contrast, contrast
 
 
 def _windowed(image: Float[Array, "b c y x"]) -> Float[Array, "b c v u"]:
@@ -81,19 +70,14 @@ def _bands(samples: int) -> Float[np.ndarray, "v y"]:
 
 
 def ms_ssim(a: Images, b: Images) -> Float[Array, " b"]:
-    """Multi-scale SSIM, averaged over colours; eq. 7 of the 2003 paper.
+    """Multi-scale SSIM of display values `[b, c, y, x]`, averaged over colours; eq. 7 of the 2003 paper.
+
+    1 for equal pictures, near 0 for unlike ones.
 
     Between scales two by two pixels are averaged; an odd last row or column is dropped. A picture whose shorter side
     has less than 176 pixels has room for fewer than five scales: the finest ones are taken, and their exponents brought
     back to unit sum. A scale whose mean is below 0.001, or negative (structure that is inverted), counts as 0.001 and
     has no slope: its power would be undefined, or infinitely steep.
-
-    Args:
-        a: `[b, c, y, x]` display values.
-        b: the pictures to compare with.
-
-    Returns:
-        1 for equal pictures, near 0 for unlike ones.
 
     Raises:
         ValueError: unlike shapes, or pictures smaller than the window.
@@ -105,9 +89,9 @@ def ms_ssim(a: Images, b: Images) -> Float[Array, " b"]:
     for k, exponent in enumerate(exponents):
         if k:
             a, b = _halved(a), _halved(b)
-        maps = ssim_maps(a, b)
+        whole, contrast = ssim_maps(a, b)
         # Means are compared at the coarsest scale only.
-        mean = jnp.mean(maps.ssim if k == scales - 1 else maps.contrast, (-2, -1))
+        mean = jnp.mean(whole if k == scales - 1 else contrast, (-2, -1))
         result = result * jnp.maximum(mean, _FLOOR) ** exponent
     return jnp.mean(result, axis=1)
 
@@ -119,20 +103,15 @@ def _halved(image: Float[Array, "b c y x"]) -> Float[Array, "b c v u"]:
 
 
 class MsSsim(eqx.Module):
-    """1 - MS-SSIM as a distance: what stands in for LPIPS where its weights are not at hand.
+    """1 - MS-SSIM as a distance, in place of LPIPS where its weights are not at hand.
 
     It sees structure from one pixel to some hundred, but knows nothing of things: texture that is like the true one
-    without being it counts as an error, as in any comparison by pixels.
-
-    Attributes:
-        name: what a run's record calls it.
-        digest: empty, since it has no weights.
-        least_px: rows and columns that a picture must have at least.
+    without being it counts as an error, as in any comparison by pixels. A run's record has its name, and an empty
+    digest, since it has no weights.
     """
 
     name: ClassVar[str] = "ms_ssim"
     digest: ClassVar[str] = ""
-    least_px: ClassVar[int] = WINDOW
 
     def __call__(self, a: Images, b: Images) -> Float[Array, " b"]:
         """Distance of pictures, 0 to about 1."""

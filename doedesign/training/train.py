@@ -13,35 +13,49 @@ A folder of a training (`doedesign.training.job`) has besides
 
 import logging
 import os
-import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from doedesign import __version__
 from doedesign.build import camera_from_spec
-from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, plain_parameters
+from doedesign.capture.camera import depth_range_m
+from doedesign.capture.from_spec import (
+    channels_from_rgb,
+    obstruction_from_spec,
+    occlusion_from_spec,
+    plain_parameters,
+    rgb_from_channels,
+)
 from doedesign.capture.images import Pictures
 from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
+from doedesign.recon.baselines import noise_to_signal, noise_variance, richardson_lucy, wiener
 from doedesign.recon.model import Model
+from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs.folder import CONTINUOUS, TRAINING
-from doedesign.runtime.stopping import stoppable
-from doedesign.spec import Spec, spec_digest, spec_from_json, spec_to_json, spec_to_toml
-from doedesign.training.evaluation import EvaluationResult
+from doedesign.runs.level_maps import write_design
+from doedesign.spec import Spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
+from doedesign.training.evaluation import SCENE_SEED, EvaluationResult, HeldOutScene, judge, split_pictures
 from doedesign.training.history import require_tensorboard
 from doedesign.training.hosts import join_hosts
-from doedesign.training.job import TrainingJob, perceptual_distance, run_job
-from doedesign.training.joint import JointState, Trainer, devices_mesh, layout_of, rates_at
-from doedesign.training.results import HeldOut, height_at_rest_m, heights_before, validate, write_results
-from doedesign.training.validation import SCENE_SEED, split_pictures
+from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
+from doedesign.training.joint import JointState, Trainer, devices_mesh, layout_of, resting_doe
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes, sha256_file
+from fab.files import canonical_json, sha256_bytes, sha256_file, write_atomic
+from fab.level_map import LevelMap
+from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
+from sim.psf_bank import psf
+from sim.store import write_bank
 
 _MOST_THREADS = 8
 _log = logging.getLogger("doedesign")
@@ -80,13 +94,10 @@ def train(
         overrides: changes that led to the spec, for the record.
         tensorboard: write for TensorBoard, too.
         devices: number of devices; all if None.
-        coordinator: with several hosts, see `doedesign.training.hosts.join_hosts`, like the next two.
+        coordinator: with several hosts, HOST:PORT of host 0, or "auto" (`doedesign.training.hosts`).
         hosts: their number.
-        host: number of this one.
+        host: number of this one, from 0.
         options: changes to how the spec says to train, such as `steps=1000` (`doedesign.spec.training.TrainSpec`).
-
-    Returns:
-        the trained model.
 
     Raises:
         InputError: a picture or number that cannot be used, a folder that belongs to something else, or a loss that is
@@ -99,32 +110,23 @@ def train(
         rule = "must be left out with several hosts: every host takes all that it has"
         raise InputError("devices", rule, devices, "Leave it out.")
     join_hosts(coordinator, hosts, host)
-    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
-    with stoppable() as stop, place as folder:
-        job = JointTraining.prepare(
-            with_options(design, **options),
-            None if images is None else Path(images),
-            None if validation is None else Path(validation),
-            occlusion=occlusion,
-            obstruction=obstruction,
-            lpips_weights=lpips_weights,
-            licence=licence,
-            overrides=overrides,
-            devices=devices,
-        )
-        run_job(job, Path(folder), stop, tensorboard=tensorboard)
-        if skips := " ".join(filter(None, (data.pictures.skips() for data in (job.data, job.held_out.data)))):
-            _log.info("%s", skips)
-        model = Model.open(folder)
-    return replace(model, folder=None) if out is None else model
+    prepare = partial(
+        JointTraining.prepare,
+        _with_options(design, options),
+        None if images is None else Path(images),
+        None if validation is None else Path(validation),
+        occlusion=occlusion,
+        obstruction=obstruction,
+        lpips_weights=lpips_weights,
+        licence=licence,
+        overrides=overrides,
+        devices=devices,
+    )
+    return trained_model(prepare, out, tensorboard=tensorboard)
 
 
-def with_options(design: Design, **options: Any) -> Design:
-    """The design with a spec whose training has other options.
-
-    Raises:
-        InputError: there is no spec, or an option breaks a rule.
-    """
+def _with_options(design: Design, options: Mapping[str, Any]) -> Design:
+    """The design with a spec whose training has other options."""
     if design.spec is None:
         raise InputError("design", "must have a spec, which says how to train", "none", "Optimise it from a spec.")
     if not options:
@@ -139,10 +141,9 @@ class JointTraining(TrainingJob):
 
     Attributes:
         design: the DOE to begin with, with the spec of the training.
-        trainer: what a step does.
+        trainer: its steps.
         kind: obstruction.
-        data: scenes to train on.
-        held_out: scenes to judge by.
+        held_out: scenes to judge by, one to a batch.
         pictures: names of the pictures, and their licence.
     """
 
@@ -150,7 +151,7 @@ class JointTraining(TrainingJob):
     trainer: Trainer
     kind: ObstructionKind
     data: SceneData
-    held_out: HeldOut
+    held_out: SceneData
     pictures: Mapping[str, Any]
 
     @classmethod
@@ -179,15 +180,13 @@ class JointTraining(TrainingJob):
         _require_possible(spec, source)
         split = split_pictures(images, validation, options.validation, options.seed)
         far = (min(spec.scene.far_m), max(spec.scene.far_m))
-        trained_on, judged_by = (Pictures(files, most_px=2 * options.size) for files in split)
+        trained_on, judged_by = (Pictures(files, most_px=2 * options.size) for files in split[:2])
         threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
         data = SceneData(trained_on, kind, view, far, options.seed, options.batch, threads)
-        held_out = HeldOut(SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False), options.validation, lpips)
+        held_out = SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False)
         _log.info("preparing propagation")
-        # Objectives are done with, and the files that they name lie beside the spec that the run was made from.
-        bare = spec.model_copy(update={"objectives": ()})
-        at_rest, mesh = height_at_rest_m(design, camera), devices_mesh(devices)
-        trainer = Trainer.of(bare, {}, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
+        at_rest, mesh = design.nominal_height_m, devices_mesh(devices)
+        trainer = Trainer.of(spec, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
         settings = {
             "format": TRAINING,
             "run": spec.name,
@@ -203,48 +202,71 @@ class JointTraining(TrainingJob):
             "perceptual_sha256": "" if perceptual is None else perceptual.digest,
             "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
         }
-        pictures = {"licence": licence} | {
-            name: [_name(path, folder) for path in files]
-            for name, files, folder in (
-                ("training", split.training, images),
-                ("held_out", split.held_out, validation or images),
-            )
+        pictures = {
+            "licence": licence,
+            "training": [_name(path, images) for path in split.training],
+            "held_out": [_name(path, validation or images) for path in split.held_out],
         }
-        comments = ["every default filled in", *(f"--set {override}" for override in overrides)]
         return cls(
             name="training",
             title=spec.name,
             options=options,
             settings=settings,
             remarks={"licence": licence},
-            inputs={"spec.toml": spec_to_toml(spec, comments).encode(), "pictures.json": canonical_json(pictures)},
+            inputs={
+                "spec.toml": spec_to_resolved_toml(spec, overrides).encode(),
+                "pictures.json": canonical_json(pictures),
+            },
             differs="one with another run, spec, occlusion model, perceptual loss or other pictures",
             design=design,
             trainer=trainer,
             kind=kind,
             data=data,
             held_out=held_out,
+            lpips=lpips,
             pictures=pictures,
         )
 
     def initial(self) -> JointState:
-        """The state before the first step."""
-        return self.trainer.initial(heights_before(self.design, self.trainer))
-
-    def batches(self, start: int, stop: int) -> AbstractContextManager[Any]:
-        """Scenes from step `start` to step `stop`."""
-        return self.data.batches(start, stop)
+        """The state before the first step: the heights of the design before rounding; of rings, their profile."""
+        doe, heights = self.trainer.doe, self.design.continuous_m
+        learnt = None if doe.parametrization is None else doe.learnt
+        if self.options.camera == "conventional":
+            shape = self.trainer.bench.camera.grid.shape if learnt is None else learnt.shape
+            return self.trainer.initial(np.zeros(shape, np.float32))
+        if heights is None:
+            rule, cure = "must have its heights before rounding", "Give one that was optimised, or the run of one."
+            raise InputError("design", rule, "level numbers alone", cure)
+        if learnt is not None:
+            heights = learnt.heights_of(heights)
+            assert heights is not None  # `optimize` writes a raster of rings for a radial design
+        return self.trainer.initial(heights)
 
     def step(self, state: JointState, batch: Batch) -> tuple[JointState, dict[str, Any]]:
-        """Take one step with this host's part of a batch."""
-        rates, hosts, here = rates_at(self.options, state.step), jax.process_count(), jax.process_index()
-        count = len(batch.items) // hosts
-        state, record = self.trainer.step(state, batch._replace(items=batch.items[here * count : (here + 1) * count]))
-        return state, {**record._asdict(), "learning_rates": rates._asdict()}
+        """Take one step."""
+        return self.trainer.step(state, batch)
 
-    def evaluate(self, state: JointState) -> EvaluationResult:
-        """Judge a state by the held-out scenes."""
-        return validate(self.trainer, state, self.held_out)
+    def evaluate(self, state: JointState, *, baselines: bool = False) -> EvaluationResult:
+        """Judge a state by the held-out scenes, and on request the rows of Table 1 that need no training, too.
+
+        The DOE is the one that is to be drawn, with its exact PSFs. Within a step PSFs are estimates: samples may be
+        sparse, and a near source lights the cells obliquely, which plans for all depths leave out
+        (`sim.propagation.farfield`): at 5 cm that is up to a fifth of the light in the window.
+        """
+        trainer, camera = self.trainer, self.trainer.bench.camera
+        if trainer.doe.parametrization is not None:
+            doe = resting_doe(trainer.spec, camera, self.kind, self._design_of(state).nominal_height_m)
+            trainer, state = eqx.tree_at(lambda t: t.doe, trainer, doe), state._replace(free=None)
+
+        def looks() -> Iterator[HeldOutScene]:
+            with self.held_out.batches(stop=self.options.validation) as batches:
+                for batch in batches:
+                    name, scene = batch.items[0]
+                    clean = srgb_from_linear(channels_from_rgb(np.asarray(scene.background), camera))
+                    shown = _shown(trainer, state, batch, baselines)
+                    yield HeldOutScene(name, shown, clean, np.asarray(scene.obstructions[0].mask))
+
+        return judge(looks(), self.lpips, lambda image: rgb_from_channels(image, camera))
 
     def caption(self, state: JointState) -> tuple[str, str]:
         """Title and words for a picture of validation."""
@@ -253,8 +275,53 @@ class JointTraining(TrainingJob):
 
     def write_results(self, folder: Path, state: JointState) -> list[str]:
         """Write network, DOE, PSFs and scores."""
+        spec, camera = self.trainer.spec, self.trainer.bench.camera
+        near = spec.scene.near_m or depth_range_m(self.kind)
+        names = [NETWORK_NAME, BANK_NAME, "metrics.json"]
+        height = np.zeros(camera.grid.shape, np.float32)
+        if spec.train.camera == "doe":
+            learnt = spec.train.moves_optics and self.trainer.doe.parametrization is not None
+            trained = self._design_of(state) if learnt else replace(self.design, continuous_m=None)
+            height = trained.nominal_height_m
+            names += write_design(folder, trained)
+        depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
+        bank = psf(height, camera, depths, propagation=spec.optics.propagation)
+        write_bank(folder / BANK_NAME, bank, {"design": spec.name})
+        found = self.evaluate(state, baselines=True)
+        write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))
         about = {**self.settings, "steps": state.step, "pictures": self.pictures, "version": __version__}
-        return write_results(folder, self.design, self.trainer, state, self.held_out, self.kind, about)
+        write_network(folder / NETWORK_NAME, state.network, {**camera_facts(camera, near), **about})
+        for data in (self.data, self.held_out):
+            if skips := data.pictures.skips():
+                _log.info("%s", skips)
+        return names
+
+    def _design_of(self, state: JointState) -> Design:
+        """The design that learnt parameters make, as `doedesign.design.optimize.finished_design` does."""
+        doe, spec, camera = self.trainer.doe, self.trainer.spec, self.trainer.bench.camera
+        # A finished run has chosen its depths, so only the map is free.
+        assert isinstance(state.free, jax.Array)
+        continuous = doe.learnt.raster(np.asarray(doe.learning.continuous_m(state.free)))
+        level = np.asarray(doe.learning.level(jnp.asarray(continuous))).astype(np.uint8)
+        level_map = LevelMap(level, doe.learning.levels, camera.grid, spec.doe.aperture_m, spec.name)
+        return Design(level_map, camera, spec.scene.near_m, spec.scene.far_m, continuous_m=continuous, spec=spec)
+
+
+def _shown(trainer: Trainer, state: JointState, batch: Batch, baselines: bool) -> dict[str, Float[np.ndarray, "c y x"]]:
+    """Capture and reconstructions of a scene in display values, by name."""
+    shot, picture = trainer.reconstruct(state, batch)
+    light, far, near = (np.asarray(image, np.float32)[0] for image in shot)
+    found = {"capture": light}
+    if baselines:
+        variance = noise_variance(light, trainer.bench.sensor)
+        ratio = noise_to_signal(light, variance)
+        found |= {
+            "wiener_far": np.asarray(wiener(light, far, ratio)),
+            "wiener_near": np.asarray(wiener(light, near, ratio)),
+            "richardson_lucy_far": np.asarray(richardson_lucy(light, far, noise_variance=variance)),
+        }
+    display = {name: srgb_from_linear(image) for name, image in found.items()}
+    return {**display, "reconstruction": np.asarray(picture, np.float32)[0]}
 
 
 def _height_digest(design: Design) -> str:
@@ -270,11 +337,7 @@ def _name(path: Path, folder: Path | None) -> str:
 
 
 def _require_possible(spec: Spec, source: str) -> None:
-    """Check what the tables of a spec allow each for itself.
-
-    Raises:
-        InputError: a frame larger than the sensor, or a network that the camera's colours do not fit.
-    """
+    """Refuse a frame larger than the sensor, and a network that the camera's colours do not fit."""
     side = min(spec.sensor.resolution) // spec.sensor.binning
     if spec.train.size > side:
         rule = f"must be at most the {side} binned pixels of the sensor's shorter side"
@@ -283,4 +346,4 @@ def _require_possible(spec: Spec, source: str) -> None:
         layout_of(spec, len(spec.optics.colours))
     except ValueError as error:
         rule, _, got = str(error).partition(", but got ")
-        raise InputError(f"{source}: network", rule.replace("`", ""), got, "Change [network].") from error
+        raise InputError(f"{source}: network", rule.replace("`", ""), got, "Change the network's shape.") from error

@@ -77,7 +77,7 @@ def trainer(*changes: str, model: Model = "paper", height_m: np.ndarray | None =
     spec = small_spec(*changes)
     kind = obstruction_from_spec(spec, "small.toml")
     height = heights() if height_m is None else height_m
-    return Trainer.of(spec, {}, "small.toml", model, kind, height, **more)
+    return Trainer.of(spec, "small.toml", model, kind, height, **more)
 
 
 def batch(count: int = 1, step: int = 0) -> Batch:

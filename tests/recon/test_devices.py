@@ -51,8 +51,8 @@ for mesh in (None, devices_mesh()):
     made = trainer(*{PLAIN}, "train.batch=2", 'train.field="random"', mesh=mesh)
     state, losses, moments = made.initial(heights()), [], []
     for step in range(2):
-        state, record = made.step(state, batch(2, step))
-        losses.append(record.loss)
+        state, line = made.step(state, batch(2, step))
+        losses.append(line["loss"])
         moments.append([np.array(leaf, np.float64) for leaf in jax.tree.leaves((state.network_moments.mu,
                        state.optics_moments.mu))])
     picture = made.reconstruct(state, batch(1, 9))[1]

@@ -19,7 +19,7 @@ from doedesign.recon.model import Model
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.photos import read_capture, write_reconstruction
 from doedesign.recon.weights import read_network, write_network
-from doedesign.training.finetune import FineTuning, Tuner, finetune, mirrored_as
+from doedesign.training.finetune import FineTuning, finetune, mirrored_as
 from doedesign.training.history import read_history
 from doedesign.training.pairs import PairData, Pairs, find_pairs, read_pair, split_pairs
 from fab.errors import InputError
@@ -258,16 +258,16 @@ def test_stopped_between_steps(
     done: int,
 ):
     """An exception loses the steps since the last checkpoint, a signal none; the result is the same to the last bit."""
-    step = Tuner.step
+    step = FineTuning.step
 
-    def stepping(self: Tuner, state: Any, batch: Any) -> Any:
+    def stepping(self: FineTuning, state: Any, batch: Any) -> Any:
         number, found = state.step, step(self, state, batch)
         if number == where:
             stop()
         return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(Tuner, "step", stepping)
+        patch.setattr(FineTuning, "step", stepping)
         code, said = tuned(model, pairs, tmp_path / "out")
     assert code == 130
     assert (f"stopped after step {done} of 6" in said) == (stop is ask)
@@ -341,13 +341,13 @@ def test_what_is_held_out_is_never_trained_on(
     assert {pair.name[0] for pair in split.left_out} <= held_out
     assert {pair.name[0] for pair in split.training} == set("012345") - held_out
     seen: set[str] = set()
-    step = Tuner.step
+    step = FineTuning.step
 
-    def noting(self: Tuner, state: Any, batch: Any) -> Any:
+    def noting(self: FineTuning, state: Any, batch: Any) -> Any:
         seen.update(item.name for item in batch.items)
         return step(self, state, batch)
 
-    monkeypatch.setattr(Tuner, "step", noting)
+    monkeypatch.setattr(FineTuning, "step", noting)
     code, said = tuned(model, folder, tmp_path / "out")
     assert code == 0, said
     assert seen <= {pair.name for pair in split.training}
@@ -493,14 +493,14 @@ def test_folders_and_checkpoints_of_others(model: Path, pairs: Path, whole: Path
 
 
 def test_a_loss_that_is_not_finite(model: Path, pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    step = Tuner.step
+    step = FineTuning.step
 
-    def breaking(self: Tuner, state: Any, batch: Any) -> Any:
+    def breaking(self: FineTuning, state: Any, batch: Any) -> Any:
         nothing = [item.pair._replace(reference=item.pair.reference * np.nan) for item in batch.items]
         spoilt = [item._replace(pair=pair) for item, pair in zip(batch.items, nothing, strict=True)]
         return step(self, state, batch._replace(items=tuple(spoilt)))
 
-    monkeypatch.setattr(Tuner, "step", breaking)
+    monkeypatch.setattr(FineTuning, "step", breaking)
     code, said = tuned(model, pairs, tmp_path / "out")
     assert (code, "step 0: the loss must stay finite" in said, "learning rate" in said) == (2, True, True)
 

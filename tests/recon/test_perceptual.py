@@ -36,7 +36,7 @@ def quick_jit(function: Callable[..., Any]) -> Callable[..., Any]:
     return eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
 
 
-lpips, lpips_map = quick_jit(perceptual.lpips), quick_jit(perceptual.lpips_map)
+lpips, lpips_map = quick_jit(Lpips.__call__), quick_jit(Lpips.map)
 ms_ssim = quick_jit(similarity.ms_ssim)
 
 BACKBONES = ("squeeze", "alex", "vgg")
@@ -184,9 +184,9 @@ def test_unlike_pictures_are_refused(made):
     model, _ = made["squeeze"]
     for other in ((1, 3, 20, 21), (1, 1, 20, 20), (2, 3, 20, 20)):
         with pytest.raises(ValueError, match="one shape"):
-            perceptual.lpips(model, jnp.zeros((1, 3, 20, 20)), jnp.zeros(other))
+            model(jnp.zeros((1, 3, 20, 20)), jnp.zeros(other))
     with pytest.raises(ValueError, match="1 or 3 colours"):
-        perceptual.lpips(model, jnp.zeros((1, 2, 20, 20)), jnp.zeros((1, 2, 20, 20)))
+        model(jnp.zeros((1, 2, 20, 20)), jnp.zeros((1, 2, 20, 20)))
 
 
 def test_equal_pictures_are_at_no_distance(made, rng):

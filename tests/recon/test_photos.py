@@ -107,11 +107,11 @@ def simulated(folder: Path, *, png_files: bool = True) -> dict[str, Path]:
     }
     described = {
         "format": "doedesign simulation 1",
-        "images": {name: one.described() for name, one in stored.items()},
-        "sha256": {one.file: sha256_file(folder / one.file) for one in stored.values()},
+        "images": stored,
+        "sha256": {one["file"]: sha256_file(folder / one["file"]) for one in stored.values()},
     }
     (folder / "manifest.json").write_bytes(canonical_json(described))
-    return {name: folder / one.file for name, one in stored.items()}
+    return {name: folder / one["file"] for name, one in stored.items()}
 
 
 def test_simulated_counts_mean_what_their_manifest_says(tmp_path: Path):

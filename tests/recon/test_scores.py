@@ -11,7 +11,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from doedesign.training import scores as scoring
 from doedesign.training.backbones import weight_shapes
-from doedesign.training.perceptual import Lpips, lpips, lpips_map, read_lpips
+from doedesign.training.perceptual import Lpips, read_lpips
 from doedesign.training.scores import mean_and_interval, paired_difference, scores
 
 psnr, ssim = eqx.filter_jit(scoring.psnr), eqx.filter_jit(scoring.ssim)
@@ -110,8 +110,8 @@ def test_scores_are_the_single_scores(pair, mask, model):
     np.testing.assert_allclose(found.occluded.psnr, psnr(b, a, mask), rtol=1e-6)
     np.testing.assert_allclose(found.occluded.ssim, ssim(b, a, mask), rtol=1e-6)
     shown = jnp.clip(b, 0, 1)
-    np.testing.assert_allclose(found.full.closeness, 1 - eqx.filter_jit(lpips)(model, shown, a), rtol=1e-5)
-    each = np.asarray(eqx.filter_jit(lpips_map)(model, shown, a))
+    np.testing.assert_allclose(found.full.closeness, 1 - eqx.filter_jit(model)(shown, a), rtol=1e-5)
+    each = np.asarray(eqx.filter_jit(Lpips.map)(model, shown, a))
     expected = [1 - each[k][mask[k] >= 0.5].mean() for k in range(2)]
     np.testing.assert_allclose(found.occluded.closeness, expected, rtol=1e-5)
     without = scores(b, a, mask)

@@ -42,8 +42,8 @@ def walk(
     """Steps on one batch, and their losses; `at` lets each of them count as that step."""
     state, losses = state or made.initial(heights()), []
     for _ in range(steps):
-        state, record = made.step(state if at is None else state._replace(step=at), batch())
-        losses.append(record.loss)
+        state, line = made.step(state if at is None else state._replace(step=at), batch())
+        losses.append(line["loss"])
     return state, losses
 
 
@@ -99,7 +99,7 @@ def test_a_conventional_camera_has_a_flat_plate() -> None:
 
 def test_randomness_follows_from_seed_and_batch(joint: Trainer) -> None:
     def first(given: Batch, made: Trainer = joint) -> float:
-        return made.step(made.initial(heights()), given)[1].loss
+        return made.step(made.initial(heights()), given)[1]["loss"]
 
     loss = first(batch())
     assert first(batch()) == loss
@@ -158,9 +158,10 @@ def test_errors_of_a_process_and_the_perceptual_term() -> None:
     # Every step has errors of its own, which follow from its number.
     np.testing.assert_array_equal(errors[0], errors[1])
     assert np.mean(errors[0] != errors[2]) > 0.01
-    _, record = made.step(state, batch())
-    assert record.parts["perceptual"] == 3
-    assert record.loss == pytest.approx(record.parts["l1"] + record.parts["masked"] + 0.5 * 3, rel=1e-6)
+    _, line = made.step(state, batch())
+    parts = line["parts"]
+    assert parts["perceptual"] == 3
+    assert line["loss"] == pytest.approx(parts["l1"] + parts["masked"] + 0.5 * 3, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -21,7 +21,6 @@ import pytest
 from PIL import Image
 
 import doedesign.training.job
-import doedesign.training.results
 import doedesign.training.train
 import fab.archive
 from doedesign.build import camera_from_spec
@@ -34,10 +33,10 @@ from doedesign.report.sheet import ValidationRow, plot_validation
 from doedesign.runs.folder import TRAINING_TABLES
 from doedesign.runs.level_maps import drawing_from, open_design
 from doedesign.spec import load_spec
+from doedesign.training.evaluation import split_pictures
 from doedesign.training.history import open_board, open_history, read_history
 from doedesign.training.joint import Trainer, layout_of
 from doedesign.training.train import train
-from doedesign.training.validation import split_pictures
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import read_json
@@ -337,8 +336,8 @@ def test_stopped_between_steps(
         (doedesign.training.job, "settled"),  # after the manifest and the spec
         (doedesign.training.job, "write_checkpoint"),  # between a line of history and the checkpoint
         (doedesign.training.job, "plot_validation"),
-        (doedesign.training.train, "write_results"),  # when all steps are done
-        (doedesign.training.results, "write_network"),  # among the results
+        (doedesign.training.train, "write_design"),  # when all steps are done
+        (doedesign.training.train, "write_network"),  # among the results
         (doedesign.training.job, "plot_training"),
     ],
 )
@@ -660,6 +659,6 @@ def test_what_tensorboard_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     fake = SimpleNamespace(SummaryWriter=Writer, __spec__=SimpleNamespace())
     monkeypatch.setitem(sys.modules, "tensorboardX", fake)
-    with open_board(tmp_path / "tensorboard", 4) as board:
-        board.add({"step": 4, "loss": 0.5, "parts": {"l1": 0.25}, "validation": {"capture": {"full": {"psnr": None}}}})
+    with open_board(tmp_path / "tensorboard", 4) as add:
+        add({"step": 4, "loss": 0.5, "parts": {"l1": 0.25}, "validation": {"capture": {"full": {"psnr": None}}}})
     assert told == [("tensorboard", 4), ("loss", 0.5, 4), ("parts/l1", 0.25, 4), "closed"]
