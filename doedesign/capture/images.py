@@ -20,13 +20,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, sha256_bytes
+from fab.files import canonical_json, explain_os_error, os_errors_explained, sha256_bytes
 from fab.pictures import read_display
 
 PICTURE_FILES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 SAMPLES = ("motorcycle_left.png", "rocket.jpg", "coffee.png", "astronaut.png", "chelsea.png", "camera.png")
-BUDGET_BYTES = 1 << 30
-
+_BUDGET_BYTES = 1 << 30
 _SHOWN = 5  # names of files in one message
 _log = logging.getLogger("doedesign")
 
@@ -34,11 +33,7 @@ Picture = UInt8[np.ndarray, "y x 3"]
 
 
 def sample_files() -> tuple[Path, ...]:
-    """The photographs inside the installed scikit-image, in a fixed order.
-
-    Raises:
-        InputError: scikit-image came without them.
-    """
+    """The photographs inside the installed scikit-image, in a fixed order; InputError where it came without them."""
     spec = find_spec("skimage")
     folder = Path(spec.origin).parent / "data" if spec and spec.origin else Path("skimage/data")
     found = tuple(folder / name for name in SAMPLES if (folder / name).is_file())
@@ -59,10 +54,8 @@ def picture_files(folder: Path | None) -> tuple[Path, ...]:
     if not folder.is_dir():
         got = "a file" if folder.exists() else "no folder"
         raise InputError(str(folder), "must be a folder of pictures", got, "Check the path.")
-    try:
+    with os_errors_explained(folder):
         found = tuple(sorted(p for p in folder.rglob("*") if p.suffix.lower() in PICTURE_FILES and p.is_file()))
-    except OSError as error:
-        raise explain_os_error(error, folder) from error
     if not found:
         rule = f"must hold pictures ({', '.join(PICTURE_FILES)})"
         raise InputError(str(folder), rule, "none", "Put pictures there, or leave `images` out for a first look.")
@@ -86,7 +79,7 @@ class Pictures:
 
     files: tuple[Path, ...]
     most_px: int | None = None
-    budget_bytes: int = BUDGET_BYTES
+    budget_bytes: int = _BUDGET_BYTES
     skipped: dict[Path, str] = field(default_factory=dict)
     decodings: int = 0
     _kept: dict[Path, Picture] = field(default_factory=dict, repr=False)

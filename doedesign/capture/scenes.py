@@ -38,12 +38,7 @@ class NamedScene(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Items of one step.
-
-    Attributes:
-        step: number of the batch since the beginning of the first epoch.
-        items: scenes (`NamedScene`), or crops of real pairs (`doedesign.training.pairs`).
-    """
+    """Scenes (`NamedScene`), or crops of real pairs, of one step, counted from the beginning of the first epoch."""
 
     step: int
     items: tuple[Any, ...]
@@ -55,7 +50,7 @@ class SceneData:
 
     Attributes:
         pictures: the pictures.
-        kind: what stands before them.
+        kind: obstruction before them.
         view: the frame.
         far_m: least and greatest distance of the background, drawn evenly in 1/z; `inf` allowed.
         seed: seed of everything.
@@ -125,13 +120,8 @@ def draw_scene(
 ) -> Scene:
     """Put a crop of a picture behind an obstruction, at a place, at depths and of a shape that are drawn.
 
-    Args:
-        picture: `[y, x, 3]` display values, uint8; enlarged where the frame does not fit.
-        kind: what stands before it.
-        view: the frame.
-        far_m: least and greatest distance of the background, drawn evenly in 1/z.
-        rng: source of the randomness.
-        mirrored: exchange left and right at random.
+    A picture in which the frame does not fit is enlarged; the background's depth is drawn evenly in 1/z from `far_m`,
+    and, if `mirrored`, left and right are exchanged at random.
     """
     place, mirror = (rng.uniform(), rng.uniform()), bool(rng.integers(2)) and mirrored
     far = 1 / rng.uniform(1 / far_m[1], 1 / far_m[0]) if far_m[0] < far_m[1] else far_m[0]
@@ -149,15 +139,9 @@ def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
 def batches_ahead(
     item: Callable[[int], Any], size: int, start: int, stop: int | None, workers: int, ahead: int
 ) -> Iterator[Iterator[Batch]]:
-    """Make items in threads, and hand them out in batches.
+    """Make items by number in threads, some batches ahead, and hand out batches `start` to `stop` - 1 (or for ever).
 
-    Args:
-        item: makes the item of a number; batch n holds the items from n * size on.
-        size: items per batch.
-        start: number of the first batch.
-        stop: number of the batch before which the stream ends; never if None.
-        workers: threads.
-        ahead: batches that are prepared before they are asked for.
+    Batch n holds the items from n * size on.
     """
     pool = ThreadPoolExecutor(workers)
 

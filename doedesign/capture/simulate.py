@@ -153,14 +153,7 @@ def simulate(
 
 
 class Stage(NamedTuple):
-    """The scenes of a design, and the camera that looks at them.
-
-    Attributes:
-        kind: the kind of obstruction.
-        model: the camera without its optic.
-        view: the frame.
-        far_m: least and greatest distance of the scene, metres.
-    """
+    """The scenes of a design behind one kind of obstruction, within a frame, and the camera without its optic."""
 
     kind: ObstructionKind
     model: CaptureModel

@@ -54,18 +54,7 @@ _RELEASE_LOG_REGULARISER = float(np.log(1e-6))
 
 @dataclass(frozen=True)
 class NetworkShape:
-    """Shape of a network; every part can be left out, for the ablations of Table 1.
-
-    Attributes:
-        colours: channels of a capture.
-        width: features at full scale, a multiple of `colours`.
-        depth: number of halvings, 1 to 4.
-        wiener: filter features with the inverse of the far PSF ("inverse filter").
-        features: learn what is filtered; otherwise the capture itself is, at every scale ("feature extraction").
-        near_estimate: hand in the Wiener estimate with the near PSF beside the capture.
-        refine: the second stage ("residual block").
-        variant: "paper", or "release" for the public code's layers.
-    """
+    """Shape of a network: the colours of a capture, and the parts that `doedesign.spec.training.NetworkSpec` names."""
 
     colours: int = 3
     width: int = 12
