@@ -64,13 +64,9 @@ class CaptureModel:
         return Optics(psf, camera.aperture_m, camera.sensor_distance_m, camera.pixel_m, self.shadow_px)
 
     def developed(self, scene: Scene, far: Psf, near: Psf, key: Key[Array, ""]) -> Float[Array, "c y x"]:
-        """Photograph a scene: linear light with noise, white 1. Differentiable, but for a mosaic.
+        """Photograph one obstruction before a background, with the PSFs of both, in the colours of the camera.
 
-        Args:
-            scene: one obstruction before a background, in the colours of the camera.
-            far: PSFs of the background, energy per pixel.
-            near: PSFs of the obstruction.
-            key: key of the noise.
+        The result is linear light with noise, white 1. Differentiable, but for a mosaic.
         """
         optics = self.optics(far, near)
         light = capture(scene, optics, self.occlusion, border=self.border, outside=self.outside)

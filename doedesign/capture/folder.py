@@ -96,8 +96,7 @@ def simulate_files(
         InputError: the folder is that of something else, or a picture, name or number cannot be used.
     """
     assert design.spec is not None
-    stage = Stage.of(design, obstruction, occlusion, size)
-    kind, model, view, far_m = stage
+    kind, model, view, far_m = Stage.of(design, obstruction, occlusion, size)
     pictures = Pictures(picture_files(images), most_px=2 * max(view.shape))
     count = min(_USUAL_COUNT, len(pictures)) if count is None else count
     if count < 1:

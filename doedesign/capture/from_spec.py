@@ -38,7 +38,7 @@ def occlusion_from_spec(spec: Spec | None, source: str, given: str | None = None
         raise InputError("occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
     model = given or (spec and spec.scene.occlusion)
     if model is None:
-        cure = 'Give "reciprocal", which is nearest to wave optics, "radiometric", or "paper" for eq. 10.'
+        cure = 'Give `occlusion`: "reciprocal", nearest to wave optics, "radiometric", or "paper" for eq. 10.'
         raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
     return cast("Model", model)
 
@@ -70,14 +70,9 @@ def obstruction_from_spec(
 ) -> ObstructionKind:
     """The kind of obstruction before the scene: the one given, or that of the spec.
 
-    Its distance is that of the spec's options; otherwise it lies between the nearest and the farthest of the near
-    depths, for which the DOE was designed; otherwise it is what the kind is usually drawn at.
-
-    Args:
-        spec: the spec, if there is one; its options hold for its own kind.
-        source: the spec's file, beside which a folder of masks lies.
-        given: a kind, or a folder of masks.
-        near_m: near depths, where there is no spec to say them.
+    Its distance is that of the spec's options, which hold for its own kind; otherwise it lies between the nearest and
+    the farthest of the near depths, for which the DOE was designed (`near_m` without a spec); otherwise it is the usual
+    one of the kind. A folder of masks may lie beside the spec's file (`source`).
 
     Raises:
         InputError: no kind, an unknown one, or options that are not the kind's.
@@ -87,7 +82,7 @@ def obstruction_from_spec(
     name = given or (own.kind if own else None)
     if name is None:
         kinds = ", ".join(OBSTRUCTIONS)
-        cure = f'Give one, such as "dirt". There are {kinds}.'
+        cure = f'Give `obstruction`, such as "dirt". There are {kinds}.'
         raise InputError(f"{source}: obstruction.kind", "an obstruction must be named", "nothing", cure)
     if name not in OBSTRUCTIONS:
         if not Path(name).is_dir():
@@ -132,22 +127,20 @@ def _parameters(kind: type[ObstructionKind], options: Mapping[str, Any], where: 
 
 def _parameter(field: Field[Any], value: Any, where: str) -> Any:
     if isinstance(value, tuple):
-        return tuple(_parameter_item(field, item, where) for item in value)
-    item = _parameter_item(field, value, where)
+        return tuple(_parsed(field.name, item, where) for item in value)
+    item = _parsed(field.name, value, where)
     # A range is two numbers; one stands for both.
     is_range = isinstance(field.default, tuple) and len(field.default) == 2
     return (item, item) if is_range and isinstance(item, float | int) else item
 
 
-def _parameter_item(field: Field[Any], value: Any, where: str) -> Any:
-    for ending, parse in (("_m", parse_length), ("_rad", parse_angle)):
-        if field.name.endswith(ending):
-            try:
-                return parse(value)
-            except ValueError as error:
-                rule, _, got = str(error).partition(", but got ")
-                raise InputError(where, rule, got, "Write the unit inside the quotes.") from error
-    return value
+def _parsed(name: str, value: Any, where: str) -> Any:
+    """A length or an angle, as the ending of its name says, in SI; anything else as it is."""
+    try:
+        return parse_length(value) if name.endswith("_m") else parse_angle(value) if name.endswith("_rad") else value
+    except ValueError as error:
+        rule, _, got = str(error).partition(", but got ")
+        raise InputError(where, rule, got, "Write the unit inside the quotes.") from error
 
 
 def plain_parameters(kind: Any) -> dict[str, Any]:

@@ -61,16 +61,10 @@ def wiener(
     psf: Float[Array, "c ky kx"] | Float[np.ndarray, "c ky kx"],
     noise_to_signal: Float[Array, "*c"] | Float[np.ndarray, "*c"] | float,
 ) -> Float[Array, "c y x"]:
-    """Wiener filter conj(H) / (|H|² + N/S), as the network has it (`doedesign.recon.wiener.sharpened`).
+    """Wiener filter conj(H) / (|H|² + N/S) of linear light, as the network has it (`doedesign.recon.wiener.sharpened`).
 
-    Args:
-        capture: `[c, y, x]` linear light.
-        psf: `[c, y, x]` PSFs in energy per pixel, odd windows with the chief ray in the middle. Light that they lose is
-            given back.
-        noise_to_signal: power of noise over that of the picture, for each colour or one for all.
-
-    Raises:
-        ValueError: an even window.
+    PSFs in energy per pixel have odd windows with the chief ray in the middle; light that they lose is given back. N/S
+    is given for each colour, or one for all.
     """
     _require_odd(psf)
     ratio = jnp.broadcast_to(jnp.asarray(noise_to_signal, jnp.float32), (len(psf),))
@@ -90,15 +84,8 @@ def richardson_lucy(
     A is the blur of a picture that is mirrored beyond its edges, and Aᵀ exactly its transpose, so that every iteration
     keeps u positive and the light of A u equal to that of the capture.
 
-    Args:
-        capture: `[c, y, x]` linear light; what is below 0 counts as 0.
-        psf: `[c, y, x]` PSFs in energy per pixel, odd windows with the chief ray in the middle.
-        iterations: the most iterations.
-        noise_variance: of the capture, for each colour or one for all; a colour stops where the mean square of
-            capture - A u falls below it.
-
-    Raises:
-        ValueError: an even window.
+    PSFs are as in `wiener`; light below 0 counts as 0. A colour stops after `iterations`, or where the mean square of
+    capture - A u falls below the variance of its noise (for each colour, or one for all).
     """
     _require_odd(psf)
     seen = jnp.maximum(jnp.asarray(capture, jnp.float32), 0.0)

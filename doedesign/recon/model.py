@@ -41,11 +41,11 @@ _log = logging.getLogger("doedesign")
 
 
 class PsfPair(NamedTuple):
-    """The PSFs that a network is given.
+    """The PSFs `[c, y, x]` of scene and obstruction that a network is given, energy per pixel, odd windows.
 
     Attributes:
-        far: `[c, y, x]` PSFs of the scene, energy per pixel, odd windows.
-        near: `[c, y, x]` PSFs of the obstruction.
+        far: PSFs of the scene.
+        near: PSFs of the obstruction.
         far_m: distance of the scene, metres.
         near_m: distance of the obstruction, metres.
         bank: PSFs at these depths and others; of two files, these two alone, in the larger window.
@@ -309,6 +309,5 @@ def _pair(of_scene: PsfBank, of_obstruction: PsfBank, far_m: float, near_m: floa
 
 def _widened(psf: Float[np.ndarray, "c y x"], window: tuple[int, int]) -> Float[np.ndarray, "c v u"]:
     """A PSF in a larger odd window, its middle pixel in the middle."""
-    (y, x), (v, u) = psf.shape[1:], window
-    margins = ((0, 0), ((v - y) // 2,) * 2, ((u - x) // 2,) * 2)
-    return np.pad(psf, margins)
+    margins = [(large - small) // 2 for large, small in zip(window, psf.shape[1:], strict=True)]
+    return np.pad(psf, ((0, 0), *((margin, margin) for margin in margins)))

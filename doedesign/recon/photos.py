@@ -34,13 +34,9 @@ _CURE = "Save it again from its source as one picture, grey or in red, green and
 
 
 class Photo(NamedTuple):
-    """A capture as its file holds it.
+    """A capture of three colours or one as linear light, white 1; bits per value in its file (None for floats).
 
-    Attributes:
-        light: `[c, y, x]` linear light, white 1; three colours or one.
-        bits: bits per value in the file; None for floats.
-        linear: whether the file held linear light.
-        name: of the file, for messages.
+    `linear` says whether the file held linear light; messages begin with the name.
     """
 
     light: Float[np.ndarray, "c y x"]
@@ -142,13 +138,9 @@ def _exr_light(path: Path) -> Float[np.ndarray, "c y x"]:
 
 
 def photo_from_array(values: Num[np.ndarray, "..."], linear: bool | None = None, name: str = "capture") -> Photo:
-    """Take the values of a picture for light.
+    """Take uint8, uint16 or floats `[y, x]`, or `[y, x, 3]` for red, green and blue, row 0 at the lowest y, for light.
 
-    Args:
-        values: `[y, x]`, or `[y, x, 3]` for red, green and blue, row 0 at the lowest y; uint8, uint16 or floats.
-        linear: whether they are linear light, white 1 or the highest count; by default floats are, and integers are
-            display values (sRGB).
-        name: what messages begin with.
+    By default floats are `linear` light, white 1, and integers are display values (sRGB), white at the highest count.
 
     Raises:
         InputError: another shape or another type, or values that are not finite.

@@ -31,14 +31,7 @@ Reconstructs = Callable[[Array, Array, Array], Array]
 
 
 class Tiling(NamedTuple):
-    """How a picture is cut.
-
-    Attributes:
-        shape: pixels (y, x) of the picture.
-        tile: pixels (y, x) of every tile.
-        overlap: pixels that neighbours share.
-        counts: tiles along y and x.
-    """
+    """Pixels (y, x) of a picture and of its tiles, pixels that neighbours share, and number of tiles along y and x."""
 
     shape: tuple[int, int]
     tile: tuple[int, int]
@@ -52,13 +45,9 @@ class Tiling(NamedTuple):
 
 
 def plan_tiles(shape: tuple[int, int], tile: int = TILE, overlap: int = OVERLAP, multiple: int = 16) -> Tiling:
-    """Cut a picture into as few tiles as will do, and these as small as will do.
+    """Cut a picture of `shape` (y, x) into as few tiles as will do, and these as small as will do.
 
-    Args:
-        shape: pixels (y, x) of the picture.
-        tile: the most pixels of a tile's side.
-        overlap: pixels that neighbours share.
-        multiple: divisor of sides and overlap (`NetworkShape.multiple`).
+    Sides of at most `tile` pixels, and the overlap, are multiples of `multiple` (`NetworkShape.multiple`).
 
     Raises:
         ValueError: a tile or an overlap that is no such multiple, or an overlap of more than half a tile.
@@ -91,22 +80,11 @@ def reconstruct_tiled(
     multiple: int = 16,
     on_tile: Callable[[int], None] = lambda _: None,
 ) -> Float[np.ndarray, "c y x"]:
-    """Reconstruct a capture of any size.
+    """Reconstruct a capture of any size: display values as the network gives them.
 
-    A capture that fits into a tile goes through as one, extended to multiples of `multiple`.
-
-    Args:
-        network: the network.
-        capture: `[c, y, x]` linear light, white 1.
-        far: `[c, y, x]` PSFs of the scene, energy per pixel, odd windows with the chief ray in the middle.
-        near: the same of the obstruction.
-        tile: see `plan_tiles`, as the next two; time and seams shrink as it grows, memory grows with its square.
-        overlap: pixels that neighbouring tiles share.
-        multiple: divisor of sides and overlap.
-        on_tile: called after each tile with the number of those done.
-
-    Returns:
-        `[c, y, x]` display values as the network gives them.
+    A capture that fits into a tile goes through as one, extended to multiples of `multiple`. Capture and PSFs are those
+    of one item of `doedesign.recon.network.Network`, tiles those of `plan_tiles`; time and seams shrink as they grow,
+    memory grows with their square. `on_tile` is called after each tile with the number of those done.
     """
     plan = plan_tiles((capture.shape[1], capture.shape[2]), tile, overlap, multiple)
     rows, columns = (list(_pieces(plan, axis)) for axis in (0, 1))

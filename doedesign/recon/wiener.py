@@ -48,13 +48,9 @@ def sharing(window: int, length: int, scale: int) -> Float[np.ndarray, "length w
 
 
 def blur_at(psf: Float[Array, "b c ky kx"], shape: tuple[int, int], scale: int = 1, *, unit: bool = True) -> Blur:
-    """The blur of PSFs with odd windows as images of a scale show it.
+    """The blur of PSFs with odd windows as images of a scale with `shape` (y, x) pixels show it.
 
-    Args:
-        psf: `[b, c, y, x]` PSFs, at full scale.
-        shape: pixels (y, x) of the scale.
-        scale: samples of the PSF per pixel of the scale, a power of two.
-        unit: bring the PSF to unit sum; otherwise lost light stays lost.
+    A pixel has `scale` samples of the PSF, a power of two. Without `unit` sum, light that the PSF loses stays lost.
     """
     by_y, by_x = (sharing(psf.shape[k - 2], shape[k], scale) for k in (0, 1))
     kernel = jnp.einsum("bcyx,vy,ux->bcvu", psf, by_y, by_x, precision="highest")
@@ -84,13 +80,10 @@ def tapered(image: Float[Array, "b g c y x"], blur: Blur) -> Float[Array, "b g c
 def deblurred(
     image: Float[Array, "b y x k"], blur: Blur, log_regulariser: Float[Array, " k"], *, taper: bool = True
 ) -> Float[Array, "b y x k"]:
-    """Wiener filter conj(H) / (|H|² + e^r) of every channel (paper §3.3, f_ZW).
+    """Wiener filter conj(H) / (|H|² + e^r) of every channel, k of colour k mod c (paper §3.3, f_ZW).
 
-    Args:
-        image: `[b, y, x, channel]`; channel k is of colour k mod c.
-        blur: what the PSFs do to images of this scale.
-        log_regulariser: r, the logarithm of the power of noise over that of the image, one for every channel.
-        taper: blend the edges first.
+    r is the logarithm of the power of noise over that of the image, one for every channel. `taper` blends the edges
+    first.
     """
     b, y, x, channels = image.shape
     colours = blur.transfer.shape[1]
@@ -112,12 +105,8 @@ def sharpened(
     A tapered edge is lost as far as the PSF reaches, and a plate that spreads light reaches half across a training
     picture. Light goes on beyond a frame, and its mirror image is the best guess at how; training scenes go on so, too
     (`sim.imaging.convolve`, border "reflect", which has the outermost samples once; here they stand twice, for
-    transforms of even lengths). Four times the samples: for pictures, not for features.
-
-    Args:
-        image: `[b, y, x, c]` a picture, one channel for every colour.
-        psf: `[b, c, y, x]` PSFs with odd windows; light that they lose is made up for.
-        log_regulariser: see `deblurred`.
+    transforms of even lengths). Four times the samples: for pictures, not for features. Light that the PSFs, with odd
+    windows, lose is made up for; regularisers are those of `deblurred`.
     """
     y, x = image.shape[1:3]
     image = jnp.concatenate([image, image[:, ::-1]], axis=1)

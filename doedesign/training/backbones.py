@@ -18,16 +18,7 @@ Backbone = Literal["squeeze", "alex", "vgg"]
 
 
 class Conv(NamedTuple):
-    """A convolution and the ReLU after it.
-
-    Attributes:
-        key: the name of its weights, after "features.".
-        size: rows and columns of the kernel.
-        inputs: channels that come in.
-        outputs: channels that go out.
-        stride: step between outputs.
-        margin: zeros beyond each edge.
-    """
+    """A convolution with zeros beyond the edges, and the ReLU after it; its weights are called "features." and key."""
 
     key: str
     size: int
@@ -116,13 +107,9 @@ def taps_of(
     biases: Mapping[str, Float[Array, " _"]],
     x: Float[Array, "b y x 3"],
 ) -> list[Float[Array, "b _ _ _"]]:
-    """Features of pictures at every tap.
+    """Features at every tap of pictures with the first row at the top and the mean and spread of the training.
 
-    Args:
-        backbone: which network.
-        kernels: `[ky, kx, in, out]` of every convolution, by its key.
-        biases: of every convolution.
-        x: `[b, y, x, colour]`, first row at the top, brought to the mean and spread that it was trained with.
+    Kernels `[ky, kx, in, out]` and biases are given by the keys of the convolutions.
     """
 
     def applied(x: Array, layer: Conv | Fire | Pool) -> Array:

@@ -29,13 +29,9 @@ _State = TypeVar("_State")
 
 
 def write_checkpoint(path: Path, state: Any, step: int, owner: str) -> None:
-    """Store a state after a number of steps.
+    """Store arrays and numbers of a state after a number of steps; its shapes and functions belong to the spec.
 
-    Args:
-        path: the file.
-        state: a tree of arrays and numbers; what else stands in it (shapes, functions) belongs to the spec.
-        step: number of steps.
-        owner: digest of all that the training depends on.
+    `owner` is a digest of all that the training depends on.
 
     Raises:
         InputError: the state is not finite, or the system refuses the path; an earlier checkpoint stays.

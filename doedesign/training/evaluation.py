@@ -72,13 +72,9 @@ def _without(files: Sequence[Path], held_out: Sequence[Path]) -> tuple[Path, ...
 
 
 class HeldOutScene(NamedTuple):
-    """One scene that is never trained on, in the camera's colours and display values.
+    """A scene that is never trained on: sharp mask of the obstruction, and display values in the camera's colours.
 
-    Attributes:
-        name: name of the picture or pair.
-        shown: `[c, y, x]` pictures by name, "capture" and "reconstruction" among them.
-        scene: `[c, y, x]` the scene alone.
-        mask: `[y, x]` sharp mask of the obstruction.
+    Those are of the scene alone, and by name of what is `shown`, "capture" and "reconstruction" among them.
     """
 
     name: str

@@ -114,15 +114,7 @@ def _options(model: Model, steps: int, learning_rate: float | None, seed: int) -
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FineTuning(TrainingJob):
-    """A training on real pairs.
-
-    Attributes:
-        model: the model to begin with.
-        psfs: PSFs of the camera.
-        perceptual: perceptual distance, or None.
-        held_out: pairs to judge by, cut to the same shape.
-        pairs: names of the pairs.
-    """
+    """A training of a model on real pairs, with the PSFs of their camera; `pairs` are their names for the record."""
 
     model: Model
     psfs: PsfPair
@@ -224,11 +216,7 @@ class FineTuning(TrainingJob):
                 shown = {"capture": srgb_from_linear(pair.capture), "reconstruction": np.asarray(found)[0]}
                 yield HeldOutScene(files.name, shown, pair.reference, pair.mask)
 
-        def to_rgb(image: Float[np.ndarray, "c y x"]) -> Float[np.ndarray, "3 y x"]:
-            picture = self.model.rgb(image)
-            return np.repeat(picture, 3, axis=0) if len(picture) == 1 else picture
-
-        return judge(looks(), self.lpips, to_rgb)
+        return judge(looks(), self.lpips, lambda image: np.repeat(self.model.rgb(image), 3 // len(image), axis=0))
 
     def caption(self, state: "FinetuneState") -> tuple[str, str]:
         """Title and words for a picture of validation."""
@@ -259,13 +247,7 @@ class FineTuning(TrainingJob):
 
 
 class FinetuneState(NamedTuple):
-    """Everything a step changes.
-
-    Attributes:
-        step: number of steps done.
-        network: the network.
-        moments: Adam's moments.
-    """
+    """Everything a step changes: steps done, the network, and Adam's moments."""
 
     step: int
     network: Network

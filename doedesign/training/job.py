@@ -100,11 +100,7 @@ class TrainingJob(ABC):
 def trained_model(prepare: Callable[[], TrainingJob], out: str | Path | None, *, tensorboard: bool = False) -> Model:
     """Run a training in a folder, or in a temporary one, which is removed, if it is None; return the model.
 
-    A signal ends it while it is prepared, and after a step, with a checkpoint, once it runs.
-
-    Raises:
-        InputError: as `prepare`; a folder that belongs to something else; a loss that is no longer finite.
-        KeyboardInterrupt: it was stopped.
+    A signal ends it (KeyboardInterrupt) while it is prepared, and after a step, with a checkpoint, once it runs.
     """
     place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
     with stoppable() as stop, place as folder:
@@ -126,9 +122,14 @@ def _run(job: TrainingJob, folder: Path, stop: StopRequest, tensorboard: bool) -
             write_atomic(folder / MANIFEST_NAME, canonical_json(manifest))
             for name, data in job.inputs.items():
                 write_atomic(folder / name, data)
-        state = _resumed(folder, settled(job.initial()), digest)
-        if len(set(found := gathered(state.step))) > 1:
-            rule, got = "every host must find the same checkpoint", f"those of steps {found}"
+        state = settled(job.initial())
+        if stored := read_checkpoint(folder / CHECKPOINT, state, digest):
+            state, step = stored
+            _log.info("resuming after step %d", step)
+            if (found := len(read_history(folder / HISTORY_NAME, step))) < step:
+                _log.warning("%s lacks %d of the %d steps before", HISTORY_NAME, step - found, step)
+        if len(set(steps := gathered(state.step))) > 1:
+            rule, got = "every host must find the same checkpoint", f"those of steps {steps}"
             raise InputError(str(folder), rule, got, "Put the run where all hosts see it.")
         state = _take_steps(folder, job, state, digest, stop, tensorboard)
         if leads:
@@ -170,18 +171,6 @@ def _is_done(folder: Path, job: TrainingJob, digest: str) -> bool:
             raise InputError(str(folder / name), rule, "a changed file", cure)
     (folder / CHECKPOINT).unlink(missing_ok=True)  # it was killed just before
     return True
-
-
-def _resumed(folder: Path, start: Any, digest: str) -> Any:
-    """The state to go on from: that of the last checkpoint, or the one to start with."""
-    stored = read_checkpoint(folder / CHECKPOINT, start, digest)
-    if stored is None:
-        return start
-    state, step = stored
-    _log.info("resuming after step %d", step)
-    if (found := len(read_history(folder / HISTORY_NAME, step))) < step:
-        _log.warning("%s lacks %d of the %d steps before", HISTORY_NAME, step - found, step)
-    return state
 
 
 def _validated(folder: Path, job: TrainingJob, state: Any) -> dict[str, Any]:
@@ -233,16 +222,10 @@ def _take_steps(folder: Path, job: TrainingJob, state: Any, digest: str, stop: S
 def perceptual_distance(
     options: TrainSpec, size: int, where: str, files: Sequence[Path]
 ) -> tuple[Lpips | None, Perceptual | None]:
-    """LPIPS for scores, if its weights are at hand, and the distance of the loss, if it has one.
-
-    Args:
-        options: with the weight of the perceptual term.
-        size: pixels of a crop's shorter side.
-        where: its source, for messages.
-        files: weights of LPIPS.
+    """LPIPS for scores, if there are files of its weights, and the distance of the loss, if that has one.
 
     Raises:
-        InputError: weights that cannot be used, or crops too small for them.
+        InputError: weights that cannot be used, or crops with a shorter side of `size` too small for them.
     """
     lpips = read_lpips(files) if files else None
     if lpips is not None and size < lpips.least_px:

@@ -55,15 +55,7 @@ _NEAR_DEPTHS, _FAR_DEPTHS = 24, 3
 
 
 class JointState(NamedTuple):
-    """Everything a step changes.
-
-    Attributes:
-        step: number of steps done.
-        network: the network.
-        free: parameters of the DOE; None for one at rest.
-        network_moments: Adam's moments.
-        optics_moments: Adam's moments; None for a DOE at rest.
-    """
+    """Everything a step changes: steps done, network, parameters of the DOE (None at rest), and Adam's moments."""
 
     step: int
     network: Network
@@ -110,16 +102,9 @@ class Trainer(eqx.Module):
         perceptual: Any = None,
         mesh: Mesh | None = None,
     ) -> "Trainer":
-        """Prepare a training.
+        """Prepare a training with an occlusion model and a kind of obstruction; messages name the spec's file.
 
-        Args:
-            spec: the spec; its objectives are done with.
-            source: the spec's file, for messages.
-            model: occlusion model.
-            kind: obstruction.
-            height_m: `[y, x]` heights of a DOE that stays at rest; flat glass replaces them in a conventional camera.
-            perceptual: distance of two batches (`doedesign.training.perceptual`); None leaves the term out.
-            mesh: devices (`devices_mesh`).
+        Heights are those of a DOE that stays at rest; a conventional camera has flat glass instead.
 
         Raises:
             InputError: a training that is not possible: a sensor with a mosaic, rings off the axis or with errors, a

@@ -30,12 +30,8 @@ def losses(
 ) -> tuple[Float[Array, ""], Float[Array, " term"]]:
     """The loss, a mean over the batch, and its terms `[l1, perceptual, masked]` before they are weighted.
 
-    Args:
-        reconstruction: `[b, c, y, x]` display values, not clipped.
-        reference: `[b, c, y, x]` display values of the scene alone.
-        mask: `[b, y, x]` share of each direction that was blocked.
-        options: weights of the terms.
-        perceptual: distance of two batches, `[b]` (`doedesign.training.perceptual`); left out where its weight is 0.
+    Display values are not clipped; the mask is the share of each direction that was blocked. The perceptual distance of
+    two batches (`doedesign.training.perceptual`) is left out where its weight in the options is 0.
     """
     error = jnp.abs(reconstruction - reference)
     parts = [

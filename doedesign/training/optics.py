@@ -90,13 +90,7 @@ def shots(
 ) -> Capture:
     """Photograph a batch, one scene after the other: every array of `seen`, and `keys`, has a first axis for it.
 
-    Args:
-        seen: the scenes.
-        doe: the DOE.
-        free: its parameters; None for one at rest.
-        softness: of the quantisation (`doedesign.design.parametrize.softness_at`).
-        bench: the rest of the camera.
-        keys: keys of the noise.
+    Through a DOE with these parameters and softness (`TrainingDoe.psf`), with noise of these keys.
     """
 
     def shot(given: tuple[TrainingScene, Key[Array, ""]]) -> Capture:

@@ -104,13 +104,7 @@ def _parts(folder: Path) -> Iterator[tuple[str, str, Path]]:
 
 
 def split_pairs(pairs: Sequence[PairFiles], count: int | None, seed: int, where: str) -> Split:
-    """Keep some pairs away from training.
-
-    Args:
-        pairs: all of them.
-        count: number to hold out; a fifth of them, and at most eight, if None.
-        seed: seed of the order that they are the last of.
-        where: the folder, for messages.
+    """Hold out a number of pairs, a fifth and at most eight if None; messages name the folder (`where`).
 
     Raises:
         InputError: nothing left to train on.
@@ -208,14 +202,9 @@ class PairCrop(NamedTuple):
 
 @dataclass(frozen=True)
 class PairData:
-    """A stream of batches of crops. An epoch shows every pair once.
+    """A stream of batches of crops of `shape` (y, x), exchanged left and right at random if `mirrored`.
 
-    Attributes:
-        pairs: the pairs.
-        shape: pixels (y, x) of a crop.
-        seed: seed of everything.
-        batch: crops per batch.
-        mirrored: whether left and right are exchanged at random.
+    An epoch shows every pair once.
     """
 
     pairs: Pairs
@@ -248,13 +237,7 @@ def cut(pair: CapturePair, shape: tuple[int, int], place: tuple[float, float] = 
 
 
 def crop_shape(least: tuple[int, int], size: int, multiple: int, where: str) -> tuple[int, int]:
-    """Pixels (y, x) of crops: `size`, or the most that every pair has.
-
-    Args:
-        least: rows and columns that every pair has.
-        size: pixels per side that are wanted.
-        multiple: divisor of both (`NetworkShape.multiple`).
-        where: the folder, for messages.
+    """Pixels (y, x) of crops: `size`, or the `least` that every pair has, as multiples of `NetworkShape.multiple`.
 
     Raises:
         InputError: a pair that is too small.

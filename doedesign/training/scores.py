@@ -148,7 +148,7 @@ def mean_and_interval(values: Values, confidence: float = 0.95) -> Interval:
     return Interval(mean, mean - reach, mean + reach, pictures)
 
 
-def paired_difference(a: Values, b: Values, confidence: float = 0.95) -> Interval:
+def paired_difference(a: Values, b: Values) -> Interval:
     """By how much `a` is above `b`, another method on the same pictures (and seeds): the mean difference.
 
     Arguments and errors are those of `mean_and_interval`; unlike numbers of scores are a ValueError, too.
@@ -156,4 +156,4 @@ def paired_difference(a: Values, b: Values, confidence: float = 0.95) -> Interva
     if np.shape(a) != np.shape(b):
         got = f"{np.shape(a)} and {np.shape(b)}"
         raise ValueError(f"both methods must have one score per picture (and seed), but got {got}")
-    return mean_and_interval(np.asarray(a, np.float64) - np.asarray(b, np.float64), confidence)
+    return mean_and_interval(np.asarray(a, np.float64) - np.asarray(b, np.float64))

@@ -137,14 +137,9 @@ def _with_options(design: Design, options: Mapping[str, Any]) -> Design:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointTraining(TrainingJob):
-    """A training of a network behind a DOE.
+    """A training of a network behind a design's DOE and a kind of obstruction.
 
-    Attributes:
-        design: the DOE to begin with, with the spec of the training.
-        trainer: its steps.
-        kind: obstruction.
-        held_out: scenes to judge by, one to a batch.
-        pictures: names of the pictures, and their licence.
+    Held-out scenes come one to a batch; `pictures` are names and licence of the pictures for the record.
     """
 
     design: Design

@@ -106,7 +106,7 @@ def test_a_mosaic_needs_three_colours_in_order():
 def test_the_occlusion_model_has_no_default():
     assert occlusion_from_spec(spec_of(), "a.toml") == "radiometric"
     assert occlusion_from_spec(spec_of(), "a.toml", "paper") == "paper"
-    with pytest.raises(InputError, match=r'a\.toml: scene\.occlusion: .*Give "reciprocal"'):
+    with pytest.raises(InputError, match=r'a\.toml: scene\.occlusion: .*Give `occlusion`: "reciprocal"'):
         occlusion_from_spec(spec_of(path=PLAIN), "a.toml")
     with pytest.raises(InputError, match=r"occlusion: .*Did you mean `radiometric`"):
         occlusion_from_spec(spec_of(), "a.toml", "radiometrc")
