@@ -333,8 +333,3 @@ def shrunk(image: Float[Array, "b y x c"], factor: int) -> Float[Array, "b v u c
     """Means over squares of `factor` pixels."""
     b, y, x, c = image.shape
     return image.reshape(b, y // factor, factor, x // factor, factor, c).mean(axis=(2, 4))
-
-
-def count_parameters(tree: Any) -> int:
-    """Count of the numbers that are learnt."""
-    return sum(int(leaf.size) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))

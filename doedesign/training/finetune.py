@@ -31,6 +31,7 @@ from doedesign.recon.model import Model, PsfPair
 from doedesign.recon.network import Network
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
 from doedesign.runtime.compiling import compiled_step
+from doedesign.runtime.stopping import stoppable
 from doedesign.spec import load_spec
 from doedesign.spec.training import TrainSpec
 from doedesign.training.evaluation import EvaluationResult, HeldOutScene, judge
@@ -87,13 +88,54 @@ def finetune(
             longer finite.
         KeyboardInterrupt: it was stopped; the same call goes on from there.
     """
-
-    def prepare() -> FineTuning:
-        options = _options(model, steps, learning_rate, seed)
-        given = psfs or model.psfs(), Path(pairs), options, validation, size, lpips_weights, linear, mirrored
-        return FineTuning.prepare(model, *given)
-
-    return trained_model(prepare, out)
+    folder = Path(pairs)
+    with stoppable():  # which ends the preparation, too
+        options, psfs = _options(model, steps, learning_rate, seed), psfs or model.psfs()
+        split = split_pairs(find_pairs(folder), validation, seed, str(folder))
+        if split.left_out:
+            count = len(split.left_out)
+            _log.warning("%d pairs show what is held out under another name and are left out", count)
+        training, held_out = (Pairs(files, model, linear) for files in split[:2])
+        _log.info("reading %d pairs to train on and %d to judge by", len(training), len(held_out))
+        least = np.minimum(training.least_size(), held_out.least_size())
+        wanted = options.size if size is None else size
+        shape = crop_shape((int(least[0]), int(least[1])), wanted, model.network.layout.multiple, str(folder))
+        lpips, perceptual = perceptual_distance(options, min(shape), f"{folder}: size of crops", lpips_weights)
+        settings = {
+            "format": FORMAT,
+            "model_sha256": dict(model.digests),
+            "psfs_sha256": sha256_bytes(psfs.far.tobytes() + psfs.near.tobytes()),
+            "near_m": psfs.near_m,
+            "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
+            "pairs_sha256": pairs_digest(split.training),
+            "held_out_sha256": pairs_digest(split.held_out),
+            "crop_px": list(shape),
+            "mirrored": mirrored,
+            "linear": linear,
+            "options": {name: getattr(options, name) for name in _OPTIONS},
+            "perceptual": "none" if perceptual is None else perceptual.name,
+            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
+            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
+        }
+        names: dict[str, Any] = {name: [pair.name for pair in group] for name, group in split._asdict().items()}
+        names["with_mask"] = [pair.name for group in split[:2] for pair in group if pair.mask is not None]
+        job = FineTuning(
+            name="fine-tuning",
+            title=str(model.about.get("run", "model" if model.folder is None else model.folder.name)),
+            options=options,
+            settings=settings,
+            inputs={"pairs.json": canonical_json(names)},
+            differs="one with another model, PSFs, settings or pairs",
+            validates_first=True,
+            model=model,
+            psfs=psfs,
+            perceptual=perceptual,
+            data=PairData(training, shape, seed, options.batch, mirrored),
+            held_out=held_out,
+            lpips=lpips,
+            pairs=names,
+        )
+    return trained_model(job, out)
 
 
 def _options(model: Model, steps: int, learning_rate: float | None, seed: int) -> TrainSpec:
@@ -122,65 +164,6 @@ class FineTuning(TrainingJob):
     data: PairData
     held_out: Pairs
     pairs: Mapping[str, Any]
-
-    @classmethod
-    def prepare(
-        cls,
-        model: Model,
-        psfs: PsfPair,
-        folder: Path,
-        options: TrainSpec,
-        validation: int | None,
-        size: int | None,
-        lpips_weights: Sequence[Path],
-        linear: bool | None,
-        mirrored: bool,
-    ) -> "FineTuning":
-        """Prepare a fine-tuning; see `finetune`."""
-        split = split_pairs(find_pairs(folder), validation, options.seed, str(folder))
-        if split.left_out:
-            count = len(split.left_out)
-            _log.warning("%d pairs show what is held out under another name and are left out", count)
-        training, held_out = (Pairs(files, model, linear) for files in split[:2])
-        _log.info("reading %d pairs to train on and %d to judge by", len(training), len(held_out))
-        least = np.minimum(training.least_size(), held_out.least_size())
-        wanted = options.size if size is None else size
-        shape = crop_shape((int(least[0]), int(least[1])), wanted, model.network.layout.multiple, str(folder))
-        lpips, perceptual = perceptual_distance(options, min(shape), f"{folder}: size of crops", lpips_weights)
-        settings = {
-            "format": FORMAT,
-            "model_sha256": dict(model.digests),
-            "psfs_sha256": sha256_bytes(psfs.far.tobytes() + psfs.near.tobytes()),
-            "near_m": psfs.near_m,
-            "far_m": None if np.isinf(psfs.far_m) else psfs.far_m,
-            "pairs_sha256": pairs_digest(split.training),
-            "held_out_sha256": pairs_digest(split.held_out),
-            "crop_px": list(shape),
-            "mirrored": mirrored,
-            "linear": linear,
-            "options": {name: getattr(options, name) for name in _OPTIONS},
-            "perceptual": "none" if perceptual is None else perceptual.name,
-            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
-            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
-        }
-        names: dict[str, Any] = {name: [pair.name for pair in pairs] for name, pairs in split._asdict().items()}
-        names["with_mask"] = [pair.name for pairs in split[:2] for pair in pairs if pair.mask is not None]
-        return cls(
-            name="fine-tuning",
-            title=str(model.about.get("run", "model" if model.folder is None else model.folder.name)),
-            options=options,
-            settings=settings,
-            inputs={"pairs.json": canonical_json(names)},
-            differs="one with another model, PSFs, settings or pairs",
-            validates_first=True,
-            model=model,
-            psfs=psfs,
-            perceptual=perceptual,
-            data=PairData(training, shape, options.seed, options.batch, mirrored),
-            held_out=held_out,
-            lpips=lpips,
-            pairs=names,
-        )
 
     def initial(self) -> "FinetuneState":
         """The state before the first step."""

@@ -17,7 +17,7 @@ import logging
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -97,14 +97,14 @@ class TrainingJob(ABC):
         """Write the trained network and all that belongs to it; return the names of the files."""
 
 
-def trained_model(prepare: Callable[[], TrainingJob], out: str | Path | None, *, tensorboard: bool = False) -> Model:
+def trained_model(job: TrainingJob, out: str | Path | None, *, tensorboard: bool = False) -> Model:
     """Run a training in a folder, or in a temporary one, which is removed, if it is None; return the model.
 
-    A signal ends it (KeyboardInterrupt) while it is prepared, and after a step, with a checkpoint, once it runs.
+    A signal ends it after a step, with a checkpoint (KeyboardInterrupt).
     """
     place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
     with stoppable() as stop, place as folder:
-        _run(prepare(), Path(folder), stop, tensorboard)
+        _run(job, Path(folder), stop, tensorboard)
         model = Model.open(folder)
     return replace(model, folder=None) if out is None else model
 

@@ -15,7 +15,6 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +42,9 @@ from doedesign.recon.model import Model
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, camera_facts, write_network
 from doedesign.runs.folder import CONTINUOUS, TRAINING
 from doedesign.runs.level_maps import write_design
+from doedesign.runtime.stopping import stoppable
 from doedesign.spec import Spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
-from doedesign.training.evaluation import SCENE_SEED, EvaluationResult, HeldOutScene, judge, split_pictures
+from doedesign.training.evaluation import SCENE_SEED, EvaluationResult, HeldOutScene, Split, judge, split_pictures
 from doedesign.training.history import require_tensorboard
 from doedesign.training.hosts import join_hosts
 from doedesign.training.job import TrainingJob, perceptual_distance, trained_model
@@ -110,29 +110,79 @@ def train(
         rule = "must be left out with several hosts: every host takes all that it has"
         raise InputError("devices", rule, devices, "Leave it out.")
     join_hosts(coordinator, hosts, host)
-    prepare = partial(
-        JointTraining.prepare,
-        _with_options(design, options),
-        None if images is None else Path(images),
-        None if validation is None else Path(validation),
-        occlusion=occlusion,
-        obstruction=obstruction,
-        lpips_weights=lpips_weights,
-        licence=licence,
-        overrides=overrides,
-        devices=devices,
-    )
-    return trained_model(prepare, out, tensorboard=tensorboard)
+    with stoppable():  # which ends the preparation, too
+        design, spec = _with_options(design, options)
+        source, how = str((design.folder or Path()) / "spec.toml"), spec.train
+        model = occlusion_from_spec(spec, source, occlusion)
+        kind = obstruction_from_spec(spec, source, obstruction)
+        lpips, perceptual = perceptual_distance(how, how.size, f"{source}: train.size", lpips_weights)
+        _require_possible(spec, source)
+        given, own = (None if folder is None else Path(folder) for folder in (images, validation))
+        split = split_pictures(given, own, how.validation, how.seed)
+        data, held_out = _scenes(spec, kind, split)
+        _log.info("preparing propagation")
+        at_rest, mesh = design.nominal_height_m, devices_mesh(devices)
+        trainer = Trainer.of(spec, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
+        settings = {
+            "format": TRAINING,
+            "run": spec.name,
+            "spec_sha256": spec_digest(spec),
+            "height_sha256": _height_digest(design),
+            "occlusion": model,
+            "obstruction": getattr(kind, "name", type(kind).__name__),
+            "obstruction_parameters": plain_parameters(kind),
+            "camera": how.camera,
+            "pictures_sha256": data.pictures.digest(),
+            "held_out_sha256": held_out.pictures.digest(),
+            "perceptual": "none" if perceptual is None else perceptual.name,
+            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
+            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
+        }
+        pictures = {
+            "licence": licence,
+            "training": [_name(path, given) for path in split.training],
+            "held_out": [_name(path, own or given) for path in split.held_out],
+        }
+        resolved = spec_to_resolved_toml(spec, overrides).encode()
+        job = JointTraining(
+            name="training",
+            title=spec.name,
+            options=how,
+            settings=settings,
+            remarks={"licence": licence},
+            inputs={"spec.toml": resolved, "pictures.json": canonical_json(pictures)},
+            differs="one with another run, spec, occlusion model, perceptual loss or other pictures",
+            design=design,
+            trainer=trainer,
+            kind=kind,
+            data=data,
+            held_out=held_out,
+            lpips=lpips,
+            pictures=pictures,
+        )
+    return trained_model(job, out, tensorboard=tensorboard)
 
 
-def _with_options(design: Design, options: Mapping[str, Any]) -> Design:
-    """The design with a spec whose training has other options."""
+def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, Spec]:
+    """The design with a spec whose training has other options, and that spec."""
     if design.spec is None:
         raise InputError("design", "must have a spec, which says how to train", "none", "Optimise it from a spec.")
     if not options:
-        return design
+        return design, design.spec
     tables = spec_to_json(design.spec)
-    return replace(design, spec=spec_from_json({**tables, "train": {**tables["train"], **options}}, "train"))
+    spec = spec_from_json({**tables, "train": {**tables["train"], **options}}, "train")
+    return replace(design, spec=spec), spec
+
+
+def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData, SceneData]:
+    """Scenes to train on, and scenes to judge by."""
+    camera, how = camera_from_spec(spec), spec.train
+    view = CameraView((how.size, how.size), camera.pixel_m, camera.sensor_distance_m)
+    far = (min(spec.scene.far_m), max(spec.scene.far_m))
+    trained_on, judged_by = (Pictures(files, most_px=2 * how.size) for files in split[:2])
+    threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
+    data = SceneData(trained_on, kind, view, far, how.seed, how.batch, threads)
+    return data, SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,79 +198,6 @@ class JointTraining(TrainingJob):
     data: SceneData
     held_out: SceneData
     pictures: Mapping[str, Any]
-
-    @classmethod
-    def prepare(
-        cls,
-        design: Design,
-        images: Path | None,
-        validation: Path | None,
-        *,
-        occlusion: str | None,
-        obstruction: str | None,
-        lpips_weights: Sequence[Path],
-        licence: str | None,
-        overrides: Sequence[str],
-        devices: int | None,
-    ) -> "JointTraining":
-        """Prepare a training; see `train`."""
-        assert design.spec is not None
-        spec, options = design.spec, design.spec.train
-        source = str((design.folder or Path()) / "spec.toml")
-        model = occlusion_from_spec(spec, source, occlusion)
-        kind = obstruction_from_spec(spec, source, obstruction)
-        camera = camera_from_spec(spec)
-        view = CameraView((options.size, options.size), camera.pixel_m, camera.sensor_distance_m)
-        lpips, perceptual = perceptual_distance(options, options.size, f"{source}: train.size", lpips_weights)
-        _require_possible(spec, source)
-        split = split_pictures(images, validation, options.validation, options.seed)
-        far = (min(spec.scene.far_m), max(spec.scene.far_m))
-        trained_on, judged_by = (Pictures(files, most_px=2 * options.size) for files in split[:2])
-        threads = min(_MOST_THREADS, max(2, os.cpu_count() or 1))
-        data = SceneData(trained_on, kind, view, far, options.seed, options.batch, threads)
-        held_out = SceneData(judged_by, kind, view, far, SCENE_SEED, mirrored=False)
-        _log.info("preparing propagation")
-        at_rest, mesh = design.nominal_height_m, devices_mesh(devices)
-        trainer = Trainer.of(spec, source, model, kind, at_rest, perceptual=perceptual, mesh=mesh)
-        settings = {
-            "format": TRAINING,
-            "run": spec.name,
-            "spec_sha256": spec_digest(spec),
-            "height_sha256": _height_digest(design),
-            "occlusion": model,
-            "obstruction": getattr(kind, "name", type(kind).__name__),
-            "obstruction_parameters": plain_parameters(kind),
-            "camera": options.camera,
-            "pictures_sha256": trained_on.digest(),
-            "held_out_sha256": judged_by.digest(),
-            "perceptual": "none" if perceptual is None else perceptual.name,
-            "perceptual_sha256": "" if perceptual is None else perceptual.digest,
-            "units": "SI; light is linear with white 1; arrays [y, x], row 0 at the lowest y",
-        }
-        pictures = {
-            "licence": licence,
-            "training": [_name(path, images) for path in split.training],
-            "held_out": [_name(path, validation or images) for path in split.held_out],
-        }
-        return cls(
-            name="training",
-            title=spec.name,
-            options=options,
-            settings=settings,
-            remarks={"licence": licence},
-            inputs={
-                "spec.toml": spec_to_resolved_toml(spec, overrides).encode(),
-                "pictures.json": canonical_json(pictures),
-            },
-            differs="one with another run, spec, occlusion model, perceptual loss or other pictures",
-            design=design,
-            trainer=trainer,
-            kind=kind,
-            data=data,
-            held_out=held_out,
-            lpips=lpips,
-            pictures=pictures,
-        )
 
     def initial(self) -> JointState:
         """The state before the first step: the heights of the design before rounding; of rings, their profile."""

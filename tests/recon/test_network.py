@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.recon.network import Block, Network, NetworkShape, count_parameters, normalised, shrunk
+from doedesign.recon.network import Block, Network, NetworkShape, normalised, shrunk
 from sim.light import srgb_from_linear
+from tests.recon.drawn_networks import count_parameters
 
 SMALL = NetworkShape(width=3, depth=2)
 TINY = NetworkShape(width=3, depth=1)

@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import pytest
 
-from doedesign.recon.network import Network, NetworkShape, count_parameters
+from doedesign.recon.network import Network, NetworkShape
 from doedesign.recon.weights import FORMAT, read_network, write_network
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import canonical_json
-from tests.recon.drawn_networks import drawn
+from tests.recon.drawn_networks import count_parameters, drawn
 
 SMALL = NetworkShape(width=3, depth=1)
 ABOUT = {
