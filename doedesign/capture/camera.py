@@ -1,4 +1,4 @@
-"""How light becomes a developed capture: the part of a camera that is the same whatever optic it has."""
+"""From light to a developed capture: the part of a camera that is the same whatever optic it has."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -46,7 +46,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneData:
-    """Where scenes come from. An epoch shows every picture once.
+    """Source of scenes. An epoch shows every picture once.
 
     Attributes:
         pictures: the pictures.

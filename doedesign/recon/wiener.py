@@ -1,7 +1,7 @@
 """PSF-aware blocks: Wiener filters that undo the blur of a camera in images, or in features of any scale.
 
-A camera's PSF has one transfer function per colour. Features are not colours, but each can be told which colour's blur
-to undo: feature k follows colour k mod c, and the transfer function is broadcast over the rest, never copied. At scale
+A camera's PSF has one transfer function per colour. Features are not colours, but each can undo the blur of one:
+feature k follows colour k mod c, and the transfer function is broadcast over the rest, never copied. At scale
 s an image's pixels are s apart, and its PSF is the camera's, summed over the s x s samples that are nearest to each of
 them (a sample half way belongs to both with one half) and brought back to unit sum: means instead of sums, as in the
 public release, would lend deep scales a gain of s².

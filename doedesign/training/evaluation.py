@@ -1,4 +1,4 @@
-"""How well a network does on pictures that it is never trained on: their choice, their scores by region, and means.
+"""Judgement of a network on pictures that it is never trained on: their choice, their scores by region, and means.
 
 Without a folder of their own they are the last of the training folder in an order shuffled by the seed; whatever has
 the same bytes as one of them under another name is not trained on either. (Neighbouring frames of a film are almost the
@@ -35,13 +35,10 @@ class Split(NamedTuple):
 
 
 def split_pictures(images: Path | None, validation: Path | None, count: int, seed: int) -> Split:
-    """Find pictures to train on, and some to keep away from training.
+    """Find pictures to train on, and a number to hold out.
 
-    Args:
-        images: folder of pictures; scikit-image's samples if None.
-        validation: folder to take the held-out ones from; the same folder if None.
-        count: number to hold out; all of the folder of their own if it has fewer.
-        seed: seed of the order that they are the last of.
+    Pictures are those of a folder, or scikit-image's samples, and the held-out ones come from a `validation` folder, if
+    there is one, and are all of it if it has fewer.
 
     Raises:
         InputError: a folder that cannot be used, or nothing left to train on.

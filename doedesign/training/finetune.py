@@ -1,4 +1,4 @@
-"""Fine-tuning: a trained network on real captures, each with a picture of what was to be seen (paper §4).
+"""Fine-tuning: a trained network on real captures, each with a reference picture (paper §4).
 
 The loss is that of training (eq. 13); its masked term counts where a mask is known. The optics is glass by now, so the
 network alone moves. Batch, size of crops, weights of the loss and precision are those of the model's own training,

@@ -10,7 +10,7 @@ Pairs that are never trained on are the last in an order shuffled by the seed. W
 of one of them under another name is not trained on either: the same view behind other dirt is the same view.
 
 Crop i of epoch e is a pure function of the seed, e and i, as scenes are (`doedesign.capture.scenes`): its place, and
-whether it is exchanged left and right. **A mirrored capture was seen through a mirrored DOE**, so whoever takes such a
+whether it is exchanged left and right. **A mirrored capture was taken through a mirrored DOE**, so whoever takes such a
 crop has to mirror the PSFs, too. They have odd windows, so that is exact.
 """
 
@@ -88,7 +88,7 @@ def find_pairs(folder: Path) -> tuple[PairFiles, ...]:
 
 
 def _parts(folder: Path) -> Iterator[tuple[str, str, Path]]:
-    """Which part of which pair every picture is."""
+    """Every picture as a part of a named pair."""
     try:
         inside = any((folder / part).is_dir() for part in _PARTS[:2])
         for part in _PARTS:

@@ -80,7 +80,7 @@ class Lpips(eqx.Module):
         return jnp.sum(jnp.stack([jnp.mean(each, (1, 2)) for each in _taps(self, a, b)]), axis=0)
 
     def map(self, a: Images, b: Images) -> Float[Array, "b y x"]:
-        """Where pictures differ: the maps of all taps, each enlarged to the pictures' size (linearly), and summed.
+        """Map of the differences: those of all taps, each enlarged to the pictures' size (linearly), and summed.
 
         This is what the authors' code calls `spatial`. Its mean is the distance but for what enlarging does at the
         edges. A deep feature sees far beyond its own place, so a small region's share is only roughly its own.
@@ -116,14 +116,10 @@ def _features(model: Lpips, image: Images) -> list[Float[Array, "b _ _ _"]]:
 
 
 def weights_of(backbone_state: Mapping[str, ArrayLike], head_state: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-    """Collect what `read_lpips` needs from the state dicts of torchvision and of the authors' package.
+    """Collect the float32 arrays by name that `read_lpips` needs, from state dicts.
 
-    Args:
-        backbone_state: of torchvision's `squeezenet1_1`, `alexnet` or `vgg16`; its classifier is left out.
-        head_state: of `lpips.LPIPS`, or of one of its v0.1 files; a backbone in it is left out.
-
-    Returns:
-        float32 arrays by name, ready for `numpy.savez`.
+    They are of torchvision's `squeezenet1_1`, `alexnet` or `vgg16`, whose classifier is left out, and of `lpips.LPIPS`
+    or one of its v0.1 files, where a backbone is left out.
 
     Raises:
         InputError: a weight is missing, has another shape or is not finite.
@@ -136,11 +132,9 @@ def weights_of(backbone_state: Mapping[str, ArrayLike], head_state: Mapping[str,
 
 
 def read_lpips(paths: Sequence[Path]) -> Lpips:
-    """Read the weights of LPIPS.
+    """Read LPIPS from `.npz` files that together hold a backbone (torchvision's names) and its heads (lin0, lin1, ...).
 
-    Args:
-        paths: one or more `.npz` files that together hold a backbone (torchvision's names) and its heads (lin0, lin1,
-            ...). What else they hold is not looked at. Half precision is widened.
+    Other arrays in them are left alone. Half precision is widened.
 
     Raises:
         InputError: a file cannot be read, or a weight is missing, there twice, of another shape, or not finite.

@@ -1,4 +1,4 @@
-"""How reconstructions are judged: PSNR, SSIM and 1 - LPIPS, in the occluded region and over the full image.
+"""Scores of reconstructions: PSNR, SSIM and 1 - LPIPS, in the occluded region and over the full image.
 
 The columns are those of Table 1 of the paper. How it restricts SSIM and LPIPS to a region, which backbone it takes and
 where a soft mask ends is not said, so this is our own protocol:
@@ -149,7 +149,7 @@ def mean_and_interval(values: Values, confidence: float = 0.95) -> Interval:
 
 
 def paired_difference(a: Values, b: Values) -> Interval:
-    """By how much `a` is above `b`, another method on the same pictures (and seeds): the mean difference.
+    """Mean difference of `a` over `b`, another method on the same pictures (and seeds), with its interval.
 
     Arguments and errors are those of `mean_and_interval`; unlike numbers of scores are a ValueError, too.
     """
