@@ -1,16 +1,17 @@
 """Mask files read by gdstk, a library that had no part in writing them.
 
-Everything here relies on gdstk and numpy alone and shares no code with the writer, the reader or the
-painter of this package: a mistake in those cannot hide itself. Rectangles are counted into a winding
-number per pixel by a difference array and two running sums; a sound plane has 0 and 1 only.
+Everything here relies on gdstk and numpy alone and shares no code with the writer, the reader or the painter of this
+package: a mistake in those cannot hide itself. Rectangles are counted into a winding number per pixel by a difference
+array and two running sums; a sound plane has 0 and 1 only.
 
-OASIS keeps repeated shapes folded. They are unfolded here by the library's own list of offsets; reading
-the polygons alone would silently miss most of a mask.
+OASIS keeps repeated shapes folded. They are unfolded here by the library's own list of offsets; reading the polygons
+alone would silently miss most of a mask.
 """
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -27,26 +28,51 @@ from fab.units import NM, UM
 _MOST_AT_ONCE = 2_200_000
 _BATCH = 100_000
 
+# Rectangles and other polygons of one layer of a cell, batch by batch.
+_Taken = tuple[list[NDArray[np.int32]], list[NDArray[np.int64]]]
+
 
 @dataclass(frozen=True, eq=False)
 class LayerReading:
-    """One layer as gdstk sees it.
-
-    Attributes:
-        cell: the cell of a DOE.
-        layer: the layer.
-        winding: ``[y, x]`` int32, how many rectangles cover each pixel.
-        strays: four-point shapes that are no rectangle on the pixel raster; they are not counted in.
-        polygons: shapes with any other number of points, ``(v, 2)`` int64 in database units.
-        moved: the shapes as they are, instead of `winding`, of a layer whose edges lie off the pixel raster on purpose.
-    """
+    """One layer of a cell of a DOE as gdstk sees it; `edges` is the pixel raster."""
 
     cell: str
     layer: Layer
-    winding: NDArray[np.int32]
-    strays: int
-    polygons: list[NDArray[np.int64]]
-    moved: Shapes | None = None
+    shapes: Shapes
+    edges: PixelEdges
+
+    @property
+    def polygons(self) -> list[NDArray[np.int32]]:
+        """Shapes with any other number of points than four."""
+        return [polygon for polygon in self.shapes.polygons if len(polygon) != 4]
+
+    @property
+    def strays(self) -> int:
+        """Number of four-point shapes that are no rectangle on the pixel raster; `winding` leaves them out."""
+        return self._counted[1] + len(self.shapes.polygons) - len(self.polygons)
+
+    @property
+    def winding(self) -> NDArray[np.int32]:
+        """``[y, x]`` how many rectangles cover each pixel."""
+        return self._counted[0]
+
+    @cached_property
+    def _counted(self) -> tuple[NDArray[np.int32], int]:
+        """Windings, and the number of rectangles off the raster."""
+        xs, ys = self.edges.x, self.edges.y
+        steps, strays = np.zeros(ys.size * xs.size, dtype=np.int32), 0
+        for start in range(0, len(self.shapes.rectangles), _BATCH):
+            boxes = self.shapes.rectangles[start : start + _BATCH].astype(np.int64)
+            numbers, found = zip(*map(_edge_numbers, boxes.T, (xs, ys, xs, ys)), strict=True)
+            sound = np.logical_and.reduce(found)
+            strays += int(np.count_nonzero(~sound))
+            x0, y0, x1, y1 = (number[sound] for number in numbers)
+            for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
+                np.add.at(steps, rows * xs.size + columns, np.int32(step))
+        winding = steps.reshape(ys.size, xs.size)
+        np.add.accumulate(winding, axis=0, out=winding)
+        np.add.accumulate(winding, axis=1, out=winding)
+        return winding[:-1, :-1], strays
 
 
 def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -56,72 +82,19 @@ def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[
     return numbers, edges[numbers] == values
 
 
-class _Counter:
-    """Collects the shapes of one layer of a cell."""
-
-    def __init__(self, cell: str, layer: Layer, edges: PixelEdges) -> None:
-        self.cell = cell
-        self.layer = layer
-        self.edges = edges
-        self.steps = np.zeros(edges.y.size * edges.x.size, dtype=np.int32)
-        self.strays = 0
-        self.polygons: list[NDArray[np.int64]] = []
-
-    def add(self, points_um: NDArray[np.float64]) -> None:
-        """Take shapes of equal size, ``(n, v, 2)``."""
-        points = np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
-        if points.shape[1] != 4:
-            self.polygons.extend(points)
-            return
-        # The long axis last: numpy is slow along axes of four.
-        x, y = np.ascontiguousarray(points.transpose(2, 1, 0))
-        # Every side runs along one axis; with a box that is not flat, that leaves only rectangles.
-        along = (np.roll(x, -1, axis=0) == x) != (np.roll(y, -1, axis=0) == y)
-        (x0, x0_found), (x1, x1_found) = (_edge_numbers(v, self.edges.x) for v in (x.min(axis=0), x.max(axis=0)))
-        (y0, y0_found), (y1, y1_found) = (_edge_numbers(v, self.edges.y) for v in (y.min(axis=0), y.max(axis=0)))
-        sound = along.all(axis=0) & x0_found & x1_found & y0_found & y1_found & (x0 < x1) & (y0 < y1)
-        self.strays += int(np.count_nonzero(~sound))
-        x0, x1, y0, y1 = (numbers[sound] for numbers in (x0, x1, y0, y1))
-        width = self.edges.x.size
-        for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
-            np.add.at(self.steps, rows * width + columns, np.int32(step))
-
-    def reading(self) -> LayerReading:
-        """Sum the steps up, in place, and return the reading."""
-        winding = self.steps.reshape(self.edges.y.size, self.edges.x.size)
-        np.add.accumulate(winding, axis=0, out=winding)
-        np.add.accumulate(winding, axis=1, out=winding)
-        return LayerReading(self.cell, self.layer, winding[:-1, :-1], self.strays, self.polygons)
-
-
-class _Collector(_Counter):
-    """Collects the shapes of a layer as they are."""
-
-    def __init__(self, cell: str, layer: Layer, edges: PixelEdges) -> None:
-        super().__init__(cell, layer, edges)
-        self.boxes: list[NDArray[np.int32]] = []
-
-    def add(self, points_um: NDArray[np.float64]) -> None:
-        """Take shapes of equal size, ``(n, v, 2)``."""
-        boxes, others = _upright(np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64))
-        self.boxes.append(boxes)
-        self.polygons.extend(others)
-
-    def reading(self) -> LayerReading:
-        """Return everything that was taken."""
-        nothing = np.zeros((0, 0), dtype=np.int32)
-        return LayerReading(self.cell, self.layer, nothing, 0, self.polygons, _shapes(self.boxes, self.polygons))
-
-
-def _upright(points: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _separated(points: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Separate the rectangles x0, y0, x1, y1 from all other polygons ``(n, v, 2)``."""
-    low, high = points.min(axis=1), points.max(axis=1)
-    sides = np.count_nonzero(points != np.roll(points, -1, axis=1), axis=2)
-    upright = (points.shape[1] == 4) & (sides == 1).all(axis=1) & (low < high).all(axis=1)
-    return np.concatenate([low, high], axis=1)[upright].astype(np.int32), points[~upright]
+    # The long axis last: numpy is slow along axes of four.
+    x, y = np.ascontiguousarray(points.transpose(2, 1, 0))
+    x0, y0, x1, y1 = x.min(axis=0), y.min(axis=0), x.max(axis=0), y.max(axis=0)
+    # Every side runs along one axis; with a box that is not flat, that leaves only rectangles.
+    along = (np.roll(x, -1, axis=0) == x) != (np.roll(y, -1, axis=0) == y)
+    upright = (len(x) == 4) & along.all(axis=0) & (x0 < x1) & (y0 < y1)
+    return np.stack([x0, y0, x1, y1], axis=1)[upright].astype(np.int32), points[~upright]
 
 
-def _shapes(boxes: Iterable[NDArray[np.int32]], polygons: Iterable[NDArray[np.int64]]) -> Shapes:
+def _shapes(taken: _Taken) -> Shapes:
+    boxes, polygons = taken
     rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *boxes])
     return Shapes(rects, tuple(polygon.astype(np.int32) for polygon in polygons))
 
@@ -142,66 +115,22 @@ def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
         yield Layer(first.layer, first.datatype), first.size, polygons[start:end]
 
 
-def _joined(polygons: list[Any], size: int) -> NDArray[np.float64]:
-    return np.frombuffer(b"".join([p.points for p in polygons]), dtype=np.float64).reshape(-1, size, 2)
+def _offsets(one: Any) -> NDArray[np.float64]:
+    return one.repetition.get_offsets() if one.repetition.size else np.zeros((1, 2))
 
 
 def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
     """Yield the points of polygons with one copy per repetition, in batches."""
+    points_um = np.frombuffer(b"".join([p.points for p in polygons]), dtype=np.float64).reshape(-1, size, 2)
     if not any(polygon.repetition.size for polygon in polygons):
-        yield _joined(polygons, size)
+        yield points_um
         return
-    origin = np.zeros((1, 2))
-    offsets = [polygon.repetition.get_offsets() if polygon.repetition.size else origin for polygon in polygons]
+    offsets = [_offsets(polygon) for polygon in polygons]
     owners = np.repeat(np.arange(len(polygons)), [len(copies) for copies in offsets])
     shifts = np.concatenate(offsets)
-    points_um = _joined(polygons, size)
     for start in range(0, len(owners), _BATCH):
         part = slice(start, start + _BATCH)
         yield points_um[owners[part]] + shifts[part, None, :]
-
-
-class _Around:
-    """Collects the cells around the DOE, layer by layer."""
-
-    def __init__(self, dbu_m: float) -> None:
-        self.dbu_m = dbu_m
-        self.shapes: dict[str, dict[Layer, list[NDArray[np.int64]]]] = defaultdict(lambda: defaultdict(list))
-        self.references: dict[str, tuple[Reference, ...]] = {}
-
-    def add(self, cell: Any) -> None:
-        """Take a cell, or a part of it; its references come with every part."""
-        self.references[cell.name] = tuple(self._references(cell))
-        for polygon in cell.polygons:
-            layer = Layer(polygon.layer, polygon.datatype)
-            offsets = polygon.repetition.get_offsets() if polygon.repetition.size else np.zeros((1, 2))
-            for offset in offsets:
-                self.shapes[cell.name][layer].append(self._units(polygon.points + offset))
-
-    def _units(self, points_um: NDArray[np.float64]) -> NDArray[np.int64]:
-        return np.rint(points_um * (UM / self.dbu_m)).astype(np.int64)
-
-    def _references(self, cell: Any) -> Iterator[Reference]:
-        for reference in cell.references:
-            offsets = reference.repetition.get_offsets() if reference.repetition.size else np.zeros((1, 2))
-            name = reference.cell_name
-            if reference.rotation or reference.x_reflection or reference.magnification != 1:
-                name += " (turned, mirrored or scaled)"
-            for x, y in self._units(np.asarray(reference.origin) + offsets).tolist():
-                yield Reference(name, x, y)
-
-    def cells(self) -> list[Cell]:
-        """Return everything."""
-        return [
-            Cell(name, {layer: _from_polygons(found) for layer, found in self.shapes[name].items()}, references)
-            for name, references in self.references.items()
-        ]
-
-
-def _from_polygons(polygons: list[NDArray[np.int64]]) -> Shapes:
-    fours = np.array([points for points in polygons if len(points) == 4], dtype=np.int64).reshape(-1, 4, 2)
-    boxes, others = _upright(fours)
-    return _shapes([boxes], [*others, *(points for points in polygons if len(points) != 4)])
 
 
 class GdstkReader:
@@ -210,32 +139,30 @@ class GdstkReader:
     The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
 
     Attributes:
-        does: the cells of the DOE, each with its layers whose edges lie off the pixel raster on purpose.
+        does: the cells of the DOE.
         edges: the pixel raster.
-        around: the other cells; complete once every reading was taken.
         problems: one sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
     """
 
-    def __init__(self, does: Mapping[str, Collection[Layer]], edges: PixelEdges) -> None:
+    def __init__(self, does: Collection[str], edges: PixelEdges) -> None:
         self.does, self.edges = does, edges
         self.problems: list[str] = []
-        self._around = _Around(edges.dbu_m)
+        self._around: dict[str, dict[Layer, _Taken]] = defaultdict(lambda: defaultdict(lambda: ([], [])))
+        self._references: dict[str, tuple[Reference, ...]] = {}
 
     @property
     def around(self) -> list[Cell]:
-        """The cells around the DOE."""
-        return self._around.cells()
+        """The cells around the DOE; complete once every reading was taken."""
+        return [
+            Cell(name, {layer: _shapes(taken) for layer, taken in self._around[name].items()}, references)
+            for name, references in self._references.items()
+        ]
 
     def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[LayerReading]:
         """Read a GDSII file, few enough shapes at a time to bound the memory.
 
-        Args:
-            path: the file.
-            layers: the layers of the DOE, with the number of shapes expected on each.
-            others: all other layers.
-
-        Yields:
-            One reading per layer, in the order given, and cell of the DOE.
+        `layers` are those of the DOE with the number of shapes expected on each, `others` all other ones. Yields one
+        reading per layer, in the order given, and cell of the DOE.
         """
         waiting = list(layers)
         rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
@@ -246,34 +173,45 @@ class GdstkReader:
             wanted = {(layer.number, layer.datatype) for layer in group}
             wanted.update(rest)
             rest = []
-            yield from self._taken(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
+            yield from self._read(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
 
     def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[LayerReading]:
         """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell."""
-        yield from self._taken(gdstk.read_oas(str(path), unit=UM), list(layers))
+        yield from self._read(gdstk.read_oas(str(path), unit=UM), list(layers))
 
-    def _taken(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:
+    def _read(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:
         if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:
             units = [f"{value / NM:.9g} nm" for value in (library.precision, self.edges.dbu_m)]
             self.problems.append(f"the database unit is {units[0]} instead of {units[1]}")
-        counters = {
-            (name, layer): (_Collector if layer in moved else _Counter)(name, layer, self.edges)
-            for layer in group
-            for name, moved in self.does.items()
-        }
+        found: dict[tuple[str, Layer], _Taken] = {(name, layer): ([], []) for layer in group for name in self.does}
         for cell in library.cells:
             if cell.labels or cell.paths:
                 self.problems.append(f"cell {cell.name} holds labels or paths")
-            if cell.name not in self.does:
-                self._around.add(cell)
-                continue
-            if cell.references:
+            around = cell.name not in self.does
+            if around:
+                self._references[cell.name] = tuple(self._placed(cell))
+            elif cell.references:
                 self.problems.append(f"cell {cell.name} places others")
             for layer, size, polygons in _runs(cell.polygons):
-                if layer not in group:
+                taken = self._around[cell.name][layer] if around else found.get((cell.name, layer))
+                if taken is None:
                     self.problems.append(f"layer {layer} of cell {cell.name} holds shapes that should not be there")
                     continue
                 for points_um in _unfolded(polygons, size):
-                    counters[cell.name, layer].add(points_um)
-        for key in list(counters):
-            yield counters.pop(key).reading()
+                    boxes, others = _separated(self._units(points_um))
+                    taken[0].append(boxes)
+                    taken[1].extend(others)
+        for cell, layer in list(found):
+            yield LayerReading(cell, layer, _shapes(found.pop((cell, layer))), self.edges)
+
+    def _units(self, points_um: NDArray[np.float64]) -> NDArray[np.int64]:
+        return np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
+
+    def _placed(self, cell: Any) -> Iterator[Reference]:
+        """Yield the references of a cell, one per copy."""
+        for reference in cell.references:
+            name = reference.cell_name
+            if reference.rotation or reference.x_reflection or reference.magnification != 1:
+                name += " (turned, mirrored or scaled)"
+            for x, y in self._units(np.asarray(reference.origin) + _offsets(reference)).tolist():
+                yield Reference(name, x, y)

@@ -198,10 +198,11 @@ def reading_problems(reading: LayerReading, entry: FileEntry, expected: Expected
 
 
 def _reading_problems(reading: LayerReading, mask: Drawn | None, expected: Expected) -> list[str]:
-    layer, winding = reading.layer, reading.winding
+    layer = reading.layer
+    if mask is not None and mask.edge_move_nm:
+        return _moved_problems(layer, reading.shapes, mask, expected)
+    winding = reading.winding
     problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
-    if mask is not None and reading.moved is not None:
-        return problems + _moved_problems(layer, reading.moved, mask, expected)
     if mask is None:
         covered = int(np.count_nonzero(winding))
         problems += _count_problem(layer, covered, "pixels are covered by rectangles in the chrome")

@@ -223,11 +223,7 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     chrome = expected.chrome_layer(entry)
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
-    moved = {
-        cell: [layer for layer, mask in drawn.items() if mask.edge_move_nm]
-        for cell, drawn in expected.etch_layers(entry).items()
-    }
-    again = GdstkReader(moved, expected.edges)
+    again = GdstkReader(expected.etch_layers(entry), expected.edges)
     others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]

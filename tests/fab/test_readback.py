@@ -38,7 +38,7 @@ def test_the_other_library_counts_every_pixel_once(tmp_path_factory, pitch_m, on
     folder = tmp_path_factory.mktemp("again")
     edges = pixel_edges(Grid((7, 10), pitch_m))
     layers = written(folder, edges, one=one, two=two)
-    again = GdstkReader({"TOP": ()}, edges)
+    again = GdstkReader(["TOP"], edges)
     both = again.gds(folder / "a.gds", layers, []), again.oasis(folder / "a.oas", layers)
     for readings in map(list, both):
         assert [reading.layer for reading in readings] == list(layers)
@@ -58,7 +58,7 @@ def test_repetitions_of_oasis_are_unfolded(tmp_path):
     layers = written(tmp_path, edges, plane=plane)
     cells: list[Any] = gdstk.read_oas(str(tmp_path / "a.oas")).cells
     assert len(cells[0].polygons) < 10
-    (reading,) = GdstkReader({"TOP": ()}, edges).oasis(tmp_path / "a.oas", layers)
+    (reading,) = GdstkReader(["TOP"], edges).oasis(tmp_path / "a.oas", layers)
     assert np.array_equal(reading.winding, plane)
 
 
@@ -68,7 +68,7 @@ def test_overlaps_and_strays_are_seen(tmp_path):
     slanted = np.array([[0, 0], [1000, 0], [1000, 1000], [1, 1000]], dtype=np.int32)
     shapes = {Layer(1): Shapes(rects.astype(np.int32), (slanted,))}
     write_gds(tmp_path / "a.gds", Layout(NM, (Cell("TOP", shapes),)))
-    (reading,) = GdstkReader({"TOP": ()}, edges).gds(tmp_path / "a.gds", {Layer(1): 5}, [])
+    (reading,) = GdstkReader(["TOP"], edges).gds(tmp_path / "a.gds", {Layer(1): 5}, [])
     assert reading.strays == 3
     assert reading.winding.tolist() == [[1, 1, 0, 0], [1, 2, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
 
@@ -88,7 +88,7 @@ def test_layers_are_read_in_as_many_passes_as_memory_asks_for(tmp_path, monkeypa
 
     def windings(count: int, *others: Layer) -> list[np.ndarray]:
         layers = {Layer(n): count for n in (1, 2, 3)}
-        return [reading.winding for reading in GdstkReader({"TOP": ()}, edges).gds(tmp_path / "a.gds", layers, others)]
+        return [reading.winding for reading in GdstkReader(["TOP"], edges).gds(tmp_path / "a.gds", layers, others)]
 
     together = windings(1)
     assert len(passes) == 1
@@ -103,7 +103,7 @@ def test_what_does_not_belong_in_an_oasis_file_is_told(tmp_path):
     cell.add(gdstk.rectangle((0, 0), (1, 1), layer=9), gdstk.Label("text", (0, 0)))
     library.new_cell("OTHER")
     library.write_oas(str(tmp_path / "a.oas"))
-    again = GdstkReader({"TOP": ()}, pixel_edges(Grid((2, 2), UM)))
+    again = GdstkReader(["TOP"], pixel_edges(Grid((2, 2), UM)))
     (reading,) = again.oasis(tmp_path / "a.oas", [Layer(1)])
     assert not reading.winding.any()
     assert [any(word in problem for problem in again.problems) for word in ("labels", "9/0")] == [True] * 2
