@@ -13,22 +13,6 @@ from typing import Any, Literal, NamedTuple
 
 from fab.units import UM
 
-__all__ = [
-    "DEVIATIONS",
-    "Deviation",
-    "Disc",
-    "MaskDisc",
-    "Source",
-    "Typical",
-    "Variation",
-    "deviation_of",
-    "error_names",
-    "estimate",
-    "short_name",
-    "sourced",
-    "variation_of",
-]
-
 Unit = Literal["1", "m", "rad"]
 
 # The largest mean or standard deviation of an error that can be meant, by its unit.

@@ -32,20 +32,6 @@ from fab.sampling import (
     varying,
 )
 
-__all__ = [
-    "DEFECTS",
-    "EXPECTED",
-    "NOMINAL",
-    "budget_keys",
-    "chosen_errors",
-    "corner_keys",
-    "normal_keys",
-    "one_at_a_time_keys",
-    "sobol_keys",
-    "sources_of",
-    "variation_at",
-]
-
 NOMINAL, EXPECTED = "nominal", "expected"
 DEFECTS, _ROUGHNESS = "defects", "roughness"
 _REACHES = (-1.0, 1.0)

@@ -1,5 +1,6 @@
 """Grid: the pixel raster of a plate, and where its centre is."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,3 +56,9 @@ class Grid:
         for row, rest in enumerate(limit - y_squared):
             np.less_equal(x_squared, rest, out=inside[row])
         return inside
+
+
+def fewest_pixels(length_m: float, pitch_m: float) -> int:
+    """Return the fewest pixels of a pitch that are not shorter than a length; at least 1."""
+    # Both are decimal numbers in binary: 2 um are two pixels of 1 um, and not three.
+    return max(1, math.ceil(length_m / pitch_m * (1 - 1e-9)))

@@ -19,8 +19,7 @@ from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.grid import Grid
 from fab.height import HeightMap
-from fab.levels import Levels, height_of, quantise, quantise_wrapped, require_levels
-from fab.masks import level_map_from_planes, planes
+from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, require_levels
 from fab.units import format_length
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ class LevelMap:
         return level_digest(self.level)
 
     def planes(self) -> NDArray[np.uint8]:
-        """Etch masks ``[bit, y, x]``: 1 where mask `bit` is open (`fab.masks.planes`)."""
+        """Etch masks ``[bit, y, x]``: 1 where mask `bit` is open (`fab.levels.planes`)."""
         return planes(self.level, self.levels)
 
     def with_level(self, level: NDArray[np.integer]) -> "LevelMap":

@@ -4,7 +4,7 @@ Every level is a choice of masks: mask k opens where bit k of ``L - 1 - l`` is s
 level l stands as high above the deepest floor as the depths of the masks that stay closed, those whose bit in l is set,
 add up to. The blank glass is the top level ``L - 1``. By default mask k etches ``2**k`` steps, and level l is l steps
 high. Any other depths will do; then the numbers of the levels are still choices of masks, but no longer an order of
-height.
+height. Splitting a level map into its masks (`planes`) and joining them are exact inverses, whatever the depths are.
 """
 
 import math
@@ -207,3 +207,25 @@ def quantise_wrapped(height_m: NDArray[np.floating], levels: Levels) -> NDArray[
 def height_of(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.float64]:
     """Return the height of every pixel of a level map ``[y, x]``, ``levels.heights_m()[level]``, metres."""
     return levels.heights_m()[require_levels(level_map, levels)]
+
+
+def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
+    """Split a level map ``[y, x]`` into its etch masks ``[bit, y, x]``: 1 where mask `bit` is open (etched)."""
+    etched = np.uint8(levels.count - 1) - require_levels(level_map, levels)
+    out = np.empty((levels.bits, *etched.shape), dtype=np.uint8)
+    for bit in range(levels.bits):
+        np.bitwise_and(etched >> np.uint8(bit), np.uint8(1), out=out[bit])
+    return out
+
+
+def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
+    """Join etch masks ``[bit, y, x]`` of 0 and 1, mask 0 first, into the level map ``[y, x]`` that they make."""
+    if bit_planes.ndim != 3 or bit_planes.shape[0] != levels.bits:
+        rule = f"{levels.count} levels need {levels.bits} planes [bit, y, x]"
+        raise InputError("bit planes", rule, f"shape {bit_planes.shape}", "Give one plane per mask.")
+    if bit_planes.size and (bit_planes.min() < 0 or bit_planes.max() > 1):
+        raise InputError("bit planes", "every value must be 0 or 1", "another value", "Threshold the planes first.")
+    etched = np.zeros(bit_planes.shape[1:], dtype=np.uint8)
+    for bit in range(levels.bits):
+        etched |= bit_planes[bit].astype(np.uint8) << np.uint8(bit)
+    return np.uint8(levels.count - 1) - etched

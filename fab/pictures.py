@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import explain_os_error, write_atomic
 
-__all__ = ["MOST_PIXELS", "TIFF_FILES", "decoding", "read_display", "read_pixels", "write_pixels"]
-
 TIFF_FILES = (".tif", ".tiff")
 MOST_PIXELS = 1 << 28
 

@@ -16,17 +16,6 @@ from scipy.linalg import hadamard
 
 from fab.process import Disc, MaskDisc, Process, Variation, deviation_of, error_names, variation_of
 
-__all__ = [
-    "corner_scores",
-    "draw_at",
-    "normal_draw",
-    "normal_scores",
-    "one_at_a_time_scores",
-    "sobol_scores",
-    "source_of",
-    "varying",
-]
-
 _ALL_CORNERS = 6  # errors up to which every combination of signs is tried
 
 

@@ -20,8 +20,6 @@ from fab.errors import InputError
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 
-__all__ = ["IDEAL", "STOCK", "Figure", "Number", "Stock", "process_from"]
-
 
 class Figure(NamedTuple):
     """One number and its source; SI units."""

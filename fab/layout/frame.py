@@ -21,7 +21,7 @@ from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, row
 from fab.layout.split import DieSplit
 from fab.layout.structures import process_monitor
-from fab.layout.wafer import READING, Wafer
+from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.units import MM, UM, format_length
 
@@ -223,7 +223,7 @@ def _beside(
 
 def _labels(plates: Sequence[Photomask], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
     """Labels of all masks side by side, above the wafer on the blank; each mask carries its own."""
-    blocks = [label_block([(p, mask_label(stem, p, READING, digest))], _LETTERS_M, dbu_m) for p in plates]
+    blocks = [label_block([(p, mask_label(stem, p, wafer.reading, digest))], _LETTERS_M, dbu_m) for p in plates]
     labels = centred(row(blocks, 4 * _LETTERS_M))
     width, height = _size_m(labels)
     y = wafer.diameter_m / 2 + _GAP_M + height / 2

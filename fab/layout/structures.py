@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.grid import fewest_pixels
 from fab.layout.geometry import Layer, Shapes
 from fab.layout.lettering import written
 from fab.layout.part import Part, Photomask, block, centred, column, joined, moved, row, without
@@ -125,8 +126,7 @@ def _stripe(pitch_m: float, dbu_m: float, minimum_line_m: float) -> int:
     if pixel < 1:
         got = format_length(pitch_m)
         raise InputError("pixel pitch", "must be one database unit or more", got, "Check the unit of the pitch.")
-    # One part in 1e9 keeps a line of exactly so many pixels.
-    return pixel * max(1, math.ceil(minimum_line_m / (pixel * dbu_m) * (1 - 1e-9)))
+    return pixel * fewest_pixels(minimum_line_m, pixel * dbu_m)
 
 
 def grating_periods_m(levels: Levels, pitch_m: float, dbu_m: float, minimum_line_m: float) -> tuple[float, float]:

@@ -1,12 +1,11 @@
 """The wafer that a mask set is for: its glass, its mask blanks, and how it is filled."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from fab.errors import InputError
 from fab.units import MM, UM, format_length
 
-READING = "right-reading chrome down"
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
 
@@ -16,6 +15,7 @@ class Wafer:
     """The glass, the mask blanks, and how the wafer is filled.
 
     Attributes:
+        reading: how masks are to be made, on every wafer.
         diameter_m: diameter of the wafer, metres.
         thickness_m: its thickness, metres.
         blank_m: edge of the square mask blanks, metres; 5 inches for a wafer of 100 mm.
@@ -32,6 +32,7 @@ class Wafer:
         InputError: a wafer that its blanks do not hold, no die as ordered, or a length that cannot be.
     """
 
+    reading: ClassVar[str] = "right-reading chrome down"
     diameter_m: float = 100 * MM
     thickness_m: float = 0.5 * MM
     blank_m: float = 127 * MM

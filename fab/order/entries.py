@@ -8,7 +8,6 @@ from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_lay
 from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
 from fab.layout.split import DieSplit
-from fab.layout.wafer import READING
 from fab.manifest.cells import geometry, shapes_digest
 from fab.manifest.records import (
     CONVENTIONS,
@@ -78,7 +77,7 @@ def plate_entry(order: Order, plate: Photomask) -> PlateEntry:
         file=f"{order.plate_stem(plate)}.gds",
         polygons=f"digitised data {plate.tone}: polygons are {'clear' if dark_field else 'chrome'} on the plate",
         field="dark field" if dark_field else "clear field",
-        reading=READING,
+        reading=order.wafer.reading,
     )
 
 

@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.figure import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, panels, shrunk
-from fab.height import HeightMap
-from fab.levels import Levels
 from fab.plots.maps import box_mm, frame_window, show_map, window_around
 from fab.units import MM, NM
 
@@ -15,7 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["height_shares", "plot_height"]
+    from fab.height import HeightMap
+    from fab.levels import Levels
 
 _WINDOW = 48
 _MOST = 672
@@ -23,7 +22,7 @@ _FINE_BINS = 96
 
 
 def plot_height(
-    height: HeightMap, levels: Levels | None = None, title: str = "", ax: "Axes | None" = None
+    height: "HeightMap", levels: "Levels | None" = None, title: str = "", ax: "Axes | None" = None
 ) -> "FigureBase":
     """Draw a height map: the whole, a window at the centre and one at the edge, and the share of area at every height.
 
@@ -63,7 +62,7 @@ def _palette() -> Any:
     return colormaps[HEIGHTS].with_extremes(bad=CHROME)
 
 
-def _range_m(heights: NDArray[np.floating], levels: Levels | None) -> tuple[float, float]:
+def _range_m(heights: NDArray[np.floating], levels: "Levels | None") -> tuple[float, float]:
     """Heights at the two ends of the colours: half a step round the staircase, and more where the map goes beyond."""
     low, high = (float(heights.min()), float(heights.max())) if heights.size else (0.0, 0.0)
     if levels is not None:
@@ -72,7 +71,7 @@ def _range_m(heights: NDArray[np.floating], levels: Levels | None) -> tuple[floa
     return (low, high) if high > low else (low - NM, high + NM)
 
 
-def _draw_whole(axes: "Axes", height: HeightMap, inside: NDArray[np.bool_], style: dict[str, Any]) -> None:
+def _draw_whole(axes: "Axes", height: "HeightMap", inside: NDArray[np.bool_], style: dict[str, Any]) -> None:
     from matplotlib.patches import Circle
 
     grid = height.grid
@@ -93,7 +92,7 @@ def _draw_whole(axes: "Axes", height: HeightMap, inside: NDArray[np.bool_], styl
 
 
 def height_shares(
-    heights: NDArray[np.floating], levels: Levels | None, ends_m: tuple[float, float]
+    heights: NDArray[np.floating], levels: "Levels | None", ends_m: tuple[float, float]
 ) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Share of the cells at every height.
 
@@ -129,7 +128,7 @@ def _draw_shares(
     scale: "Axes",
     axes: "Axes",
     heights: NDArray[np.floating],
-    levels: Levels | None,
+    levels: "Levels | None",
     ends_m: tuple[float, float],
     style: dict[str, Any],
 ) -> None:

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-__all__ = ["Window", "box_mm", "frame_window", "show_map", "window_around"]
-
 
 class Window(NamedTuple):
     """Rows and columns of a part of a map; indexes an array ``[y, x]``."""

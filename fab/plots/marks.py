@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fab.figure import CHROME, SERIES, single
-from fab.layout.geometry import Layer
-from fab.layout.part import Part, Photomask
 from fab.units import UM
 
 if TYPE_CHECKING:
     from klayout import db
     from matplotlib.axes import Axes
 
-__all__ = ["plot_part", "plot_through_mask"]
+    from fab.layout.geometry import Layer
+    from fab.layout.part import Part, Photomask
 
 _ZERO = "#5b3a1e"
 _GLASS = "#f4f7fa"
@@ -26,7 +25,7 @@ _Box = tuple[float, float, float, float]
 
 
 def plot_part(
-    part: Part, masks: Sequence[Photomask], title: str = "", window_m: _Box | None = None, ax: "Axes | None" = None
+    part: "Part", masks: "Sequence[Photomask]", title: str = "", window_m: _Box | None = None, ax: "Axes | None" = None
 ) -> "Axes":
     """Draw all masks of a part over each other, each in its colour, as in the drawing (polygons filled).
 
@@ -50,7 +49,7 @@ def plot_part(
 
 
 def plot_through_mask(
-    part: Part, first: Photomask, mask: Photomask, title: str = "", name: str = "finder", ax: "Axes | None" = None
+    part: "Part", first: "Photomask", mask: "Photomask", title: str = "", name: str = "finder", ax: "Axes | None" = None
 ) -> "Axes":
     """Draw what a microscope shows through a photomask on the wafer, around the mask's own place in a part.
 
@@ -80,7 +79,7 @@ def plot_through_mask(
     return axes
 
 
-def _colour(layer: Layer, masks: Sequence[Photomask]) -> str:
+def _colour(layer: "Layer", masks: "Sequence[Photomask]") -> str:
     mask = next(mask for mask in masks if mask.layer == layer.number)
     if mask.bit is not None:
         return SERIES[mask.bit % len(SERIES)]
@@ -103,7 +102,7 @@ def _fill(axes: "Axes", drawn: "db.Region", dbu_m: float, colour: str, alpha: fl
         axes.add_patch(PathPatch(whole, facecolor=colour, linewidth=0, alpha=alpha, snap=False))
 
 
-def _cut(part: Part, layers: Sequence[Layer], window_um: _Box) -> "db.Region":
+def _cut(part: "Part", layers: "Sequence[Layer]", window_um: _Box) -> "db.Region":
     """Return what some layers hold as far as it lies in a window."""
     from klayout import db
 
@@ -116,13 +115,13 @@ def _cut(part: Part, layers: Sequence[Layer], window_um: _Box) -> "db.Region":
     return drawn & _everything(part, window_um)
 
 
-def _everything(part: Part, window_um: _Box) -> "db.Region":
+def _everything(part: "Part", window_um: _Box) -> "db.Region":
     from klayout import db
 
     return db.Region(db.Box(*(round(edge * UM / part.dbu_m) for edge in window_um)))
 
 
-def _window_um(part: Part, window_m: _Box | None) -> _Box:
+def _window_um(part: "Part", window_m: _Box | None) -> _Box:
     if window_m is not None:
         x0, y0, x1, y1 = (edge / UM for edge in window_m)
         return x0, y0, x1, y1

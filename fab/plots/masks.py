@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
-from fab.level_map import LevelMap
 from fab.plots.maps import Window, box_mm, frame_window, show_map, window_around
 from fab.units import MM, NM, UM, format_length
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["plot_masks"]
+    from fab.level_map import LevelMap
 
 _MOST = 560
 _WINDOW = 48
@@ -27,7 +26,7 @@ _SIDE_IN = 2.7
 
 
 def plot_masks(
-    level_map: LevelMap, chrome_m: tuple[float, float], title: str = "", ax: "Axes | None" = None
+    level_map: "LevelMap", chrome_m: tuple[float, float], title: str = "", ax: "Axes | None" = None
 ) -> "FigureBase":
     """Draw a mask set: heights, chrome, and every etch mask as a whole and through a window.
 
@@ -62,7 +61,7 @@ def plot_masks(
     return figure
 
 
-def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map: LevelMap, window: Window) -> None:
+def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map: "LevelMap", window: Window) -> None:
     """Draw heights as a whole and through the window, with one colour scale."""
     levels, grid = level_map.levels, level_map.grid
     stairs_nm = levels.by_height()[1] / NM
@@ -79,7 +78,7 @@ def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map
     bar.set_label("height above the deepest floor (nm)")
 
 
-def _draw_chrome(axes: "Axes", level_map: LevelMap, radii_m: tuple[float, float]) -> None:
+def _draw_chrome(axes: "Axes", level_map: "LevelMap", radii_m: tuple[float, float]) -> None:
     from matplotlib.patches import Circle
 
     inner, outer = (radius / MM for radius in radii_m)

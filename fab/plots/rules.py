@@ -7,16 +7,14 @@ from numpy.typing import NDArray
 
 from fab.figure import MARK, length_text, panels, shrunk
 from fab.grid import Grid
-from fab.layout.polygons import run_lengths
 from fab.plots.maps import Window, box_mm, frame_window, show_map, window_around
-from fab.rules.check import PlaneRules, Rules, RulesReport, shortest_run
 from fab.units import MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["plot_rules"]
+    from fab.rules.check import PlaneRules, RulesReport
 
 _MOST_COLUMNS = 4
 _WINDOW = 40
@@ -27,9 +25,8 @@ _MOST_RINGS = 40
 _SPACE, _LINE = "#eef3f7", "#9fb4c4"
 _NARROW_LINE, _NARROW_SPACE, _KISSING = "#0072b2", "#d55e00", "#111111"
 _OUTSIDE = "#d9dbde"
-# Space, line, narrow space, narrow line: the numbers of `_codes`; touching corners; outside the aperture.
+# Space, line, narrow space, narrow line: the numbers of `Rules.codes`; touching corners; outside the aperture.
 _COLOURS = (_SPACE, _LINE, _NARROW_SPACE, _NARROW_LINE, _KISSING, _OUTSIDE)
-_LONGEST_RUN = 255
 
 
 class _Pane(NamedTuple):
@@ -42,7 +39,7 @@ class _Pane(NamedTuple):
     window: Window
 
 
-def plot_rules(report: RulesReport, title: str = "", ax: "Axes | None" = None) -> "FigureBase":
+def plot_rules(report: "RulesReport", title: str = "", ax: "Axes | None" = None) -> "FigureBase":
     """Draw where every etch mask breaks a rule: the whole mask, and below it the surroundings of its worst place.
 
     In the overview a block of pixels is coloured if anything in it is broken, the stronger the more of it is. Few
@@ -59,13 +56,19 @@ def plot_rules(report: RulesReport, title: str = "", ax: "Axes | None" = None) -
     columns = min(len(planes), _MOST_COLUMNS)
     rows = -(-len(planes) // columns)
     size = (max(2.9 * columns, 6.4), 6.9 * rows + 0.7)
-    with panels(ax, size, title, _legend(report.rules)) as figure:
+    line, space = (length_text(m) for m in (report.rules.minimum_line_m, report.rules.minimum_space_m))
+    note = (
+        f"Etched areas are lines, the rest is spaces. Blue: lines narrower than {line}; "
+        f"orange: spaces narrower than {space}; black: pixels that touch only at a "
+        "corner. Below each mask: the square marked in it, around its worst place, pixel by pixel."
+    )
+    with panels(ax, size, title, note) as figure:
         panes = figure.subplots(2 * rows, columns, squeeze=False)
         for number, (found, plane) in enumerate(zip(report.planes, planes, strict=True)):
             row, column = divmod(number, columns)
             whole, detail = panes[2 * row : 2 * row + 2, column]
             corners = _corners(plane) if found.breaks else np.zeros_like(plane)
-            pane = _Pane(_codes(plane, report.rules, grid.pitch_m), corners, inside, grid, _window(found, grid))
+            pane = _Pane(report.rules.codes(plane, grid.pitch_m), corners, inside, grid, _window(found, grid))
             _draw_whole(whole, pane)
             whole.set_title(f"mask {found.bit + 1} (bit {found.bit})\n{_summary(found)}", linespacing=1.3)
             _draw_window(detail, pane)
@@ -77,34 +80,13 @@ def plot_rules(report: RulesReport, title: str = "", ax: "Axes | None" = None) -
     return figure
 
 
-def _legend(rules: Rules) -> str:
-    return (
-        f"Etched areas are lines, the rest is spaces. Blue: lines narrower than {length_text(rules.minimum_line_m)}; "
-        f"orange: spaces narrower than {length_text(rules.minimum_space_m)}; black: pixels that touch only at a "
-        "corner. Below each mask: the square marked in it, around its worst place, pixel by pixel."
-    )
-
-
-def _summary(found: PlaneRules) -> str:
+def _summary(found: "PlaneRules") -> str:
     if not found.breaks:
         return "breaks no rule"
     return (
         f"{100 * found.line.narrow_share:.2g} % of lines and {100 * found.space.narrow_share:.2g} % of\n"
         f"spaces too narrow, {found.kissing} corners touch"
     )
-
-
-def _codes(plane: NDArray[np.uint8], rules: Rules, pitch_m: float) -> NDArray[np.uint8]:
-    """Say of every pixel whether it is space (0), line (1), or in a narrow space (2) or line (3); `[y, x]`."""
-    codes = plane.copy()
-    for value, minimum_m in ((0, rules.minimum_space_m), (1, rules.minimum_line_m)):
-        fewest = min(shortest_run(minimum_m, pitch_m), _LONGEST_RUN)
-        # A frame of blank glass: a space that reaches it lies between no two lines.
-        kind = (np.pad(plane, fewest) == value).view(np.uint8)
-        for runs in (run_lengths(kind), run_lengths(kind.T).T):
-            narrow = (runs > 0) & (runs < fewest)
-            codes[narrow[fewest:-fewest, fewest:-fewest]] = 2 + value
-    return codes
 
 
 def _corners(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -115,7 +97,7 @@ def _corners(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return found
 
 
-def _window(found: PlaneRules, grid: Grid) -> Window:
+def _window(found: "PlaneRules", grid: Grid) -> Window:
     """Surroundings of the longest of the narrowest places."""
     narrow = [p for p in found.places if p.length_m] or found.places
     y_m, x_m = (narrow[0].y_m, narrow[0].x_m) if narrow else (0.0, 0.0)

@@ -1,23 +1,23 @@
 """The picture of a whole mask plate: blank, wafer, dies, alignment sites, test structures and labels."""
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from fab.figure import CHROME, FAINT, INK, LINE, MARK, SMALL, length_text, single
-from fab.layout.frame import Frame
-from fab.layout.geometry import Cell, Reference
-from fab.layout.wafer import READING, Wafer
 from fab.units import MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_wafer"]
+    from fab.layout.frame import Frame
+    from fab.layout.geometry import Shapes
+    from fab.layout.wafer import Wafer
 
 _SITES = {"SITE": "alignment site", "TEST": "test structures"}
 
 
 def plot_wafer(
-    wafer: Wafer, frame: Frame, aperture_m: float, dbu_m: float, title: str = "", ax: "Axes | None" = None
+    wafer: "Wafer", frame: "Frame", aperture_m: float, dbu_m: float, title: str = "", ax: "Axes | None" = None
 ) -> "Axes":
     """Draw where everything lies on a mask plate, seen from the etched side.
 
@@ -48,34 +48,35 @@ def plot_wafer(
         for reference in around.references:
             kind = reference.cell.rpartition("_")[2]
             if kind in _SITES:
-                _box(axes, cells[reference.cell], reference, dbu_m, _SITES[kind])
-        labels = {layer: shapes for layer, shapes in top.shapes.items() if layer.datatype == 3}
-        _box(axes, Cell("labels", labels), Reference("labels"), dbu_m, "labels, one per mask")
+                _box(axes, cells[reference.cell].shapes.values(), (reference.x, reference.y), dbu_m, _SITES[kind])
+        labels = [shapes for layer, shapes in top.shapes.items() if layer.datatype == 3]
+        _box(axes, labels, (0, 0), dbu_m, "labels, one per mask")
         axes.set(xlim=(-half - 1, half + 1), ylim=(-half - 1, half + 1), aspect="equal")
         axes.set(xlabel="x (mm)", ylabel="y (mm)")
     return axes
 
 
-def _words(wafer: Wafer, frame: Frame) -> str:
+def _words(wafer: "Wafer", frame: "Frame") -> str:
     rows, columns = frame.raster
     numbered = " Numbered dies: splits, drawn differently on purpose; the manifest and the run sheet say how."
     return (
         f"Blank of {length_text(wafer.blank_m)}, wafer of {length_text(wafer.diameter_m)} and "
         f"{length_text(wafer.thickness_m)}, {rows} x {columns} dies {length_text(frame.die_m)} apart. "
-        f"Seen from the etched side, +y up; {READING}. Grey: clear apertures." + (numbered if any(frame.splits) else "")
+        f"Seen from the etched side, +y up; {wafer.reading}. Grey: clear apertures."
+        + (numbered if any(frame.splits) else "")
     )
 
 
-def _box(axes: "Axes", cell: Cell, at: Reference, dbu_m: float, words: str) -> None:
-    """Draw the box of a cell where it is placed, with its name beside it."""
+def _box(axes: "Axes", drawn: "Iterable[Shapes]", at: tuple[int, int], dbu_m: float, words: str) -> None:
+    """Draw the box around some shapes where they are placed, with its name beside it."""
     from matplotlib.patches import Rectangle
 
-    boxes = [shapes.box for shapes in cell.shapes.values() if shapes.box is not None]
+    boxes = [shapes.box for shapes in drawn if shapes.box is not None]
     if not boxes:
         return
     unit = dbu_m / MM
-    x0, y0 = ((min(box[k] for box in boxes) + start) * unit for k, start in ((0, at.x), (1, at.y)))
-    x1, y1 = ((max(box[k] for box in boxes) + start) * unit for k, start in ((2, at.x), (3, at.y)))
+    x0, y0 = ((min(box[k] for box in boxes) + start) * unit for k, start in ((0, at[0]), (1, at[1])))
+    x1, y1 = ((max(box[k] for box in boxes) + start) * unit for k, start in ((2, at[0]), (3, at[1])))
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=MARK, edgecolor="none", alpha=0.75))
     centred: Any = {"ha": "center", "va": "center", "fontsize": SMALL}
     # Away from the wafer's rim, which lies below what is above it.

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.figure import html_of
-from fab.grid import Grid
+from fab.grid import Grid, fewest_pixels
 from fab.layout.geometry import pixel_edges
+from fab.layout.polygons import run_lengths
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process
@@ -47,6 +48,7 @@ _MOST_PLACES = 20
 _MOST_PER_KIND = 5
 _SLIVER_LENGTH = 3
 _FEMTO = 10**15
+_LONGEST_RUN = 255
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,18 @@ class Rules:
     def from_process(cls, process: Process) -> "Rules":
         """Return the rules of a process: the narrowest line and space that it prints."""
         return cls(process.minimum_line_m, process.minimum_space_m)
+
+    def codes(self, plane: NDArray[np.uint8], pitch_m: float) -> NDArray[np.uint8]:
+        """Say of every pixel of a mask if it is space (0), line (1), or in a narrow space (2) or line (3); `[y, x]`."""
+        codes = plane.copy()
+        for value, minimum_m in ((0, self.minimum_space_m), (1, self.minimum_line_m)):
+            fewest = min(fewest_pixels(minimum_m, pitch_m), _LONGEST_RUN)
+            # A frame of blank glass: a space that reaches it lies between no two lines.
+            kind = (np.pad(plane, fewest) == value).view(np.uint8)
+            for runs in (run_lengths(kind), run_lengths(kind.T).T):
+                narrow = (runs > 0) & (runs < fewest)
+                codes[narrow[fewest:-fewest, fewest:-fewest]] = 2 + value
+        return codes
 
 
 class Violation(NamedTuple):
@@ -241,12 +255,6 @@ def _metres(length_m: float) -> float:
     return round(length_m, 15)
 
 
-def shortest_run(minimum_m: float, pitch_m: float) -> int:
-    """Return the fewest pixels that are not narrower than a length; at least 1."""
-    # The pitch and the minimum are decimal numbers in binary: 2 um are two pixels of 1 um, and not three.
-    return max(1, math.ceil(minimum_m / pitch_m * (1 - 1e-9)))
-
-
 def _spans(grid: Grid, aperture_m: float) -> NDArray[np.int64]:
     """First and end column of the clear aperture in every row; the same pixels as `Grid.inside_circle`."""
     limit = (aperture_m / 2) ** 2 * (1 + 1e-12)
@@ -295,8 +303,8 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
     )
     for index, (what, minimum_m, outside) in enumerate(kinds):
         plane = words if what == "line" else ~words
-        fewest = shortest_run(minimum_m, pitch)
-        sliver = shortest_run(_SLIVER_LENGTH * minimum_m, pitch)
+        fewest = fewest_pixels(minimum_m, pitch)
+        sliver = fewest_pixels(_SLIVER_LENGTH * minimum_m, pitch)
         found = x_found, y_found = [narrow_runs(plane, axis, outside, fewest, sliver) for axis in (1, 0)]
         places += [place(what, x + w / 2, y + n / 2, w, n) for y, x, w, n in x_found.places]
         places += [place(what, x + n / 2, y + w / 2, w, n) for y, x, w, n in y_found.places]

@@ -23,10 +23,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.grid import fewest_pixels
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process
-from fab.rules.check import Rules, RulesReport, check, shortest_run
+from fab.rules.check import Rules, RulesReport, check
 from fab.rules.repair_moves import RepairTask, broken, loss, offends, sweep
 
 # How much phase error (1 - cos) one pixel of deficit, or one kissing corner, is worth in each sweep.
@@ -222,7 +223,7 @@ def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repai
     waves = 1 / levels.period_m if waves_per_metre is None else waves_per_metre
     if not 0 < waves < math.inf:
         raise InputError("waves per metre", "must be positive and finite", waves, "Give (n - 1) / wavelength.")
-    line, space = (shortest_run(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
+    line, space = (fewest_pixels(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
     if max(line, space) > _WIDEST:
         rule = f"the narrowest line and space must not exceed {_WIDEST} pixels"
         raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")

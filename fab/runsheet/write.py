@@ -14,7 +14,6 @@ from fab.files import canonical_json, write_atomic
 from fab.layout.marks import VERNIER_STEP_M, alignment_notes
 from fab.layout.part import Photomask
 from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
-from fab.layout.wafer import READING
 from fab.process import Normal
 from fab.runsheet.recipe import (
     RATES_M_PER_S,
@@ -185,7 +184,7 @@ def _order_record(sheet: RunSheet) -> list[dict[str, Any]]:
             "depth_nm": _nm(plate.depth_m) if plate.bit is not None else None,
             "polygons_mean": "chrome here" if plate.bit is None else "etched here",
             "tone": tone_words(plate),
-            "reading": READING,
+            "reading": sheet.wafer.reading,
             "edge_move_nm": _nm(sheet.files[plate.name].edge_move_m),
         }
         for plate in sheet.plates

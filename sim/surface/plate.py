@@ -14,8 +14,7 @@ from jaxtyping import Array, Complex, Float, UInt8
 
 from fab.grid import Grid
 from fab.layout.polygons import run_lengths
-from fab.levels import height_of
-from fab.masks import planes
+from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine

@@ -10,8 +10,7 @@ from fab.grid import Grid
 from fab.layout.compensation import edge_moves, grown, read_back
 from fab.layout.geometry import PixelEdges, Shapes, pixel_edges
 from fab.layout.polygons import rectangles
-from fab.levels import Levels
-from fab.masks import level_map_from_planes, planes
+from fab.levels import Levels, level_map_from_planes, planes
 
 BITMAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 1))
 PIXEL = 1850

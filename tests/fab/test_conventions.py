@@ -11,8 +11,7 @@ from fab.gds.writer import write_gds
 from fab.grid import Grid
 from fab.layout.doe import mask_layout
 from fab.layout.geometry import Chrome
-from fab.levels import Levels, height_of, quantise
-from fab.masks import planes
+from fab.levels import Levels, height_of, planes, quantise
 from fab.order.write import write_order
 from tests.fab.maps import wide_map
 

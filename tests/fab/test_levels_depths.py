@@ -11,9 +11,8 @@ from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.layout.structures import codes_by_depth
-from fab.levels import Levels, height_of, quantise, quantise_wrapped, wrapped_cells
+from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, wrapped_cells
 from fab.manifest.records import read_manifest
-from fab.masks import level_map_from_planes, planes
 from fab.order.write import write_order
 from fab.plots.masks import plot_masks
 from fab.process import Process

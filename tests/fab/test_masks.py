@@ -7,8 +7,7 @@ from hypothesis.extra import numpy as hnp
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.level_map import LevelMap
-from fab.levels import Levels, height_of
-from fab.masks import level_map_from_planes, planes
+from fab.levels import Levels, height_of, level_map_from_planes, planes
 from fab.units import NM
 
 COUNTS = st.sampled_from([2, 4, 8, 16, 32, 64])

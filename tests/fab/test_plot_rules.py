@@ -64,7 +64,7 @@ def test_pixels_are_coded_by_what_is_wrong_with_them():
     plane[2:7, 1] = 1  # a narrow line, at two pixels from the next one
     plane[2:7, 4:7] = 1
     plane[2:7, 8:11] = 1
-    codes = picture._codes(plane, RULES, UM)
+    codes = RULES.codes(plane, UM)
     assert np.all(codes[2:7, 1] == 3)
     assert np.all(codes[2:7, 2:4] == 0)
     assert np.all(codes[2:7, 7] == 2)
@@ -75,7 +75,7 @@ def test_pixels_are_coded_by_what_is_wrong_with_them():
 def test_narrow_pixels_are_those_that_the_check_counts():
     plane = np.random.default_rng(8).integers(0, 2, (40, 50)).astype(np.uint8)
     report = check(level_map_from(1 - plane, Levels(2, 1e-6)), Rules(3 * UM, 2 * UM)).planes[0]
-    codes = picture._codes(plane, Rules(3 * UM, 2 * UM), UM)
+    codes = Rules(3 * UM, 2 * UM).codes(plane, UM)
     assert np.any(codes == 2)
     assert np.any(codes == 3)
     assert int(picture._corners(plane).sum()) == report.kissing

@@ -10,8 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from fab.errors import InputError
 from fab.layout.polygons import smallest_runs
-from fab.levels import Levels
-from fab.masks import planes
+from fab.levels import Levels, planes
 from fab.rules import repair as repair_module
 from fab.rules.check import Rules, check
 from fab.rules.repair import repair

@@ -11,8 +11,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles, smallest_runs
 from fab.level_map import LevelMap
-from fab.levels import Levels
-from fab.masks import planes
+from fab.levels import Levels, planes
 from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.check import Rules, check

@@ -9,8 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from bench.reference import YELLOW_M
 from fab.grid import Grid
-from fab.levels import Levels, height_of
-from fab.masks import planes
+from fab.levels import Levels, height_of, planes
 from fab.process import Process, Variation, variation_of
 from sim.camera import Camera, Colour
 from sim.metrics import mean_transmission, strehl, zeroth_order

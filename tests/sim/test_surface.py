@@ -10,8 +10,7 @@ import pytest
 from bench.reference import relative_error
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.levels import Levels, height_of
-from fab.masks import level_map_from_planes, planes
+from fab.levels import Levels, height_of, level_map_from_planes, planes
 from fab.process import Disc, MaskDisc, Process, Variation, error_names, variation_of
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from fab.grid import Grid
-from fab.levels import Levels, height_of
-from fab.masks import planes
+from fab.levels import Levels, height_of, planes
 from fab.process import Process, Variation
 from sim.camera import Camera, Colour
 from sim.surface import as_fabricated
