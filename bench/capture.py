@@ -29,7 +29,7 @@ import numpy as np
 
 from bench.psf import time_rounds
 from sim.imaging.convolve import fast_length
-from sim.imaging.formation import Optics, Prepared, capture, shadow_px
+from sim.imaging.formation import Optics, capture, shadow_px
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Obstruction, Scene
 from sim.noise import photon_noise
@@ -79,7 +79,7 @@ def bare(forward: int, back: int, smaller: tuple[int, int, int] | None = None) -
     return run
 
 
-def noisy(scene: Scene, optics: Optics | Prepared, model: Model) -> Callable[[], Any]:
+def noisy(scene: Scene, optics: Optics, model: Model) -> Callable[[], Any]:
     """Build a capture with photon and read noise, depths known, everything else an argument."""
     noise = jax.jit(lambda key, light: photon_noise(key, FULL_WELL_E * light, READ_NOISE_E))
     key = jax.random.key(0)

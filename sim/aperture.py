@@ -1,8 +1,7 @@
 """The clear aperture: how much of each DOE cell is open.
 
-The chrome opening is a true circle, so cells on its edge are partly covered. A cell's amplitude is the open share
-of its area; what an edge cell scatters at angles beyond the
-cell grid (a few parts in ten thousand of the light) counts among the higher orders of the energy budget.
+The chrome opening is a true circle. The amplitude of a cell on its edge is the open share of its area; what it scatters
+beyond the angles of the cell grid (a few parts in ten thousand of the light) counts among the higher orders.
 """
 
 import jax.numpy as jnp
@@ -15,15 +14,10 @@ from fab.grid import Grid
 def circle_coverage(
     grid: Grid, diameter_m: float, centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> Float[np.ndarray, "y x"]:
-    """Share of each cell's area inside a circle, float32 in 0-1.
+    """Share of each cell's area inside a circle, float32 in 0-1; lengths in metres, the centre as (y, x).
 
-    Args:
-        grid: cells of the DOE.
-        diameter_m: diameter of the circle, metres.
-        centre_m: its centre (y, x), metres; the clear aperture's is the grid's.
-
-    Each edge cell is cut into 64 strips along y whose open length along x is exact, so the total area is
-    right to about 1e-7 of the circle for apertures of a thousand cells or more.
+    Each edge cell is cut into 64 strips along y whose open length along x is exact, so the total area is right to about
+    1e-7 of the circle for apertures of a thousand cells or more.
     """
     radius = diameter_m / 2 / grid.pitch_m
     y = np.abs(grid.axis_m("y") - centre_m[0]) / grid.pitch_m
@@ -39,11 +33,6 @@ def circle_coverage(
     open_length = np.clip(half_chord - left, 0.0, 1.0) - np.clip(-half_chord - left, 0.0, 1.0)
     coverage[rows, columns] = open_length.mean(axis=1)
     return coverage
-
-
-def clear_area_m2(diameter_m: float) -> float:
-    """Area of the clear aperture in square metres."""
-    return np.pi * diameter_m**2 / 4
 
 
 def displaced_circle_coverage(

@@ -1,8 +1,8 @@
 """Lens, sensor and DOE substrate of a camera, and the wave a source sends into its aperture.
 
-The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens
-cancels the quadratic term of Fresnel propagation, so only the source's own path differences and the DOE remain
-(eq. 7). A sensor out of focus leaves a quadratic remainder, which is added here.
+The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens cancels the
+quadratic term of Fresnel propagation and only the source's own path differences and the DOE remain (eq. 7); a sensor
+out of focus leaves a quadratic remainder, which is added here.
 """
 
 from dataclasses import dataclass
@@ -26,12 +26,9 @@ class Colour:
 
 
 class SpectralLine(NamedTuple):
-    """One wavelength of one colour channel.
+    """One wavelength of the colour channel of that number.
 
-    Attributes:
-        colour: number of the channel.
-        wavelength_m: vacuum wavelength.
-        factor: weight in the channel times the power that passes the substrate's two faces.
+    `factor` is its weight in the channel times the power that passes the substrate's two faces.
     """
 
     colour: int
@@ -99,10 +96,7 @@ class Camera:
         return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
 
     def defocus_radius_m(self, depth_m: float) -> float:
-        """Radius on the sensor of the geometric blur disc of a point at `depth_m`.
-
-        D/2 · |d/z + 1 - d/f| for a sensor at distance d; D f / (2 z) in the focal plane.
-        """
+        """Radius on the sensor of the geometric blur disc: D/2 · |d/z + 1 - d/f|, or D f / (2 z) in the focal plane."""
         distance = self.sensor_distance_m
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
         return self.aperture_m / 2 * abs(distance * inverse_depth + 1.0 - distance / self.focal_length_m)
@@ -111,8 +105,7 @@ class Camera:
 def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:
     """Direction sines (y, x) of the chief ray for field angles (y, x) in radians.
 
-    The angles are those of the ray's projections on the yz and xz planes, positive where the light travels
-    toward +y or +x, so the image moves to +y or +x.
+    The angles are those of its projections on the yz and xz planes, positive where light travels toward +y or +x.
     """
     tangents = np.tan(np.asarray(field_rad, dtype=np.float64))
     return tangents / np.sqrt(1.0 + np.sum(tangents**2))
@@ -125,13 +118,8 @@ def source_path_m(
 ) -> Float[np.ndarray, "y x"]:
     """Optical path from a point source to every DOE cell, relative to the chief ray, metres in float64.
 
-    Args:
-        camera: lens and grid.
-        depth_m: axial distance of the source from the DOE; `inf` for a star.
-        field_rad: field angles (y, x); the linear path (the tilt that moves the image to f tan(field)) is
-            removed, so the PSF window stays centred on the chief ray.
-
-    Eq. 1 of the paper with the constant subtracted, plus r^2/2 (1/d - 1/f) for a sensor at distance d.
+    Eq. 1 of the paper with the constant subtracted, plus r^2/2 (1/d - 1/f) for a sensor at distance d. The linear path
+    of field angles (y, x), the tilt that moves the image to f tan(field), is removed: the window follows the chief ray.
     """
     y = camera.grid.axis_m("y")[:, None]
     x = camera.grid.axis_m("x")[None, :]

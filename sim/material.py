@@ -28,10 +28,8 @@ class Material:
     """A transparent material at room temperature.
 
     Attributes:
-        name: key used in specs.
         range_m: shortest and longest vacuum wavelength the formula was fitted for, metres.
         formula: index as a function of the wavelength in micrometres and `terms`.
-        terms: coefficients of the formula.
         citation: where the coefficients were published.
     """
 
@@ -42,11 +40,7 @@ class Material:
     citation: str
 
     def index(self, wavelength_m: float) -> float:
-        """Refractive index n at a vacuum wavelength in metres.
-
-        Raises:
-            InputError: the wavelength lies outside the range of the published fit.
-        """
+        """Refractive index n at a vacuum wavelength in metres; an InputError outside the range of the published fit."""
         low, high = self.range_m
         if not low <= wavelength_m <= high:
             raise InputError(
@@ -108,11 +102,7 @@ MATERIALS: dict[str, Material] = {
 
 
 def material(name: str) -> Material:
-    """The material of that name.
-
-    Raises:
-        InputError: no such material; the message lists those there are.
-    """
+    """The material of that name, or an InputError that lists those there are."""
     if name not in MATERIALS:
         raise InputError("material", f"must be one of {', '.join(MATERIALS)}", repr(name), "Pick one of these names.")
     return MATERIALS[name]
@@ -126,9 +116,8 @@ def refractive_index(name: str, wavelength_m: float) -> float:
 def fresnel_transmission(index: float) -> float:
     """Power that passes both uncoated faces of a plate at normal incidence, 0-1.
 
-    One face passes T = 4n/(n+1)^2 (M. Born and E. Wolf, *Principles of Optics*, §1.5); the two faces of a
-    substrate much thicker than the coherence length multiply, and light reflected twice or more is counted
-    as lost from the image.
+    One face passes T = 4n/(n+1)^2 (M. Born and E. Wolf, *Principles of Optics*, §1.5); for a substrate much thicker
+    than the coherence length the two multiply, and light reflected twice or more counts as lost.
     """
     return (4.0 * index / (index + 1.0) ** 2) ** 2
 
@@ -139,12 +128,12 @@ def full_wave_height_m(name: str, wavelength_m: float) -> float:
 
 
 def full_wave_wavelength_m(name: str, height_m: float) -> float:
-    """The wavelength for which `height_m` of the material delays by exactly one wave, metres.
+    """The wavelength, metres, that `height_m` of the material delays by exactly one wave: lambda = (n(lambda) - 1) h.
 
-    Solves lambda = (n(lambda) - 1) h inside the material's range. 16 levels of 75 nm in fused silica give 552 nm.
+    16 levels of 75 nm in fused silica give 552 nm.
 
     Raises:
-        InputError: no wavelength in the range is delayed by one wave.
+        InputError: no wavelength in the material's range is delayed by one wave.
     """
     from scipy.optimize import brentq
 
@@ -159,6 +148,6 @@ def full_wave_wavelength_m(name: str, height_m: float) -> float:
             f"material {name}",
             f"a height of one wave must lie in {least:.3g}-{most:.3g} m",
             f"{height_m:.4g} m",
-            "Change process.levels or process.level_step.",
+            "Change the number of levels or the height of one.",
         )
     return float(np.asarray(brentq(excess, low, high, xtol=1e-15)))

@@ -36,15 +36,7 @@ TSENG_SCALE, TSENG_SIGMA = 4e-5, 1e-5
 
 @eqx.filter_jit
 def poisson(key: Key[Array, ""], mean: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """Draw Poisson counts.
-
-    Args:
-        key: random key.
-        mean: means from 0 to 2^24; what is below 0 is taken as 0.
-
-    Returns:
-        whole numbers as float32, without gradient.
-    """
+    """Poisson counts, whole numbers as float32 without gradient, of means from 0 to 2^24 (0 for what is below)."""
     mean = jax.lax.stop_gradient(jnp.maximum(mean, 0.0).astype(jnp.float32))
     # Both ends of the interval are left out, where the normal quantile is infinite.
     centred = jax.random.uniform(key, mean.shape, jnp.float32, minval=np.nextafter(np.float32(-1), np.float32(0)))
@@ -89,9 +81,8 @@ def photon_noise(
         scale: signal of one count.
         most: where the counted part saturates; what lies above has no gradient.
 
-    Returns:
-        the noisy signal. In its gradient the variance `scale` signal + sigma^2 counts as at least that of one count, so
-        that a photon in the dark does not weigh without bounds.
+    In the gradient the variance `scale` signal + sigma^2 counts as at least that of one count, so that a photon in the
+    dark does not weigh without bounds.
     """
     shot, read = jax.random.split(key)
     signal = jnp.maximum(signal, 0.0)

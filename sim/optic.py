@@ -1,9 +1,7 @@
-"""Optics: whatever images a point source onto a camera's pixels, asked by one protocol.
+"""Optics: whatever images a point source onto a camera's pixels.
 
 `Optic` answers for one wavelength, source and field. The host prepares, in double precision, a plan of the propagation
-and the source's phase (`plan`, `source`); `energy` turns both into pixel energies and may be traced by jax. A height
-map (`HeightOptic`) and a DOE as fabricated (`sim.surface.FabricatedDoe`) are made of cells (`CellOptic`), `RingOptic`
-of rings, and `sim.psf_bank.BankOptic` holds PSFs that are known already.
+and the source's phase (`plan`, `source`); `energy` turns both into pixel energies and may be traced by jax.
 """
 
 # Abstract fields become fields, or properties, of subclasses.
@@ -116,8 +114,7 @@ class CellOptic(CameraOptic):
     """A DOE of square cells behind a camera's clear aperture.
 
     Attributes:
-        camera: lens, sensor and substrate; its grid is that of the cells.
-        coverage: `[y, x]` open share of every cell.
+        coverage: `[y, x]` open share of every cell of the camera's grid.
         source_kind: how sources are described (`sim.source`).
         wavelengths_m: different wavelengths.
         means: `[wavelength, y, x]` mean transmission of every cell.
@@ -155,11 +152,7 @@ class CellOptic(CameraOptic):
         return plan.energy(doe_field, *self.rows(line, source))
 
     def with_camera(self, camera: Camera) -> "CellOptic":
-        """The same DOE before another lens or sensor; the cells stay.
-
-        Raises:
-            ValueError: a camera with another aperture or substrate.
-        """
+        """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
         own = self.camera
         if (camera.aperture_m, camera.material) != (own.aperture_m, own.material):
             wanted, got = f"{own.aperture_m} m of {own.material}", f"{camera.aperture_m} m of {camera.material}"
@@ -184,8 +177,6 @@ class HeightOptic(CellOptic):
     """A DOE given by its height map.
 
     Attributes:
-        camera: lens, sensor, substrate and DOE grid.
-        coverage: `[y, x]` open share of every cell.
         height_m: `[y, x]` DOE height, metres; None for the bare lens.
         deviation: `[line, y, x]` transmission of a DOE as fabricated over that of its heights, or None.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
@@ -199,11 +190,7 @@ class HeightOptic(CellOptic):
 
     @classmethod
     def of(cls, camera: Camera, height_m: Any = None) -> "HeightOptic":
-        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); none for the bare lens.
-
-        Raises:
-            ValueError: a map of another shape.
-        """
+        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); none for the bare lens."""
         if height_m is not None and np.shape(height_m) != camera.grid.shape:
             got = np.shape(height_m)
             raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {got}")
@@ -216,7 +203,7 @@ class HeightOptic(CellOptic):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of what `with_heights` takes."""
+        """Shape of the heights."""
         return self.camera.grid.shape
 
     @property
@@ -240,20 +227,18 @@ class HeightOptic(CellOptic):
         return replace(self, height_m=height_m)
 
     def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
-        """Heights of the cells of `with_heights`."""
+        """Heights of the cells."""
         return height_m
 
     def heights_of(self, map_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"] | None:
-        """What `with_heights` takes of a map on the grid."""
+        """The heights that `with_heights` takes of a map on the grid."""
         return map_m
 
 
 class RingOptic(CameraOptic):
     """Rings drawn as rings, seen on the axis; each is as wide as a cell.
 
-    Attributes:
-        camera: lens, sensor and substrate.
-        profile_m: `[ring]` height of every ring, metres (`sim.propagation.hankel.ring_count` of them).
+    `profile_m` is the height of every ring, metres (`sim.propagation.hankel.ring_count` of them).
     """
 
     camera: Camera = eqx.field(static=True)
@@ -268,11 +253,7 @@ class RingOptic(CameraOptic):
         return plan_hankel(self.camera, line.wavelength_m)
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> SourceMap:
-        """The path to every sub-ring.
-
-        Raises:
-            ValueError: a source off the axis.
-        """
+        """The path to every sub-ring, from the axis only."""
         if any(field_rad):
             raise ValueError(f"`field_rad` must be (0, 0) for rings, but got {field_rad}")
         waves = ring_source_waves(self.camera, depth_m, line.wavelength_m)
@@ -284,7 +265,7 @@ class RingOptic(CameraOptic):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of what `with_heights` takes."""
+        """Shape of the heights."""
         return (ring_count(self.camera),)
 
     def with_heights(self, height_m: Float[Array, " ring"]) -> "RingOptic":

@@ -129,11 +129,7 @@ class PsfBank(eqx.Module):
         return BankOptic(energy, jnp.asarray(inverse), self.colours, self.pixel_m, self.camera)
 
     def at(self, depth_m: float) -> Float[np.ndarray, "c y x"] | Float[Array, "c y x"]:
-        """PSFs of every colour at a depth, mixed linearly in 1/z from the two nearest.
-
-        Raises:
-            InputError: a depth beyond the bank's.
-        """
+        """PSFs of every colour at a depth, mixed linearly in 1/z; an InputError for a depth beyond the bank's."""
         order = np.argsort([1 / depth for depth in self.depths_m])
         curvatures = np.array([1 / self.depths_m[d] for d in order])
         # The slack lets a depth through that was rounded on its way; it is far below any change of a PSF.
@@ -150,17 +146,7 @@ class PsfBank(eqx.Module):
 
 
 class BankOptic(Optic):
-    """PSFs that are known at some depths, computed or measured, mixed linearly in 1/z between them.
-
-    Beyond the outermost depths they stay as they are there.
-
-    Attributes:
-        energies: `[depth, c, y, x]` PSFs, the farthest first.
-        inverse_depths: `[depth]` rising, 1/m.
-        colours: names of the channels.
-        pixel_m: pixel pitch, metres.
-        camera: the camera, if it is known.
-    """
+    """Known PSFs `[depth, c, y, x]`, the farthest first, mixed linearly in 1/z; beyond the outermost as there."""
 
     energies: Float[Array, "d c y x"]
     inverse_depths: Float[Array, " d"]
@@ -195,8 +181,8 @@ def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
     """The optic of something that carries one, or of a bare height map `[y, x]` (metres) and a camera.
 
     Raises:
-        ValueError: a map without a camera or of another shape than its grid, or a camera with another aperture or
-            substrate than the optic's.
+        ValueError: a map without a camera or of another shape than its grid, or a camera of another aperture or
+            substrate.
         TypeError: a camera for an optic that is not made of cells.
     """
     if isinstance(optic, HasOptic):

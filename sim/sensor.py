@@ -70,11 +70,7 @@ class Sensor:
     noise: NoiseModel = "physical"
 
     def __post_init__(self) -> None:
-        """Refuse a sensor that cannot be.
-
-        Raises:
-            ValueError: a number out of range or an unknown name.
-        """
+        """Raise a ValueError for a number out of range or an unknown name."""
         for name in ("full_well_e", "exposure"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"`{name}` must be positive, but got {getattr(self, name)}")
@@ -108,11 +104,7 @@ class Sensor:
         return self.exposure * self.full_well_e / max(self.quantum_efficiency)
 
     def white_e(self, colours: int) -> Float[np.ndarray, "c 1 1"]:
-        """Electrons of a white of the scene in every colour.
-
-        Raises:
-            ValueError: another number of colours than quantum efficiencies.
-        """
+        """Electrons of a white of the scene in every colour, of which there are as many as quantum efficiencies, or 1."""
         given = len(self.quantum_efficiency)
         if given not in (1, colours):
             raise ValueError(f"`quantum_efficiency` must have 1 or {colours} entries, but got {given}")
@@ -182,14 +174,10 @@ def _noisy(seen: Array, sensor: Sensor, key: Array) -> Array:
 
 
 def mosaic(values: Float[Array, "*batch c y x"], pattern: Pattern) -> Float[Array, "*batch 1 y x"]:
-    """Keep at every pixel the one colour that its filter passes.
+    """Keep of red, green and blue `[c, y, x]` (row 0 at the lowest y) at every pixel the one that its filter passes.
 
-    Args:
-        values: `[c, y, x]` red, green and blue, row 0 at the lowest y.
-        pattern: colours of the four upper left photosites of the picture.
-
-    Raises:
-        ValueError: other than three colours.
+    `pattern` names the colours of the four upper left photosites of the picture. A ValueError for other than three
+    colours.
     """
     if values.shape[-3] != 3:
         raise ValueError(f"a mosaic needs red, green and blue, but got {values.shape[-3]} colours")
@@ -228,15 +216,11 @@ def demosaiced(
 
     Args:
         raw: `[1, y, x]` numbers of `expose`.
-        sensor: a sensor with a mosaic.
-        interpolation: the method of the library.
+        sensor: a sensor with a mosaic; a ValueError for one without.
+        interpolation: the method of the library; an InputError where that is not installed.
 
     Returns:
         raw numbers of red, green and blue, for `developed`.
-
-    Raises:
-        InputError: the library is not installed.
-        ValueError: the sensor has no mosaic.
     """
     if sensor.pattern is None:
         raise ValueError("`sensor` must have a mosaic, but its pattern is None")
@@ -260,6 +244,6 @@ def _library(interpolation: Interpolation) -> Callable[[np.ndarray, str], np.nda
         try:
             package = importlib.import_module("colour_demosaicing")
         except ImportError as error:
-            cure = "pip install 'doedesign[bayer]', or leave `bayer` out of [sensor]."
-            raise InputError("sensor.bayer", "a mosaic needs colour-demosaicing", "no such package", cure) from error
+            cure = "pip install 'doedesign[bayer]', or choose a sensor without a mosaic."
+            raise InputError("sensor.pattern", "a mosaic needs colour-demosaicing", "no such package", cure) from error
     return getattr(package, f"demosaicing_CFA_Bayer_{names[interpolation]}")

@@ -38,9 +38,7 @@ class MapColumns(NamedTuple):
 class SourceMap(eqx.Module):
     """A point source by its path to every cell.
 
-    Attributes:
-        source_waves: `[y, x]` wrapped optical path to every cell (or `[subring]` of a DOE of rings), waves.
-        waves_per_metre: waves of delay per metre of DOE height for this chief ray.
+    The wrapped path `[y, x]` (or `[subring]`) in waves, and waves per metre of DOE height for this chief ray.
     """
 
     source_waves: Float[Array, "*cell"]
@@ -118,7 +116,7 @@ class SeparableSource(NamedTuple):
         return cls(np.float32(curvature), sines, waves_y, waves_x, per_metre, np.float32(1 / wavelength_m))
 
     def over(self, grid: Grid) -> tuple[tuple[Array, Array], SeparableColumns]:
-        """What `sim.propagation.pupil.doe_field` has to know: by row, and for all rows alike."""
+        """The same as of `SourceMap`."""
         y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in ("y", "x"))
         curvature, sines, waves_y, waves_x, *scales = (jnp.asarray(part) for part in self)
         return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)

@@ -45,8 +45,8 @@ class StoredHeight(NamedTuple):
 
     Attributes:
         height_m: `[y, x]` heights, metres, row 0 at the lowest y.
-        pitch_m: cell pitch, metres; None if the file does not say.
-        aperture_m: diameter of the clear aperture, metres; None if the file does not say.
+        pitch_m: cell pitch, metres, or None.
+        aperture_m: diameter of the clear aperture, metres, or None.
         metadata: the other text attributes.
     """
 
@@ -77,11 +77,10 @@ def write_height(
         height_m: `[y, x]` heights, metres, rounded to float32.
         pitch_m: cell pitch, metres.
         aperture_m: diameter of the clear aperture, metres.
-        extra: further text attributes.
+        extra: further text attributes; a ValueError for a name that is taken.
 
     Raises:
         InputError: the system refuses the path.
-        ValueError: an extra attribute has a name that is taken.
     """
     texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": repr(float(aperture_m))}
     _write(Path(path), {"height": height_m}, texts, extra)
@@ -120,16 +119,15 @@ def read_height(path: str | Path) -> StoredHeight:
 
 
 def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[str, str] | None = None) -> None:
-    """Write a PSF bank, one channel per depth and colour.
+    """Write a PSF bank, one channel per depth and colour, rounded to float32.
 
     Args:
         path: the file; its folder is made if missing.
-        bank: PSFs, rounded to float32.
-        extra: further text attributes.
+        bank: PSFs; a ValueError where two depths or colours have the same name.
+        extra: further text attributes; a ValueError for a name that is taken.
 
     Raises:
         InputError: the system refuses the path.
-        ValueError: two depths or colours have the same name, or an extra attribute has one that is taken.
     """
     channels = {
         _channel_name(depth, colour): bank.energy[c, d]
@@ -193,16 +191,15 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
 
 
 def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[str, str] | None = None) -> None:
-    """Write a picture in linear light, or any other maps of one shape.
+    """Write a picture in linear light, or any other maps `[y, x]` of one shape, rounded to float32.
 
     Args:
         path: the file; its folder is made if missing.
-        channels: `[y, x]` maps by name, such as R, G and B; rounded to float32, infinity allowed.
-        extra: text attributes.
+        channels: maps by name, such as R, G and B; infinity allowed.
+        extra: text attributes; a ValueError for a name that is taken.
 
     Raises:
         InputError: the system refuses the path.
-        ValueError: maps of different shapes, or an extra attribute with a name that is taken.
     """
     shapes = {np.shape(values) for values in channels.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
@@ -211,11 +208,7 @@ def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[
 
 
 def read_picture(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "y x"]], dict[str, str]]:
-    """Read the channels `[y, x]` of a picture by name, and its text attributes.
-
-    Raises:
-        InputError: the file is missing, no whole EXR file, or changed since it was written.
-    """
+    """Read the channels `[y, x]` of a picture by name, and its text attributes; see `read_height` for errors."""
     picture = _read(Path(path))
     return picture.channels, picture.texts
 
@@ -364,8 +357,8 @@ def _broken(path: Path, what: str) -> InputError:
 def _silence() -> Iterator[Callable[[], str]]:
     """Keep what OpenEXR prints about broken files off the terminal; yields a function that returns it.
 
-    It prints through Python's stdout, which must carry data only, and says more straight to the process's stderr. Both
-    are the whole process's: of two threads at once, the second would put back what the first had put there.
+    It prints through Python's stdout, which must carry data only, and straight to stderr. Both are the whole process's:
+    of two threads at once, the second would put back what the first had put there.
     """
     printed = io.StringIO()
     with _SILENT, contextlib.redirect_stdout(printed), contextlib.ExitStack() as stack:

@@ -41,11 +41,7 @@ def fast_length(samples: int) -> int:
 
 
 def result_shape(shape: Window, window: Window, border: Border) -> Window:
-    """Shape of a convolution's result.
-
-    Raises:
-        ValueError: an unknown border, or an image smaller than its own margin.
-    """
+    """Shape of a convolution's result; a ValueError for an unknown border, or an image smaller than its own margin."""
     if border not in get_args(Border):
         raise ValueError(f"`border` must be one of {', '.join(get_args(Border))}, but got {border!r}")
     if border != "own":
@@ -57,10 +53,9 @@ def result_shape(shape: Window, window: Window, border: Border) -> Window:
 
 
 class Otf(eqx.Module):
-    """Transforms of kernels, ready for images of one shape.
+    """Transforms `[..., fx, fy]` of kernels, ready for images of one shape.
 
     Attributes:
-        transfer: `[..., fx, fy]` transform of every kernel.
         window: samples (y, x) of a kernel.
         shape: samples (y, x) of an image.
         border: what lies beyond it.
@@ -94,22 +89,14 @@ def plan_otf(kernel: Float[Array, "*k y x"] | Float[np.ndarray, "*k y x"], shape
 
 
 def convolve(image: Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"], otf: Otf) -> Float[Array, "*c v u"]:
-    """Convolve images with kernels; leading axes are broadcast.
-
-    Args:
-        image: `[..., y, x]` of the shape that the OTF was planned for.
-        otf: kernels.
-
-    Raises:
-        ValueError: an image of another shape.
-    """
+    """Convolve images `[..., y, x]` of the planned shape with kernels; leading axes are broadcast."""
     return landed(spectrum(image, otf) * otf.transfer, otf)
 
 
 def superpose(
     images: Sequence[Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"]], otf: Otf
 ) -> Float[Array, "*c v u"]:
-    """Convolve every image with its own entry of the kernels' first axis, and add: one transform back for all.
+    """Convolve each image with its own entry of the kernels' first axis, and add: one transform back for all.
 
     The images are transformed one by one, so that two cores can work on two of them.
     """
@@ -118,11 +105,7 @@ def superpose(
 
 
 def spectrum(image: Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"], otf: Otf) -> Complex[Array, "*b fx fy"]:
-    """Transform of images with their borders, to be multiplied with `Otf.transfer`.
-
-    Raises:
-        ValueError: an image of another shape than the OTF was planned for.
-    """
+    """Transform of images of the planned shape with their borders, to be multiplied with `Otf.transfer`."""
     if image.shape[-2:] != otf.shape:
         raise ValueError(f"`image` must have the shape {otf.shape} of the plan, but got {image.shape[-2:]}")
     if otf.border == "own":
@@ -172,10 +155,7 @@ def tile_length(shape: Window, window: Window, border: Border, limit: int = 1536
 
 
 def tiles(shape: Window, window: Window, border: Border, length: Window) -> Iterator[Tile]:
-    """Cut a result into overlap-save tiles, all of one size.
-
-    The last tile of an axis is moved back to end with the result; what it shares with its neighbour is the same there.
-    """
+    """Cut a result into overlap-save tiles of one size, the last of an axis moved back to end with the result."""
     results = result_shape(shape, window, border)
     starts = []
     for samples, n, long in zip(results, window, length, strict=True):
@@ -201,22 +181,13 @@ def _needed(start: int, count: int, window: int, samples: int, border: Border) -
     return first, index
 
 
-@jax.jit
-def _tile_convolved(patch: Array, otf: Otf) -> Array:
-    return convolve(patch, otf)
+_tile_convolved = jax.jit(convolve)
 
 
 def convolve_tiled(
     image: Float[np.ndarray, "y x"], kernel: Float[np.ndarray, "*k ky kx"], border: Border, length: Window | None = None
 ) -> Float[np.ndarray, "*k v u"]:
-    """`convolve` of a frame too large for one transform, by overlap-save.
-
-    Args:
-        image: `[y, x]` the frame.
-        kernel: `[..., y, x]` kernels, each applied to the frame.
-        border: what lies beyond the frame.
-        length: samples (y, x) of a tile with its margins; `tile_length` by default.
-    """
+    """`convolve` of a frame too large for one transform, by overlap-save with tiles of up to `length` samples (y, x)."""
     shape, window = (image.shape[0], image.shape[1]), (kernel.shape[-2], kernel.shape[-1])
     out = np.empty((*kernel.shape[:-2], *result_shape(shape, window, border)), np.float32)
     otf: Otf | None = None

@@ -19,15 +19,12 @@ def disc_window(diameter_px: float) -> int:
 def shadow_disc(
     diameter_px: Float[Array, ""] | float, window: int
 ) -> Float[Array, "{window} {window}"] | Float[np.ndarray, "{window} {window}"]:
-    """Disc of unit sum in an odd window, every pixel weighted by the area of it that the disc covers.
+    """Disc `[y, x]` of unit sum in an odd window, every pixel weighted by the area of it that the disc covers.
 
     Args:
-        diameter_px: diameter in pixels, above 0; may be traced, and the result is differentiable in it. Then the
-            circle counts as straight within a pixel, which suits discs of several pixels.
+        diameter_px: diameter in pixels, above 0. If it is traced the result is differentiable in it: the circle counts
+            as straight within a pixel, and a disc larger than the window is NaN.
         window: pixels per side.
-
-    Returns:
-        `[y, x]`, numpy for a plain number; NaN where a traced disc is larger than the window.
 
     Raises:
         ValueError: an even window, or a disc known to be larger than the window.

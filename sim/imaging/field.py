@@ -55,10 +55,10 @@ class FieldOptics(NamedTuple):
 
     @classmethod
     def of(cls, banks: Sequence[Sequence[PsfBank]], camera: Camera, depths_m: Sequence[float]) -> "FieldOptics":
-        """From banks at field angles, one row of banks per angle along y, in increasing order.
+        """From banks at field angles: `banks[j][i]` has the angles (y_j, x_i), in increasing order.
 
         Args:
-            banks: `banks[j][i]` has the field angles (y_j, x_i); see `sim.psf_bank.psf`.
+            banks: PSFs.
             camera: the camera they were made for.
             depths_m: depth of every layer, background first, metres.
 
@@ -133,15 +133,7 @@ def capture_frame(
 
 
 class _FramePlan(NamedTuple):
-    """`Imaging` of a frame in one colour, tile by tile.
-
-    Attributes:
-        otf: `[gy][gx]` transforms of the nodes' PSFs of every layer, for one tile.
-        energy: `[gy, gx, layer]` their sums.
-        tiles: pieces of the frame.
-        optics: nodes and camera.
-        shape: pixels of the frame.
-    """
+    """`Imaging` of a frame in one colour: transforms `[gy][gx]` and sums of the nodes' PSFs, for tiles of one size."""
 
     otf: tuple[tuple[Otf, ...], ...]
     energy: Float[np.ndarray, "gy gx layer"]
@@ -199,6 +191,4 @@ def _added(total: Array, patch: Array, shares: tuple[Light, Light], otf: Otf, la
     return total + jnp.sum(spectrum(light, otf) * otf.transfer[slice(*layers)], axis=0)
 
 
-@jax.jit
-def _tile_landed(total: Array, otf: Otf) -> Array:
-    return landed(total, otf)
+_tile_landed = jax.jit(landed)

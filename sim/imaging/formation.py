@@ -4,6 +4,7 @@ How an obstruction takes light from what is behind it is the choice of a model b
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -39,9 +40,9 @@ class Optics(eqx.Module):
         aperture_m: diameter of the clear aperture, metres.
         focal_m: distance from the lens to the sensor, metres.
         pixel_m: pixel pitch, metres.
-        shadow_px: pixels of the odd window that holds every shadow disc. Only where depths are traced, as in a compiled
-            function over many of them; otherwise None, and the depths say it. A traced depth whose disc does not
-            fit gives NaN, never a smaller shadow.
+        shadow_px: pixels of the odd window that holds every shadow disc, where depths are traced; otherwise the depths
+            say it. A traced depth whose disc does not fit gives NaN, never a smaller shadow.
+        otf: transforms of the PSFs, with the layers of `with_spot`, once they are `prepared`.
     """
 
     psf: Float[Array, "layer c ky kx"] | Float[np.ndarray, "layer c ky kx"]
@@ -49,12 +50,11 @@ class Optics(eqx.Module):
     focal_m: float = eqx.field(static=True)
     pixel_m: float = eqx.field(static=True)
     shadow_px: int | None = eqx.field(static=True, default=None)
+    otf: Otf | None = None
 
     @classmethod
     def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float], shadow_px: int | None = None) -> "Optics":
-        """Optics for layers at given depths, background first, from a bank.
-
-        Between two depths of the bank PSFs are mixed linearly in 1/z, as the width of a blur grows.
+        """Optics for layers at given depths, background first, from a bank whose PSFs are mixed linearly in 1/z.
 
         Raises:
             InputError: a depth beyond the bank's.
@@ -68,11 +68,7 @@ class Optics(eqx.Module):
         return self.psf.shape[-2], self.psf.shape[-1]
 
     def disc_px(self, depth_m: Depth, behind_m: Depth) -> Float[Array, ""] | float:
-        """Diameter in pixels of the shadow disc of a point at `behind_m` in the plane at `depth_m`.
-
-        Raises:
-            ValueError: the plane is not before the point.
-        """
+        """Diameter in pixels of the shadow disc in the plane at `depth_m` of a point at `behind_m`, which is farther."""
         near, far, width = _known(depth_m), _known(behind_m), self.aperture_m * self.focal_m / self.pixel_m
         if near is None or far is None:
             return width * (1 / jnp.asarray(depth_m) - 1 / jnp.asarray(behind_m))
@@ -80,7 +76,7 @@ class Optics(eqx.Module):
             raise ValueError(f"an obstruction must be nearer than what it covers, but got {near} m before {far} m")
         return width * (1 / near - 1 / far)
 
-    def prepared(self, shape: Window, border: Border = "reflect") -> "Prepared":
+    def prepared(self, shape: Window, border: Border = "reflect") -> "Optics":
         """The same optics with the PSFs' transforms, for many scenes of one shape.
 
         Args:
@@ -88,7 +84,7 @@ class Optics(eqx.Module):
                 margin that the shadow discs take (`capture`).
             border: what lies beyond a scene.
         """
-        return Prepared(self, plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
+        return replace(self, otf=plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
 
 
 def _known(depth_m: Depth) -> float | None:
@@ -97,18 +93,6 @@ def _known(depth_m: Depth) -> float | None:
         return float(depth_m)
     except jax.errors.ConcretizationTypeError:
         return None
-
-
-class Prepared(eqx.Module):
-    """Optics with the transforms of their PSFs; `Optics.prepared` makes one.
-
-    Attributes:
-        optics: what they were made from.
-        otf: `[c, layer, fx, fy]` transforms; its layers are those of `with_spot`.
-    """
-
-    optics: Optics
-    otf: Otf
 
 
 def capture(
@@ -136,19 +120,19 @@ def capture(
             before the background, or an unknown name.
     """
     check_names(model, outside)
-    plain = optics.optics if isinstance(optics, Prepared) else optics
-    check_layers(scene, *plain.psf.shape[:2])
-    window = shadow_px(scene, plain) if follows_light(model) else 1
+    check_layers(scene, *optics.psf.shape[:2])
+    window = shadow_px(scene, optics) if follows_light(model) else 1
     y, x = scene.background.shape[1:]
     margin = own_margin_px(1, window, model) if border == "own" else 0
     lit = (y - margin, x - margin)
-    if isinstance(optics, Prepared) and (optics.otf.shape, optics.otf.border) != (lit, border):
+    if optics.otf is not None and (optics.otf.shape, optics.otf.border) != (lit, border):
         wanted, got = f"{lit} and {border!r}", f"{optics.otf.shape} and {optics.otf.border!r}"
         raise ValueError(f"`optics` must be prepared for the shape and border {wanted}, but got {got}")
-    discs = shadow_discs(scene, plain, window) if follows_light(model) else ()
-    kernels = optics.otf if isinstance(optics, Prepared) else jnp.swapaxes(jnp.asarray(plain.psf), 0, 1)
-    if model == "reciprocal" and not isinstance(kernels, Otf):
-        kernels = jnp.asarray(with_spot(kernels))
+    discs = shadow_discs(scene, optics, window) if follows_light(model) else ()
+    kernels = optics.otf
+    if kernels is None:
+        kernels = jnp.swapaxes(jnp.asarray(optics.psf), 0, 1)
+        kernels = jnp.asarray(with_spot(kernels)) if model == "reciprocal" else kernels
     layers = Layers(
         scene.background, tuple(o.mask for o in scene.obstructions), tuple(o.radiance for o in scene.obstructions)
     )
@@ -158,10 +142,8 @@ def capture(
 def own_margin_px(psf_px: int, shadow_px: int, model: Model) -> int:
     """Pixels per axis by which a scene that brings its margin along (`border="own"`) is larger than its capture.
 
-    Args:
-        psf_px: window of the PSFs.
-        shadow_px: window of the shadow discs.
-        model: how layers are put together; the paper's models cast no shadow, `reciprocal` casts it twice.
+    The paper's models cast no shadow, `reciprocal` casts it twice; the windows are those of the PSFs and the shadow
+    discs.
     """
     shadows = 2 if model == "reciprocal" else int(follows_light(model))
     return psf_px - 1 + shadows * (shadow_px - 1)
@@ -170,16 +152,8 @@ def own_margin_px(psf_px: int, shadow_px: int, model: Model) -> int:
 def lost_share(scene: Scene, optics: Optics, model: Model) -> Float[Array, "c v u"]:
     """Share of the background's light that a model takes away; the view is mirrored at its edges.
 
-    Args:
-        scene: one obstruction before a background.
-        optics: PSFs of both.
-        model: how layers are put together.
-
-    Returns:
-        `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10 otherwise, 0 to 1.
-
-    Raises:
-        ValueError: a scene of another number of obstructions, or an unknown name.
+    The scene has one obstruction. `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10
+    otherwise, 0 to 1.
     """
     check_names(model, "scene")
     if len(scene.obstructions) != 1:
@@ -206,10 +180,10 @@ def _formed(
     lit: Window,
     border: Border,
 ) -> Array:
-    """`capture` in arrays.
+    """`capture` in arrays, colour by colour.
 
-    One colour after the other: the arrays between its transforms then stay below the 32 MB from which the C library
-    takes fresh memory from the system at every call, which costs as much as the transforms.
+    The arrays between its transforms then stay below the 32 MB from which the C library takes fresh memory from the
+    system at every call, which costs as much as the transforms.
     """
     shape = (layers.background.shape[1], layers.background.shape[2])
     shadows = [plan_otf(disc, shape, border) for disc in discs]
@@ -235,11 +209,7 @@ def _formed(
 
 
 def check_layers(scene: Scene, layers: int, colours: int) -> None:
-    """Check that PSFs and layers match.
-
-    Raises:
-        ValueError: they do not.
-    """
+    """Raise a ValueError unless PSFs and layers match."""
     wanted = (1 + len(scene.obstructions), scene.background.shape[0])
     if (layers, colours) != wanted:
         raise ValueError(f"PSFs must have (layers, colours) = {wanted} as the scene, but got {(layers, colours)}")
@@ -253,8 +223,7 @@ def check_layers(scene: Scene, layers: int, colours: int) -> None:
 def shadow_px(scene: Scene, optics: Optics) -> int:
     """Pixels of the odd window that holds every shadow disc of a scene, one more than a multiple of 16.
 
-    Raises:
-        ValueError: depths are traced and `Optics.shadow_px` is not given.
+    A ValueError where depths are traced and `Optics.shadow_px` is not given.
     """
     if optics.shadow_px is not None:
         return optics.shadow_px
@@ -281,11 +250,7 @@ def _layer(otf: Otf, which: int | slice) -> Otf:
 
 
 class _Patch(eqx.Module):
-    """`Imaging` by one set of PSFs, with one transform per image.
-
-    Attributes:
-        otf: `[layer, fx, fy]` transforms of the PSFs of one colour.
-    """
+    """`Imaging` by transforms `[layer, fx, fy]` of one colour's PSFs, with one transform per image."""
 
     otf: Otf
 

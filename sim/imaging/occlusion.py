@@ -59,13 +59,7 @@ _SPOT_PX = 6
 
 
 class Layers(eqx.Module):
-    """A scene in one colour.
-
-    Attributes:
-        background: `[y, x]` light.
-        masks: `[y, x]` of every obstruction, from the farthest to the nearest.
-        radiances: `[y, x]` likewise.
-    """
+    """A scene in one colour, `[y, x]` each; obstructions from the farthest to the nearest."""
 
     background: Light
     masks: tuple[Light, ...]
@@ -88,11 +82,8 @@ class Imaging(Protocol):
 def radiometric(layers: Layers, kept: Sequence[Light], imaging: Imaging) -> Light:
     """Light on the sensor by the model `radiometric`.
 
-    Args:
-        layers: the scene in one colour.
-        kept: for every obstruction, the share `[behind, y, x]` of its light that each layer behind it keeps, perhaps
-            without a margin of the scene.
-        imaging: the camera.
+    For every obstruction, `kept` is the share `[behind, y, x]` of its light that each layer behind it keeps, perhaps
+    without a margin of the scene.
     """
     lights = [layers.background, *(m * light for m, light in zip(layers.masks, layers.radiances, strict=True))]
     lights = [_cut(light, kept[0].shape) if kept else light for light in lights]
@@ -103,16 +94,11 @@ def radiometric(layers: Layers, kept: Sequence[Light], imaging: Imaging) -> Ligh
 
 
 def reciprocal(layers: Layers, kept: Sequence[Light], shaded: Callable[[int, Light], Light], imaging: Imaging) -> Light:
-    """Light on the sensor by the model `reciprocal`.
+    """Light on the sensor by the model `reciprocal`; `imaging` has the layers of `with_spot`.
 
     Among each other obstructions take light as in `radiometric`; what several of them take from the background is
-    counted once, for the farthest.
-
-    Args:
-        layers: the scene in one colour.
-        kept: as for `radiometric`.
-        shaded: the background's light `[y, x]` blurred by the shadow disc of the obstruction of that number.
-        imaging: the camera, with the layers of `with_spot`.
+    counted once, for the farthest. `shaded` blurs the background's light by the shadow disc of the obstruction of that
+    number.
     """
     taken, opened = [], 1.0
     for number, mask in enumerate(layers.masks):
@@ -176,11 +162,7 @@ def follows_light(model: Model) -> bool:
 
 
 def with_spot(psf: Float[Array, "*k layer y x"] | Float[np.ndarray, "*k layer y x"]) -> Light:
-    """PSFs of all layers and of what `reciprocal` adds.
-
-    Returns:
-        after the layers the sharp spot of the first, the background's; and every other one scaled to its energy.
-    """
+    """PSFs of all layers, the sharp spot of the first (the background's), and every other one scaled to its energy."""
     y, x = (np.arange(n) - (n - 1) / 2 for n in psf.shape[-2:])
     inside = (np.hypot(y[:, None], x) <= _SPOT_PX).astype(np.float32)
     energy = psf.sum(axis=(-2, -1), keepdims=True)
@@ -190,11 +172,7 @@ def with_spot(psf: Float[Array, "*k layer y x"] | Float[np.ndarray, "*k layer y 
 
 
 def check_names(model: str, outside: str) -> None:
-    """Check the names of a model and of a filling.
-
-    Raises:
-        ValueError: an unknown one.
-    """
+    """Raise a ValueError for an unknown name of a model or of a filling."""
     for name, value, known in (("model", model, get_args(Model)), ("outside", outside, get_args(Outside))):
         if value not in known:
             raise ValueError(f"`{name}` must be one of {', '.join(known)}, but got {value!r}")

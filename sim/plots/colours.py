@@ -43,11 +43,7 @@ def line_colours(colours: Sequence[Colour]) -> list[str]:
 
 
 def depth_positions(of_m: Sequence[float], depths_m: Sequence[float], most: int) -> list[int]:
-    """Positions among the depths `of_m` of a bank of at most `most` of some depths.
-
-    Raises:
-        ValueError: a depth is not in the bank.
-    """
+    """Positions among the depths `of_m` of a bank of at most `most` of some depths, which must be there."""
     positions = []
     for depth in (depths_m[i] for i in evenly_spaced(len(depths_m), most)):
         # A bank that was read from a file may have rounded its depths.

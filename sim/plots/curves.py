@@ -45,21 +45,11 @@ def plot_mtf(
     lens: "sim.transfer.TransferBank | None" = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
-    """Draw the modulation transfer along x up to the sensor's Nyquist frequency.
+    """Draw the modulation transfer along x up to the sensor's Nyquist frequency; that of the plain lens is dashed.
 
     Far depths have an even frequency axis; near ones, whose contrast dies at low frequencies, a logarithmic one. Of
-    more than three near or far depths, and of more than six colours, an even choice is shown.
-
-    Args:
-        transfer: MTF of lens, DOE and pixel.
-        camera: colours.
-        near_m: near depths to show, metres; may be empty.
-        far_m: far depths to show, metres; may be empty.
-        lens: MTF of the plain lens and pixel at the same depths, dashed.
-        ax: axes whose place the picture takes; a new figure by default.
-
-    Raises:
-        ValueError: no depth is given, or one is not in a bank.
+    more than three near or far depths, and of more than six colours, an even choice is shown. A ValueError for no
+    depth, or one that is not in a bank.
     """
     frequencies = transfer.frequencies_per_m * MM
 
@@ -83,20 +73,10 @@ def plot_encircled(
     lens: "sim.psf_bank.PsfBank | None" = None,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
-    """Draw the share of the incident light inside centred circles of growing radius.
+    """Draw the share of the incident light inside centred circles of growing radius; that of the plain lens is dashed.
 
-    Dotted lines stand at the radius of the geometric defocus disc of near depths, and of the far spot of far ones.
-
-    Args:
-        bank: PSFs with the DOE.
-        camera: optics of the bank.
-        near_m: near depths of the bank, metres; may be empty.
-        far_m: far depths of the bank, metres; may be empty.
-        lens: PSFs of the plain lens at the same depths, dashed.
-        ax: axes whose place the picture takes; a new figure by default.
-
-    Raises:
-        ValueError: no depth is given, or one is not in a bank.
+    Dotted lines stand at the radius of the geometric defocus disc of near depths, and of the far spot of far ones. A
+    ValueError for no depth, or one that is not in a bank.
     """
     hues = line_colours(camera.colours)
     radii = bank.pixel_m * np.geomspace(1.0, bank.energy.shape[-1] / np.sqrt(2), _RADII)
@@ -136,10 +116,7 @@ def _plot_curves(
     note: str,
     ax: "Axes | None",
 ) -> "FigureBase":
-    """Draw a row of panels per group of depths (near, far), curves of the DOE over those of the lens if there are two.
-
-    `words` name the two axes.
-    """
+    """Draw a row of panels per group of depths (near, far), the lens below the DOE; `words` name the axes."""
     named = {"far": depths_m[1], "near": depths_m[0]}
     groups = {name: depth_positions(both[0][1], depths, _MOST_DEPTHS) for name, depths in named.items() if len(depths)}
     if not groups:

@@ -27,20 +27,10 @@ def plot_pattern(
     uniformity: float,
     ax: "Axes | None" = None,
 ) -> "FigureBase":
-    """Draw a target pattern and the PSF that should equal it, on one colour scale.
+    """Draw a target pattern and the PSF that should equal it (shares of the light per pixel) on one colour scale.
 
-    Colours follow the square root of the energy, so that ghosts of one per cent show.
-
-    Args:
-        target: `[y, x]` wanted share of the incident light per pixel.
-        achieved: `[y, x]` achieved share.
-        camera: pixel pitch of both.
-        efficiency: share of the incident light that lies on the target, written above the picture.
-        uniformity: evenness of the light on the target, 1 for perfect, written above the picture.
-        ax: axes whose place the picture takes; a new figure by default.
-
-    Raises:
-        ValueError: the two differ in shape.
+    Colours follow the square root of the energy, so that ghosts of one per cent show. Efficiency and uniformity (1 for
+    perfect) are written above.
     """
     from matplotlib.colors import PowerNorm
     from matplotlib.ticker import MaxNLocator

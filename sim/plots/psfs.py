@@ -31,14 +31,7 @@ _BLACK = 0.02
 
 
 class _Group(NamedTuple):
-    """Depths that share a colour scale.
-
-    Attributes:
-        name: "near" or "far".
-        depths: positions in the bank.
-        images: `[w, d, y, x]` energies, averaged to picture pixels.
-        norm: the scale.
-    """
+    """Depths that share a colour scale: "near" or "far", positions in the bank, energies in picture pixels."""
 
     name: str
     depths: list[int]
@@ -51,18 +44,9 @@ def plot_psfs(
 ) -> "FigureBase":
     """Draw the PSFs of a bank: a row per colour, near depths on the left and far ones on the right.
 
-    Energies are shown on a logarithmic scale, one for the near and one for the far columns. Three colours make a
-    last row in which they stand together. Of more than six depths, or six colours, an even choice is shown.
-
-    Args:
-        bank: the PSFs.
-        camera: the camera of the bank.
-        near_m: depths of the bank to show as near, metres; may be empty.
-        far_m: depths of the bank to show as far, metres; may be empty.
-        ax: axes whose place the picture takes; a new figure by default.
-
-    Raises:
-        ValueError: no depth is given, or one is not in the bank.
+    Energies are shown on a logarithmic scale, one for the near and one for the far columns. Three colours make a last
+    row in which they stand together. Of more than six depths, or six colours, an even choice is shown. A ValueError for
+    no depth, or one that is not in the bank.
     """
     most = _MOST_COLUMNS if len(near_m) + len(far_m) <= _MOST_COLUMNS else _MOST_COLUMNS // 2
     shown = {

@@ -55,12 +55,10 @@ class FarField(eqx.Module):
     """Operators of one wavelength and depth.
 
     Attributes:
-        gather: samples -> pixels along either axis, with all constant factors.
-        spread: its transpose.
+        gather: samples -> pixels along either axis, with all constant factors; `spread` is its transpose.
         refine: samples of the field -> samples of the intensity along either axis, with the cell's sinc: real and
-            imaginary part of the weights (the latter is missing for a distant source), or none of them if the two
-            sets of samples are the same.
-        coarsen: their transposes.
+            imaginary part of the weights (only the real one for a distant source), or none if the samples are the same;
+            `coarsen` holds their transposes.
         tilt: phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`).
         cells: DOE cells per axis.
         length: transform length per axis.
@@ -84,16 +82,12 @@ class FarField(eqx.Module):
     expected_error: float
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
-        """Energy in every pixel of the window, per unit power incident on the clear aperture.
+        """Energy `[y, x]` in every pixel of the window, per unit power incident on the clear aperture.
 
         Args:
-            pupil: function (rows, shared) -> complex field `[row, x]` behind the DOE; zero rows must give a
-                zero field.
+            pupil: function (rows, shared) -> complex field `[row, x]` behind the DOE; zero rows must give a zero field.
             rows: pytree of arrays whose first axis is the grid's y; `pupil` receives blocks of them.
-            shared: pytree passed to every block unchanged.
-
-        Returns:
-            `[y, x]` energies; differentiable in every floating-point leaf of `rows` and `shared`.
+            shared: pytree passed to every block unchanged. The result is differentiable in it and in `rows`.
         """
         return _pixel_energy((rows, shared), pupil, self)
 
@@ -102,24 +96,19 @@ class FarField(eqx.Module):
 def plan_far_field(
     camera: Camera, wavelength_m: float, *, depth_m: float = np.inf, sampling: float | None = None, cell: bool = True
 ) -> FarField:
-    """Prepare the transform of one wavelength and depth.
+    """Prepare the transform of one wavelength and depth. Kept, for every DOE of a tolerance study needs the same few.
 
     Args:
         camera: DOE grid (square), aperture, lens and sensor.
         wavelength_m: vacuum wavelength.
-        depth_m: source depth, for the directions in which the cells are lit; without influence below a `sampling`
-            of 2, where the cell's sinc stays centred on the axis.
+        depth_m: source depth, for the directions in which the cells are lit; without influence below a `sampling` of 2,
+            where the cell's sinc stays centred on the axis.
         sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
-            at most `TOLERANCE`.
+            `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
-
-    Returns:
-        a plan whose pixel energies are per unit power incident on the clear aperture.
 
     Raises:
         ValueError: a DOE grid that is not square, or `sampling` below 1.
-
-    Kept, because every plate of a tolerance study is looked at with the same few.
     """
     ny, nx = camera.grid.shape
     if ny != nx:
@@ -170,21 +159,19 @@ def plan_far_field(
 def field_weights(
     positions: Float[np.ndarray, " fine"], samples: int, length: int, aperture: float, slope: float | None
 ) -> tuple[tuple[Float[np.ndarray, "sample fine"], ...], float]:
-    """Weights that interpolate the field behind a disc of square cells, and what they miss.
+    """Weights that interpolate the field behind a disc of square cells, and their relative RMS error along one axis.
 
     Args:
         positions: where the field is wanted, in samples from the first one.
         samples: number of samples; the middle one lies on the axis.
         length: length of the transform that made them.
         aperture: diameter of the disc, cells.
-        slope: direction in which a cell is lit, in waves per cell and cell from the axis; None leaves out the
-            factor sinc(direction of observation - direction of light) of a square cell.
+        slope: direction in which a cell is lit, in waves per cell and cell from the axis; None leaves out the factor
+            sinc(direction of observation - direction of light) of a square cell.
 
-    Returns:
-        real part of the weights, with the imaginary part if it is not zero, and the relative RMS error along one axis.
-
-    Least squares over the disc, weighted by its chords. Every cell x contributes exp(-2 pi i k x / length) at sample
-    k and, to what is wanted, the same at a fractional k times its sinc.
+    Real part of the weights, with the imaginary part if it is not zero. Least squares over the disc, weighted by its
+    chords: every cell x contributes exp(-2 pi i k x / length) at sample k and, to the wanted field, the same at a
+    fractional k times its sinc.
     """
     first = np.floor(positions - (_FIELD_TAPS - 1) / 2 + 0.5).astype(np.int64)
     # One cell more than the aperture: for an even count its centre lies half a cell off the transform's origin.
@@ -217,8 +204,8 @@ def _apply(parts: Float[Array, "2 ..."], operators: tuple[Banded, ...]) -> Float
 def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
     """The same plan with every image moved by (y, x) metres on the sensor, by tilting the pupil.
 
-    The optimiser moves the image by a random fraction of a pixel at every step: a design must not depend on where
-    on the pixel grid a point of the scene falls, and the errors of a sparse `sampling` then average out.
+    The optimiser moves the image by a random fraction of a pixel at every step: a design must not depend on where on
+    the pixel grid a point falls, and the errors of a sparse `sampling` average out.
     """
     cells = jnp.arange(plan.cells) - (plan.cells - 1) / 2
     waves = cells / (plan.length * plan.spacing_m)

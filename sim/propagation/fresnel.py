@@ -17,7 +17,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 from scipy.fft import next_fast_len
 
 from fab.errors import InputError
-from sim.camera import Camera
+from sim.camera import Camera, wrapped_waves
 from sim.propagation.pixel import Banded, pixel_weights
 from sim.propagation.pupil import PupilRows, cis
 
@@ -102,7 +102,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     matrix = weights.matrix * (pitch / np.sqrt(area))
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
     # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d.
-    lens = _wrapped(-square / (2 * distance * wavelength_m))
+    lens = wrapped_waves(-square / (2 * distance * wavelength_m), 1.0)
     return DirectPath(
         gather=Banded.from_dense(matrix),
         lens=cis(jnp.asarray(lens)),
@@ -110,10 +110,6 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
         first=first,
         expected_error=np.sqrt(2) * weights.expected_error,
     )
-
-
-def _wrapped(waves: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
-    return (waves - np.round(waves)).astype(np.float32)
 
 
 def _kernel(
@@ -133,4 +129,4 @@ def _kernel(
     fall = np.clip((np.abs(frequency) / limit - _UNTAPERED) / (1 - _UNTAPERED), 0.0, 1.0)
     passed = np.cos(np.pi / 2 * fall) ** 2
     passed = passed[:, None] * passed[None, :] * (square < carrier)
-    return cis(jnp.asarray(_wrapped(waves))) * jnp.asarray(passed, jnp.float32)
+    return cis(jnp.asarray(wrapped_waves(waves, 1.0))) * jnp.asarray(passed, jnp.float32)

@@ -36,7 +36,7 @@ class Hankel(eqx.Module):
     """Operators of one wavelength for a profile of rings.
 
     Attributes:
-        rings_to_field: `[subring, coarse radius]`, float32, all constant factors included.
+        rings_to_field: `[subring, coarse radius]`, all constant factors included.
         refine: coarse radii -> fine radii.
         first: first fine radius used by each distinct pixel.
         areas: `[distinct pixel, fine radius]` weights of the fine radii from `first` on.

@@ -32,12 +32,7 @@ _SAMPLINGS = (2.05, 2.1, 2.2, 2.3, 2.5, 2.75, 3.0, 3.5, 4.0, 5.0, 6.0)
 
 
 class PixelWeights(NamedTuple):
-    """Weights of every pixel along one axis.
-
-    Attributes:
-        matrix: `[sample, pixel]`, float64.
-        expected_error: predicted relative L2 error of the integrals along this axis.
-    """
+    """Weights `[sample, pixel]` along one axis, float64, and the predicted relative L2 error of the integrals."""
 
     matrix: Float[np.ndarray, "sample pixel"]
     expected_error: float
@@ -59,19 +54,13 @@ def _speckle_spectrum(cutoff: float, width: float) -> tuple[np.ndarray, np.ndarr
 
 
 def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: float, samples: int) -> PixelWeights:
-    """Weights that integrate samples at 0 .. samples-1 over pixels.
+    """Weights that integrate samples at 0 .. samples-1 over pixels; each pixel's sum is `width`.
 
     Args:
         centres: pixel centres in units of the sample spacing.
         width: side of a pixel's sensitive square in the same unit.
         cutoff: highest spatial frequency of the intensity, cycles per sample; 1/2 is just enough.
-        samples: number of samples; every pixel must lie inside by two samples.
-
-    Returns:
-        the weights; each pixel's sum is `width`.
-
-    Raises:
-        ValueError: a pixel needs samples that are not there.
+        samples: number of samples; every pixel must lie inside by two samples, or a ValueError is raised.
     """
     # Two samples beyond the pixel's edge on both sides: the gain of a third is below the plan's tolerance.
     taps = int(np.ceil(width)) + 5
@@ -97,9 +86,9 @@ def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: fl
 def sampling_for(pixel: float, tolerance: float) -> float:
     """Samples per lambda d / D with which pixels of side `pixel` (in lambda d / D) are integrated to `tolerance`.
 
-    The error is predicted for pixels at eight positions between two samples, both axes together. Wide pixels do with
-    a little more than the Nyquist rate of 2; pixels narrower than the Airy disc need more, because there the rule
-    has to interpolate.
+    The error is predicted for pixels at eight positions between two samples, both axes together. Wide pixels need
+    little more than the Nyquist rate of 2; pixels narrower than the Airy disc need more, because there the rule
+    interpolates.
     """
     for sampling in _SAMPLINGS:
         width = pixel * sampling
@@ -111,12 +100,7 @@ def sampling_for(pixel: float, tolerance: float) -> float:
 
 
 class Banded(eqx.Module):
-    """A banded matrix applied along the last axis, as a few dense products of narrow tiles.
-
-    Attributes:
-        tiles: `[window, tile]` blocks, float32.
-        starts: first input index of every tile's window.
-    """
+    """A banded matrix applied along the last axis: dense `[window, tile]` blocks, and each one's first input index."""
 
     tiles: tuple[Float[Array, "_ _"], ...]  # of different sizes
     starts: tuple[int, ...] = eqx.field(static=True)

@@ -38,10 +38,10 @@ class DoeRows(NamedTuple):
     """Rows of a DOE and of the wave that lights it; every array's first axis is the grid's y.
 
     Attributes:
-        coverage: `[y, x]` open share of every cell.
-        height_m: `[y, x]` DOE height, metres; None for a DOE without relief.
-        transmission: `[y, x]` complex transmission besides that of the height; None for 1.
-        source: what the source says of these rows (`sim.source`).
+        coverage: open share of every cell.
+        height_m: DOE height, metres, or None.
+        transmission: transmission besides that of the height, or None for 1.
+        source: rows of the source (`sim.source`).
     """
 
     coverage: Float[Array, "y x"]

@@ -33,8 +33,8 @@ class Cuts(NamedTuple):
         state: `[mask, segment]` 0, 1 or 2: the segment lies before, between or behind the two lines of that mask.
         low: `[mask, state]` offset in cells of the lowest mask pixel that a piece in that state sees.
         high: the same for the highest.
-        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's two lines, shift - |bias| and
-            shift + |bias|; modulo one cell, either may come first.
+        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's lines shift - |bias| and shift + |bias|;
+            modulo one cell, either may come first.
     """
 
     edges: Float[Array, " segment+1"]
@@ -45,11 +45,7 @@ class Cuts(NamedTuple):
 
 
 def cuts(shift: Float[Array, " mask"], bias: Float[Array, " mask"]) -> Cuts:
-    """Cut a cell where masks are shifted and their openings widened.
-
-    Args:
-        shift: displacement of every mask along this axis, in cells.
-        bias: how far every edge of an opening moves outward, in cells, between -1/2 and 1/2.
+    """Cut a cell where masks are shifted, and edges of their openings moved outward by `bias` (-1/2 to 1/2), in cells.
 
     A point of the wafer lies in the printed opening if any mask pixel within the bias of it (measured along x and along
     y) is open, or, for a negative bias, if all of them are: the square keeps the corners of rectangles square.
@@ -118,14 +114,10 @@ def point_moments(at_y: Float[Array, "part degree q"], at_x: Float[Array, "part 
 
 
 def moment_filter(degree: int, band: float) -> Float[np.ndarray, " tap"]:
-    """Weights on the cells -10 ... 10 from a moment's own whose far field is that of the moment.
+    """Weights on the cells -10 ... 10 from a moment's own whose far field is that of the moment of degree 1 or 2.
 
-    Args:
-        degree: 1 or 2.
-        band: highest |u| that matters, in waves per cell, below 1/2.
-
-    Least squares for (2q+1) (-i)^q j_q(pi u) / j_0(pi u) over the band; the weights are real, odd or even like their
-    degree, and have no effect on the axis, so that they leave the mean of a plate alone.
+    Least squares for (2q+1) (-i)^q j_q(pi u) / j_0(pi u) up to `band` waves per cell, below 1/2. The weights are real,
+    odd or even like their degree, and have no effect on the axis, so that they leave the mean of a plate alone.
     """
     u = np.linspace(0, band, 400)
     target = (2 * degree + 1) * spherical_jn(degree, np.pi * u) / spherical_jn(0, np.pi * u)

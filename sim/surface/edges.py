@@ -1,4 +1,4 @@
-"""What the edges of openings do besides lying where they lie: tilted walls and rounded corners."""
+"""Tilted walls and rounded corners: what edges of openings do besides their place."""
 
 from typing import NamedTuple
 
@@ -120,10 +120,8 @@ class _Crossings(NamedTuple):
     """The crossings of a mask's lines seen from each of four sides, in the cells where those sides lie.
 
     Attributes:
-        y: `[side]` middle of the area that rounding changes, in cells.
-        x: the same along x.
-        row: `[side]` segment there along y.
-        column: the same along x.
+        y: `[side]` middle of the area that rounding changes, in cells; `x` along x.
+        row: `[side]` segment there along y; `column` along x.
         odd: `[side, cell]` whether the mask is open there (closed, for gaps) and not on the other three sides.
         touching: `[side, cell]` whether two openings touch here at their corners.
     """
@@ -154,13 +152,10 @@ def _crossings(
 def _beside(
     along: Cuts, mask: Array, side: Int[np.ndarray, " side"], opening: Array, bias: Array, step: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Points `step` to one side of a mask's lines, in the cells where they lie.
+    """Points `step` to one side of a mask's lines in the cells where they lie, segments there, and indices of `STATES`.
 
-    An opening above its line (or a gap below it) begins at shift - bias, all others at shift + bias.
-
-    Returns:
-        their places in those cells, the segments there, and the entries of `STATES` of the mask below each line and
-        below both lines.
+    An opening above its line (or a gap below it) begins at shift - bias, all others at shift + bias. The indices are of
+    the mask below each line and below both lines.
     """
     upper = (side != opening) ^ (bias < 0)
     rank = along.line[mask]

@@ -35,14 +35,8 @@ def mask_states(
 ) -> Float[Array, "j i t t"]:
     """What is left open of one mask in each of its kinds of piece, for all cells of a tile.
 
-    Args:
-        state: the mask's pixels with a halo.
-        along_y: where its lines are along y.
-        along_x: where they are along x.
-        mask: its number.
-        bias: growth of openings; only its sign counts here.
-        kinds: the states along either axis.
-        plan: for the width of the halo.
+    `state` holds the mask's pixels with a halo; of `bias`, the growth of openings, only the sign counts; `kinds` are
+    the states along either axis.
     """
     cell, within = (np.array(part) for part in zip(*(divmod(kind, 2) for kind in kinds), strict=True))
 
@@ -62,8 +56,8 @@ def mask_states(
 def light_of(height: Float[Array, "p c"], rates: Float[Array, " w"]) -> Float[Array, "p 2 w c"]:
     """Transmission of every piece, real and imaginary part apart, so that all sums over pieces are real products.
 
-    One sine of the phase and of the phase plus a quarter, to 4e-6 like `sim.propagation.pupil.cis`: a single expression
-    without complex numbers compiles to a loop several times faster.
+    One sine of the phase and of the phase plus a quarter, to 4e-6 like `sim.propagation.pupil.cis`: without complex
+    numbers it compiles to a loop several times faster.
     """
     waves = height[:, None] * rates[None, :, None]
     waves = jnp.stack([waves + 0.25, waves], axis=1)

@@ -32,12 +32,12 @@ class FabricatedDoe(CellOptic):
         camera: lens, sensor and substrate. Its grid is that of the cells here: those of the DOE, or a whole number of
             parts of them where the sensor sees waves too oblique for moments.
         coverage: `[y, x]` open share of every cell.
-        transmission: `[wavelength, y, x]` complex transmission of every cell, without the chrome; its far field is
-            that of the DOE within `sim.surface.cell`'s accuracy, and its mean is the DOE's.
+        transmission: `[wavelength, y, x]` transmission of every cell without the chrome; its far field is the DOE's
+            within `sim.surface.cell`'s accuracy.
         means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other DOEs.
         wavelengths_m: vacuum wavelengths.
-        height_m: `[y, x]` height of every cell where that says all about the DOE: exactly as drawn. Its PSFs are then
-            those of the height map, to the last bit.
+        height_m: `[y, x]` height of every cell of a DOE exactly as drawn, whose PSFs are those of its height map, bit
+            for bit; otherwise None.
     """
 
     camera: Camera = eqx.field(static=True)

@@ -80,11 +80,7 @@ _MOST, _TRACED_REACH = 8, 3
 
 
 def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> TilePlan:
-    """What has to be computed for these errors; everything that may be, where they are not known yet (`traced`).
-
-    Raises:
-        InputError: masks lie off by more than the model looks.
-    """
+    """What has to be computed for these errors; everything that may be, where they are not known yet (`traced`)."""
     grid = camera.grid
     reach = _TRACED_REACH
     cut = corners = walls = True
@@ -171,11 +167,7 @@ def _blank_m(levels: Levels) -> Array:
 
 
 def require_possible(grid: Grid, process: Process, variation: Variation) -> None:
-    """Refuse errors that the model does not describe.
-
-    Raises:
-        InputError: naming the error, its bound and its value.
-    """
+    """Refuse errors that the model does not describe."""
     pitch_m, masks = grid.pitch_m, process.masks
     for name in [f.name for f in fields(Variation) if f.name not in SETTINGS] + ["repeats"]:
         value = getattr(variation, name)

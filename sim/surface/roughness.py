@@ -39,13 +39,9 @@ def cell_share(length: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def cell_roughness(grid: Grid, rms_m: Array | float, length_m: Array | float, seed: int) -> Float[Array, "y x"]:
-    """Mean height of every cell of a rough surface, metres.
+    """Mean height of every cell, metres, of a surface of that rms, of which cell means keep a part (`cell_share`).
 
-    Args:
-        grid: the cells.
-        rms_m: rms of the surface itself; cell means vary less (`cell_share`).
-        length_m: correlation length.
-        seed: seed of the noise; the same seed gives the same hills for every rms and length.
+    The same seed gives the same hills for every rms and length.
     """
     noise = np.random.default_rng(seed).standard_normal(grid.shape, np.float32)
     return _hills(noise, _positive(jnp.asarray(length_m, jnp.float32) / grid.pitch_m)) * rms_m
