@@ -104,16 +104,12 @@ class Sensor:
         return self.exposure * self.full_well_e / max(self.quantum_efficiency)
 
     def white_e(self, colours: int) -> Float[np.ndarray, "c 1 1"]:
-        """Electrons of a white of the scene in every colour, of which there are as many as quantum efficiencies, or 1."""
+        """Electrons of a white of the scene in every colour; there is one quantum efficiency, or one per colour."""
         given = len(self.quantum_efficiency)
         if given not in (1, colours):
             raise ValueError(f"`quantum_efficiency` must have 1 or {colours} entries, but got {given}")
         efficiency = np.broadcast_to(np.asarray(self.quantum_efficiency, np.float64), (colours,))
         return (self.white_photons * efficiency).astype(np.float32)[:, None, None]
-
-    def mean_e(self, light: Float[Array, "*batch c y x"]) -> Float[Array, "*batch c y x"]:
-        """Expected electrons, dark ones included, of light relative to white."""
-        return light * self.white_e(light.shape[-3]) + self.dark_e
 
     def white_raw(self, colours: int) -> Float[np.ndarray, "c 1 1"]:
         """Raw numbers of white above black, in every colour."""
@@ -149,17 +145,13 @@ def expose(light: Float[Array, "*batch c y x"], sensor: Sensor, key: Key[Array, 
         ValueError: a mosaic of other than three colours.
     """
     light = jnp.maximum(light, 0.0)
+    signal = light * sensor.white_e(light.shape[-3]) + sensor.dark_e if sensor.counts_photons else light
     # A photosite behind a filter draws its own noise, so the mosaic comes first.
-    seen = mosaic(_full_scale(light, sensor), sensor.pattern) if sensor.pattern else _full_scale(light, sensor)
+    seen = mosaic(signal, sensor.pattern) if sensor.pattern else signal
     share = _noisy(seen, sensor, key)
     steps = sensor.top - sensor.black_level
     raw = clipped(sensor.black_level + share * steps, 0.0, sensor.top)
     return raw if sensor.bits is None else rounded(raw)
-
-
-def _full_scale(light: Array, sensor: Sensor) -> Array:
-    """Expected electrons, or for noise on relative light that light."""
-    return sensor.mean_e(light) if sensor.counts_photons else light
 
 
 def _noisy(seen: Array, sensor: Sensor, key: Array) -> Array:

@@ -187,7 +187,7 @@ _tile_convolved = jax.jit(convolve)
 def convolve_tiled(
     image: Float[np.ndarray, "y x"], kernel: Float[np.ndarray, "*k ky kx"], border: Border, length: Window | None = None
 ) -> Float[np.ndarray, "*k v u"]:
-    """`convolve` of a frame too large for one transform, by overlap-save with tiles of up to `length` samples (y, x)."""
+    """`convolve` of a frame too large for one transform, by overlap-save with tiles of `length` samples (y, x)."""
     shape, window = (image.shape[0], image.shape[1]), (kernel.shape[-2], kernel.shape[-1])
     out = np.empty((*kernel.shape[:-2], *result_shape(shape, window, border)), np.float32)
     otf: Otf | None = None

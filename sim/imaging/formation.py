@@ -68,7 +68,7 @@ class Optics(eqx.Module):
         return self.psf.shape[-2], self.psf.shape[-1]
 
     def disc_px(self, depth_m: Depth, behind_m: Depth) -> Float[Array, ""] | float:
-        """Diameter in pixels of the shadow disc in the plane at `depth_m` of a point at `behind_m`, which is farther."""
+        """Diameter in pixels of the shadow disc in the plane at `depth_m` of a point at `behind_m`, farther away."""
         near, far, width = _known(depth_m), _known(behind_m), self.aperture_m * self.focal_m / self.pixel_m
         if near is None or far is None:
             return width * (1 / jnp.asarray(depth_m) - 1 / jnp.asarray(behind_m))
@@ -96,7 +96,7 @@ def _known(depth_m: Depth) -> float | None:
 
 
 def capture(
-    scene: Scene, optics: Optics | Prepared, model: Model, *, border: Border = "reflect", outside: Outside = "scene"
+    scene: Scene, optics: Optics, model: Model, *, border: Border = "reflect", outside: Outside = "scene"
 ) -> Float[Array, "c v u"]:
     """Light on the sensor, relative to a white scene through a lossless lens of the same aperture; no noise.
 

@@ -16,8 +16,6 @@ from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
-__all__ = ["SOILS", "Dirt"]
-
 # Reflectance in linear sRGB of three Munsell soil colours, from the renotation data (Newhall, Nickerson and Judd 1943;
 # xyY under illuminant C, Y over that of a perfect white), adapted to D65 by Bradford's transform.
 SOILS = {

@@ -27,8 +27,6 @@ from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
-__all__ = ["Fence", "Pattern"]
-
 Pattern = Literal["chain_link", "bars", "grid"]
 
 # Linear reflectances (estimates): zinc, twice as common as each of green plastic, black plastic and rust.

@@ -27,8 +27,6 @@ from sim.light import linear_from_srgb
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
-__all__ = ["MASK_FILES", "MaskFolder", "MaskPicture", "read_mask"]
-
 MASK_FILES = (".png", *TIFF_FILES)
 
 _MOST_PIXELS = 1 << 26

@@ -13,8 +13,6 @@ from sim.obstruction.parameters import Range, WithLimits
 from sim.obstruction.raindrop import Raindrop
 from sim.obstruction.view import CameraView
 
-__all__ = ["DirtRaindrop"]
-
 
 @dataclass(frozen=True)
 class DirtRaindrop(WithLimits):

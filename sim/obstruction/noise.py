@@ -12,8 +12,6 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_array
 
-__all__ = ["gradients", "layered_noise", "perlin"]
-
 _REACH = 4.0  # sigmas of the Gaussian
 
 

@@ -11,8 +11,6 @@ from fab.errors import InputError
 from sim.imaging.scene import Obstruction
 from sim.obstruction.view import CameraView
 
-__all__ = ["DEPTHS_M", "ObstructionKind", "Range", "WithLimits", "draw_from"]
-
 # A value is drawn uniformly from here to there; twice the same number is that number.
 Range = tuple[float, float]
 

@@ -33,8 +33,6 @@ from sim.imaging.scene import Obstruction
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
-__all__ = ["Drop", "Raindrop"]
-
 _WATER = 1.333
 _MOST_DROPS = 10_000
 

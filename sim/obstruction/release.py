@@ -21,8 +21,6 @@ from sim.obstruction.noise import gradients, perlin
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
-__all__ = ["ReleaseDirt", "ReleaseFence", "ReleaseRaindrop"]
-
 _CELLS = 8  # noise cells along each side of the release's tile
 _CELL_M = 64 * 3.7e-6 * 0.12 / 8e-3  # their width on the glass: 64 pixels of 3.7 um at 12 cm behind 8 mm
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["CameraView"]
-
 
 @dataclass(frozen=True)
 class CameraView:
@@ -34,11 +32,6 @@ class CameraView:
     def pixel_at_m(self, depth_m: float) -> float:
         """Width of a pixel's direction at `depth_m`, metres."""
         return 1 / self.pixels(1.0, depth_m)
-
-    def extent_m(self, depth_m: float) -> tuple[float, float]:
-        """Height and width (y, x) of the whole frame at `depth_m`, metres."""
-        y, x = (n * self.pixel_at_m(depth_m) for n in self.shape)
-        return y, x
 
     def slopes(self) -> tuple[Float[np.ndarray, "y 1"], Float[np.ndarray, "1 x"]]:
         """Tangents (y, x) of every row's and column's direction, float32, zero on the axis."""

@@ -8,8 +8,6 @@ import numpy as np
 from fab.figure import LINE, SERIES, evenly_spaced, length_text
 from sim.camera import Colour
 
-__all__ = ["colour_label", "depth_positions", "line_colours", "wavelength_order"]
-
 _BLUE, _RED, _GREEN = SERIES[:3]
 
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     import sim.psf_bank
     import sim.transfer
 
-__all__ = ["plot_encircled", "plot_mtf"]
-
 _MOST_DEPTHS = 3
 _MOST_COLOURS = 6
 _RADII = 96

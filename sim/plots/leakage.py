@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     import sim.psf_bank
     import sim.surface.leakage
 
-__all__ = ["plot_split"]
-
 _SIDE, _MOST_ROWS = 2.2, 4
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     Bank = sim.psf_bank.PsfBank
 
-__all__ = ["plot_psfs"]
-
 _MOST_COLUMNS = 6
 _MOST_ROWS = 6
 # Below the level that the dimmest fiftieth of the light does not exceed, everything is black.

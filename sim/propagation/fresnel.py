@@ -47,15 +47,10 @@ class DirectPath(eqx.Module):
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
         field = pupil(rows, shared) * self.lens
         spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
-        kept = self.gather_length
+        kept = self.gather.starts[-1] + self.gather.tiles[-1].shape[0]  # samples per axis that the pixels use
         image = jnp.roll(jnp.fft.ifft2(spectrum), (-self.first, -self.first), (0, 1))[:kept, :kept]
         intensity = image.real**2 + image.imag**2
         return self.gather(self.gather(intensity).T).T
-
-    @property
-    def gather_length(self) -> int:
-        """Samples per axis that the pixels use."""
-        return self.gather.starts[-1] + self.gather.tiles[-1].shape[0]
 
 
 def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> float:
@@ -74,7 +69,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     if nyquist > camera.focal_length_m * (1 + 1e-9):
         limit = wavelength_m * camera.focal_length_m / camera.aperture_m
         raise InputError(
-            "optics.propagation",
+            "propagation",
             f"the direct path needs N pitch^2 / wavelength (eq. 6) of at most the focal length, "
             f"{camera.focal_length_m * 1e3:.4g} mm",
             f"{nyquist * 1e3:.4g} mm at {wavelength_m * 1e9:.4g} nm with N = {cells} and {pitch * 1e6:.4g} um",
@@ -86,7 +81,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     kept = 2 * int(np.ceil(half + width + 8))
     if 2 * half > 3 * cells:
         raise InputError(
-            "sensor.window",
+            "camera.window",
             f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm",
             f"{camera.window * camera.pixel_m * 1e3:.4g} mm",
             "Use a smaller window or the far-field path.",

@@ -1,14 +1,12 @@
 """Tilted walls and rounded corners: what edges of openings do besides their place."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim.surface.cell import Cuts, axis_moments, axis_values, plane_moments, point_moments
-from sim.surface.pieces import STATES, Pair, summed, turned, weighted
+from sim.surface.pieces import STATES, Pair, summed, turned
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
 
@@ -86,15 +84,23 @@ def corners(
     shared = _shared_corners(along_y, along_x, bias, radius)
     segments_x = along_x.state.shape[1]
 
-    def looked_at(mask_and_opening: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def seen_from_sides(mask_and_opening: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+        """Place (y, x) and amount `[side, cell]` of odd openings (or gaps) at a mask's crossings, and the light there."""
         k, opening = mask_and_opening
-        crossing = _crossings(kinds[k], along_y, along_x, k, opening, bias[k], _CORNER_MIDDLE * radius)
-        amount = crossing.odd * jnp.where(crossing.touching, apart[k], 1.0)
-        return crossing.y, crossing.x, amount, light[crossing.row * segments_x + crossing.column]
+        step, own_kinds = _CORNER_MIDDLE * radius, kinds[k]
+        y, row, low_y, outer_y = _beside(along_y, k, _SIDE_Y, opening, bias[k], step)
+        x, column, low_x, outer_x = _beside(along_x, k, _SIDE_X, opening, bias[k], step)
+        own, other_y, other_x, far = (
+            own_kinds[low_y + (_SIDE_Y ^ dy), low_x + (_SIDE_X ^ dx)] for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
+        )
+        around = [own_kinds[outer_y + dy, outer_x + dx] for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
+        touching = (around[0] == around[1]) & (around[2] == around[3]) & (around[0] != around[2])
+        odd = (own == opening) & (own != other_y) & (own != other_x) & (own != far)
+        return y, x, odd * jnp.where(touching, apart[k], 1.0), light[row * segments_x + column]
 
     # A loop, because its results exist: fused into what follows, they would be computed again for every colour.
     masks, openings = np.indices((plan.masks, 2)).reshape(2, -1)
-    ys, xs, amounts, found = jax.lax.map(looked_at, (masks, openings > 0))
+    ys, xs, amounts, found = jax.lax.map(seen_from_sides, (masks, openings > 0))
     total, earlier = jnp.zeros(()), []
     for k in range(plan.masks):
         # What the masks before this one change on each side, and with it the light that this one finds there.
@@ -109,44 +115,11 @@ def corners(
             gain = Pair(jnp.cos(phase) - 1, jnp.sin(phase)).each(lambda part, a=amounts[at]: part[:, None] * a[:, None])
             gained = changed.times(gain).times(Pair(found[at, :, 0], found[at, :, 1]))
             points = point_moments(axis_values(ys[at], plan.parts), axis_values(xs[at], plan.parts))
-            total = total + jnp.stack([weighted(points, gained.real), weighted(points, gained.imaginary)], axis=1)
+            total = total + jnp.stack([summed(points, gained.real), summed(points, gained.imaginary)], axis=1)
             gains.append(gain)
         # On one side a cell has an odd opening or an odd gap of this mask, not both.
         earlier.append(gains[0].plus(gains[1], jnp.ones(())))
     return (1 - np.pi / 4) * radius**2 * total
-
-
-class _Crossings(NamedTuple):
-    """The crossings of a mask's lines seen from each of four sides, in the cells where those sides lie.
-
-    Attributes:
-        y: `[side]` middle of the area that rounding changes, in cells; `x` along x.
-        row: `[side]` segment there along y; `column` along x.
-        odd: `[side, cell]` whether the mask is open there (closed, for gaps) and not on the other three sides.
-        touching: `[side, cell]` whether two openings touch here at their corners.
-    """
-
-    y: Array
-    x: Array
-    row: Array
-    column: Array
-    odd: Array
-    touching: Array
-
-
-def _crossings(
-    kinds: Bool[Array, "j i c"], along_y: Cuts, along_x: Cuts, mask: Array, opening: Array, bias: Array, step: Array
-) -> _Crossings:
-    """Crossings where an odd opening (or an odd gap) may lie."""
-    y, row, low_y, outer_y = _beside(along_y, mask, _SIDE_Y, opening, bias, step)
-    x, column, low_x, outer_x = _beside(along_x, mask, _SIDE_X, opening, bias, step)
-    own, other_y, other_x, far = (
-        kinds[low_y + (_SIDE_Y ^ dy), low_x + (_SIDE_X ^ dx)] for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
-    )
-    corners = [kinds[outer_y + dy, outer_x + dx] for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
-    touching = (corners[0] == corners[1]) & (corners[2] == corners[3]) & (corners[0] != corners[2])
-    odd = (own == opening) & (own != other_y) & (own != other_x) & (own != far)
-    return _Crossings(y, x, row, column, odd, touching)
 
 
 def _beside(

@@ -102,15 +102,8 @@ class Pair(NamedTuple):
         return Pair(work(self.real), work(self.imaginary))
 
 
-def weighted(weights: Float[Array, "m ..."], values: Float[Array, "... w c"]) -> Float[Array, "m w c"]:
-    """Sum over pieces (or lines, or crossings) of values times each row of weights."""
-    rows, rest = weights.shape[0], values.shape[-2:]
+def summed(weights: Float[Array, "m ..."], values: Float[Array, "..."]) -> Float[Array, "m ..."]:
+    """Sum over pieces (or lines, or crossings), the first axes of both, of values times each row of weights."""
+    rows, rest = weights.shape[0], values.shape[weights.ndim - 1 :]
     product = jnp.dot(weights.reshape(rows, -1), values.reshape(-1, np.prod(rest)), precision=PRECISION)
-    return product.reshape(rows, *rest)
-
-
-def summed(weights: Float[Array, "m ..."], light: Float[Array, "... 2 w c"]) -> Float[Array, "m 2 w c"]:
-    """The same for both parts of light."""
-    rows, rest = weights.shape[0], light.shape[-3:]
-    product = jnp.dot(weights.reshape(rows, -1), light.reshape(-1, np.prod(rest)), precision=PRECISION)
     return product.reshape(rows, *rest)

@@ -6,10 +6,8 @@
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Complex, Float, UInt8
 
 from fab.grid import Grid
@@ -23,6 +21,7 @@ from sim.source import SourceMap
 from sim.surface.relief import plan_of, relief_of, require_possible
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
+from sim.tracing import is_traced
 
 
 class FabricatedDoe(CellOptic):
@@ -87,7 +86,7 @@ def as_fabricated(
     """
     levels = process.levels
     lines = wavelengths_m or tuple(dict.fromkeys(w for c in camera.colours for w in c.wavelengths_m))
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(variation))
+    traced = is_traced(variation)
     rates = jnp.asarray([camera.waves_per_metre(w) for w in lines], jnp.float32)
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
@@ -100,30 +99,23 @@ def as_fabricated(
     etched = planes(level_map, levels)
     for particle in variation.particles:
         _keep_off(etched, particle, camera.grid)
-    widths = _opening_widths(etched) if traced or variation.etch_lag else None
+    widths = None
+    if traced or variation.etch_lag:  # of the opening that a pixel belongs to: the shorter of its runs, at most 255
+        widths = np.stack([np.minimum(run_lengths(plane), run_lengths(plane.T).T) for plane in etched])
     rough = None
     if traced or variation.roughness_m:
         rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
     relief = relief_of(process, variation, rough)
-    transmission, means = transmission_of(_packed(etched), widths, relief, rates, plan)
-    loss = _subcell_loss(variation, camera.grid.pitch_m, rates, traced)
-    if loss is not None:
-        transmission, means = transmission * loss[:, None, None], means * loss[:, None, None]
-    grid = _refined(camera.grid, plan.parts)
+    packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
+    transmission, means = transmission_of(packed, widths, relief, rates, plan)
+    if traced or variation.roughness_m:  # amplitude left after the roughness within a cell
+        rest = 1.0 - cell_share(jnp.asarray(variation.correlation_m, jnp.float32) / camera.grid.pitch_m)
+        loss = jnp.exp(-0.5 * rest * (2 * jnp.pi * rates * variation.roughness_m) ** 2)[:, None, None]
+        transmission, means = transmission * loss, means * loss
+    (ny, nx), parts = camera.grid.shape, plan.parts
+    grid = camera.grid if parts == 1 else Grid((ny * parts, nx * parts), camera.grid.pitch_m / parts)
     coverage = _coverage(grid, camera, variation, traced)
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, means, lines)
-
-
-def _refined(grid: Grid, parts: int) -> Grid:
-    return grid if parts == 1 else Grid((grid.shape[0] * parts, grid.shape[1] * parts), grid.pitch_m / parts)
-
-
-def _packed(etched: UInt8[np.ndarray, "mask y x"]) -> UInt8[np.ndarray, "y x"]:
-    """All masks of a pixel in one number, bit k for mask k."""
-    out = np.zeros(etched.shape[1:], np.uint8)
-    for mask, plane in enumerate(etched):
-        out |= plane << np.uint8(mask)
-    return out
 
 
 def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: Grid) -> None:
@@ -133,20 +125,6 @@ def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: G
     y, x = grid.axis_m("y")[rows] - particle.y_m, grid.axis_m("x")[columns] - particle.x_m
     inside = np.hypot(y[:, None], x[None, :]) <= particle.radius_m
     etched[particle.mask][np.ix_(rows, columns)] &= ~inside
-
-
-def _opening_widths(etched: UInt8[np.ndarray, "mask y x"]) -> UInt8[np.ndarray, "mask y x"]:
-    """Width in pixels of the opening that every open pixel belongs to: the shorter of its runs, at most 255."""
-    return np.stack([np.minimum(run_lengths(plane), run_lengths(plane.T).T) for plane in etched])
-
-
-def _subcell_loss(variation: Variation, pitch_m: float, rates: Array, traced: bool) -> Array | None:
-    """Amplitude left after the roughness within a cell."""
-    if not traced and not variation.roughness_m:
-        return None
-
-    rest = 1.0 - cell_share(jnp.asarray(variation.correlation_m, jnp.float32) / pitch_m)
-    return jnp.exp(-0.5 * rest * (2 * jnp.pi * rates * variation.roughness_m) ** 2)
 
 
 def _coverage(grid: Grid, camera: Camera, variation: Variation, traced: bool) -> Array:

@@ -1,7 +1,6 @@
 """What all tiles of a plate share: a process and its errors as the numbers that the physics needs."""
 
 from dataclasses import fields
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -11,7 +10,6 @@ from jaxtyping import Array, Float
 
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.levels import Levels
 from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
@@ -25,7 +23,7 @@ _BAND = 0.46  # waves per cell up to which second moments and their filters do
 
 
 class EtchParameters(NamedTuple):
-    """What all tiles share; leaves that are None are not needed.
+    """What all tiles share.
 
     Attributes:
         depth_m: `[mask]` depth of every etch.
@@ -94,21 +92,12 @@ def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: 
         if reach > _MOST + 2:
             rule = f"masks may lie off by at most {_MOST} cells, {format_length(_MOST * grid.pitch_m)}"
             raise InputError("variation.overlay", rule, format_length(float(shifts.max())), "Align better.")
-    needed = _widest_band(camera, shortest_m)
+    # Highest wave number on the sensor, in waves per DOE cell, with a margin for its last pixels.
+    needed = (camera.window / 2 + 1) * camera.pixel_m * grid.pitch_m / (shortest_m * camera.sensor_distance_m)
     parts = int(np.ceil(needed / _BAND - 1e-9)) if cut else 1
     return TilePlan(
         grid, process.masks, process.die_m, parts, reach, min(needed / parts, _BAND), cut, corners, walls
     )  # fmt: skip
-
-
-def _widest_band(camera: Camera, wavelength_m: float) -> float:
-    """Highest wave number on the sensor, in waves per DOE cell, with a margin for its last pixels."""
-    half = (camera.window / 2 + 1) * camera.pixel_m
-    return half * camera.grid.pitch_m / (wavelength_m * camera.sensor_distance_m)
-
-
-def _per_mask(value: tuple[float | Array, ...], masks: int) -> Array:
-    return jnp.asarray(jnp.stack([jnp.asarray(v, jnp.float32) for v in value]) if value else jnp.zeros(masks))
 
 
 def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.ndarray:
@@ -127,8 +116,11 @@ def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.n
 
 def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x"] | None = None) -> EtchParameters:
     """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
-    masks = process.masks
-    per_mask = partial(_per_mask, masks=masks)
+    masks, levels = process.masks, process.levels
+
+    def per_mask(value: tuple[float | Array, ...]) -> Array:
+        return jnp.asarray(jnp.stack([jnp.asarray(v, jnp.float32) for v in value]) if value else jnp.zeros(masks))
+
     repeats = np.asarray(variation.repeats or (0,) * masks)
     nominal = np.asarray(process.depths_m())
     scale = (1.0 + variation.common_depth_scale) * (1.0 + per_mask(variation.depth_scale))
@@ -155,15 +147,10 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
         bowl=jnp.asarray(variation.radial_nonuniformity, jnp.float32) / radius**2,
         tilt=tilt / radius,
         rough_m=rough_m,
-        height_m=_blank_m(process.levels),
+        height_m=jnp.float32(levels.count - 1) * jnp.float32(levels.step_m)
+        if levels.is_binary
+        else jnp.asarray(levels.total_m, jnp.float32),
     )
-
-
-def _blank_m(levels: Levels) -> Array:
-    """Height of the blank glass above the deepest floor."""
-    if levels.is_binary:
-        return jnp.float32(levels.count - 1) * jnp.float32(levels.step_m)
-    return jnp.asarray(levels.total_m, jnp.float32)
 
 
 def require_possible(grid: Grid, process: Process, variation: Variation) -> None:
