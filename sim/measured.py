@@ -1,14 +1,13 @@
 """Measured PSFs: from the frames of a camera to one image with known noise.
 
-A lab photographs a point source through the plate: several exposures, each with a dark frame. Here the frames
-(`sim.frames`) are freed of their dark level, merged to one image of high dynamic range, freed of the background, and
-cut to a window round the light. Nothing is ever interpolated: the window moves by whole pixels, what remains of the
-offset is told, and the model moves instead. Pixels that say nothing (saturated in every exposure, another colour of a
-mosaic, beyond the frame's edge) stay, marked as not valid.
+Several exposures of a point source through the plate, each with a dark frame (`sim.frames`), are freed of their dark
+level, merged to one image of high dynamic range, freed of the background, and cut to a window round the light. Nothing
+is interpolated: the window moves by whole pixels and the model moves by the rest. Pixels without information (saturated
+in every exposure, another colour of a mosaic, beyond the frame's edge) are marked as not valid.
 
 Noise. A pixel of one exposure has the variance read² + dark's + step² / 12 + signal / gain, in counts². Exposures are
 weighted by its inverse, taken from a first estimate of the signal, so the merged variance is `floor + slope * signal`
-with known coefficients, whatever the signal is thought to be; a fit can use its model's.
+with known coefficients, for any signal; a fit can use its model's.
 """
 
 from collections.abc import Sequence

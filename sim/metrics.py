@@ -5,7 +5,7 @@ None changes a PSF's energy. `jax.grad`, `jit` and `vmap` go through all but the
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +18,7 @@ from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour, SpectralLine
 from sim.optic import CellOptic
-from sim.tracing import is_traced, stacked, total
+from sim.tracing import is_traced, total
 
 Psf = Float[np.ndarray, "y x"] | Float[Array, "y x"]
 Number = float | Float[Array, ""]
@@ -280,8 +280,8 @@ class MetricInputs:
 
     def concentration_bound(self, colour: int) -> Any:
         """Square of the largest far-spot energy, or None without a far depth."""
-        far = [d for d, depth in enumerate(self.depths_m) if depth not in self.near_m]
-        return stacked([self.far_spot(colour, d) for d in far]).max() ** 2 if far else None
+        far = [self.far_spot(colour, d) for d, depth in enumerate(self.depths_m) if depth not in self.near_m]
+        return reduce(jnp.maximum if is_traced(far) else max, far) ** 2 if far else None
 
 
 @dataclass(frozen=True)

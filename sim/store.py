@@ -1,9 +1,8 @@
 """Height maps, PSF banks and pictures as OpenEXR files; the only importer of OpenEXR.
 
-* The first scan line is the highest y, so a viewer shows +y up. Arrays here have row 0 at the lowest y; rows are
-  turned over on the way out and on the way in, and the round trip is exact.
-* Channels are float32: `height` in metres; for a bank one channel per depth and colour, `z50mm.red`, in
-  energy per pixel per unit power incident on the clear aperture.
+* The first scan line is the highest y, so a viewer shows +y up; arrays here have row 0 at the lowest y.
+* Channels are float32: `height` in metres; for a bank one channel per depth and colour, `z50mm.red`, in energy per
+  pixel per unit power incident on the clear aperture.
 * Lengths and angles are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because EXR's own
   number attributes are float32.
 * A digest of pixels and lengths rides along as the text `sha256` and is checked on reading (EXR itself leaves
@@ -11,8 +10,7 @@
 * The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`).
 
 A PSF measured elsewhere (channels R, G, B, or one channel of any name; half, float or integer) is read as a bank of one
-depth. Its values are whatever its author wrote: counts, as a rule, not energies, and perhaps negative where a
-background was taken off.
+depth with the values its author wrote: as a rule counts, perhaps negative where a background was taken off.
 """
 
 import contextlib
@@ -56,13 +54,6 @@ class StoredHeight(NamedTuple):
     metadata: dict[str, str]
 
 
-class _Picture(NamedTuple):
-    """Channels `[y, x]` (row 0 at the lowest y) and text attributes of an EXR file."""
-
-    channels: dict[str, np.ndarray]
-    texts: dict[str, str]
-
-
 def write_height(
     path: str | Path,
     height_m: Float[np.ndarray, "y x"],
@@ -93,15 +84,15 @@ def read_height(path: str | Path) -> StoredHeight:
         InputError: the file is missing, no whole EXR file, has no channel `height`, or holds a height that is
             negative or not finite.
     """
-    picture = _read(Path(path))
-    if "height" not in picture.channels:
+    channels, texts = _read(Path(path))
+    if "height" not in channels:
         raise InputError(
             str(path),
             "a height map must have a channel named height, in metres",
-            f"the channels {', '.join(sorted(picture.channels))}",
+            f"the channels {', '.join(sorted(channels))}",
             "Give a height map, or rename its channel.",
         )
-    height = picture.channels["height"]
+    height = channels["height"]
     if not (np.isfinite(height).all() and height.min() >= 0):
         bad = np.argwhere(~(np.isfinite(height) & (height >= 0)))
         y, x = (int(i) for i in bad[0])
@@ -111,7 +102,6 @@ def read_height(path: str | Path) -> StoredHeight:
             f"{height[y, x]:.6g} m at row {y}, column {x} ({len(bad)} such pixels)",
             "Measure heights from the deepest floor upward, or write the file again.",
         )
-    texts = dict(picture.texts)
     pitch, aperture = (
         _length(path, key, texts.pop(key)) if key in texts else None for key in ("pitch_m", "aperture_m")
     )
@@ -162,17 +152,21 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
     """
     from sim.psf_bank import PsfBank
 
-    picture = _read(Path(path))
-    for name, pixels in picture.channels.items():
+    channels, texts = _read(Path(path))
+    for name, pixels in channels.items():
         if not np.isfinite(pixels).all():
             raise InputError(
                 f"{path}: channel {name}", "a PSF must be finite", "NaN or infinity", "Write the file again."
             )
-    if _BANK not in picture.texts:
-        colours, stored = _measured_colours(path, picture), _given_pixel(path, pixel_m)
-        energy = np.stack([picture.channels[c] for c in colours])[:, None]
+    if _BANK not in texts:
+        colours = _measured_colours(path, channels)
+        if pixel_m is None:
+            rule = "the pixel pitch of a PSF from another program must be given"
+            raise InputError(str(path), rule, "none", "Give the pixel pitch (after binning).")
+        stored = _length(path, "pixel pitch", pixel_m)
+        energy = np.stack([channels[c] for c in colours])[:, None]
         return PsfBank(energy, colours, (float(depth_m),), stored)
-    colours, depths, stored, field = _bank_description(path, picture.texts[_BANK])
+    colours, depths, stored, field = _bank_description(path, texts[_BANK])
     if pixel_m is not None and not np.isclose(pixel_m, stored, rtol=1e-6, atol=0):
         raise InputError(
             str(path),
@@ -181,12 +175,12 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
             "Leave it out: the file knows it.",
         )
     names = [[_channel_name(depth, colour) for depth in depths] for colour in colours]
-    missing = [name for row in names for name in row if name not in picture.channels]
+    missing = [name for row in names for name in row if name not in channels]
     if missing:
         raise InputError(
             str(path), "every PSF of the bank must be there", f"no channel {missing[0]}", "Write the file again."
         )
-    energy = np.stack([np.stack([picture.channels[name] for name in row]) for row in names])
+    energy = np.stack([np.stack([channels[name] for name in row]) for row in names])
     return PsfBank(energy, colours, depths, stored, field)
 
 
@@ -209,8 +203,7 @@ def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[
 
 def read_picture(path: str | Path) -> tuple[dict[str, Float[np.ndarray, "y x"]], dict[str, str]]:
     """Read the channels `[y, x]` of a picture by name, and its text attributes; see `read_height` for errors."""
-    picture = _read(Path(path))
-    return picture.channels, picture.texts
+    return _read(Path(path))
 
 
 def _channel_name(depth_m: float, colour: str) -> str:
@@ -237,8 +230,8 @@ def _bank_description(
     return colours, depths, _length(path, f"{_BANK}.pixel_m", pixel), (y, x)
 
 
-def _measured_colours(path: str | Path, picture: _Picture) -> tuple[str, ...]:
-    names = set(picture.channels)
+def _measured_colours(path: str | Path, channels: Mapping[str, Any]) -> tuple[str, ...]:
+    names = set(channels)
     if {"R", "G", "B"} <= names:
         return ("R", "G", "B")
     without_alpha = sorted(names - {"A"})
@@ -250,13 +243,6 @@ def _measured_colours(path: str | Path, picture: _Picture) -> tuple[str, ...]:
         f"the channels {', '.join(sorted(names))}",
         "Keep one layer of the picture.",
     )
-
-
-def _given_pixel(path: str | Path, pixel_m: float | None) -> float:
-    if pixel_m is None:
-        rule = "the pixel pitch of a PSF from another program must be given"
-        raise InputError(str(path), rule, "none", "Give the pixel pitch (after binning).")
-    return _length(path, "pixel pitch", pixel_m)
 
 
 def _length(path: str | Path, key: str, text: object) -> float:
@@ -296,7 +282,8 @@ def _digest(pixels: Mapping[str, np.ndarray], texts: Mapping[str, str]) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> _Picture:
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Channels `[y, x]` (row 0 at the lowest y) and text attributes of an EXR file."""
     import OpenEXR
 
     try:
@@ -327,7 +314,7 @@ def _read(path: Path) -> _Picture:
             "a file that has changed since",
             f"Restore the file; if it was edited on purpose, remove its attribute {_DIGEST}.",
         )
-    return _Picture({k: np.ascontiguousarray(v[::-1], np.float32) for k, v in pictures.items()}, texts)
+    return {k: np.ascontiguousarray(v[::-1], np.float32) for k, v in pictures.items()}, texts
 
 
 def _window_shape(path: Path, header: dict[str, Any]) -> tuple[int, int]:

@@ -1,17 +1,16 @@
 """Linear convolution with a PSF by real FFTs, without wrap-around.
 
 A sample of the result is out[i] = sum over k of kernel[k] · image[i - (k - c)] with c = (n - 1) // 2 for a window of n
-samples. **An odd window** has the chief ray on the centre of its middle pixel: c is that pixel and the result is
-registered with the image. **An even window** has it on the corner between the four middle pixels: c is the lower one,
-so the result lies half a pixel toward +y and +x of the image. Where pixels must match, use odd windows.
+samples. **An odd window** has the chief ray on the centre of its middle pixel, c, and the result is registered with the
+image. **An even window** has it on the corner between the four middle pixels, of which c is the lower one, so the
+result lies half a pixel toward +y and +x of the image. Where pixels must match, use odd windows.
 
-What lies beyond the image is said by a border: `reflect` mirrors the image about its outermost samples, `edge` repeats
-them, and `own` invents nothing: the image is taken to bring its margin along and the result is smaller, by n - 1.
+Beyond the image the border `reflect` mirrors it about its outermost samples and `edge` repeats them; with `own` the
+image is taken to bring its margin along and the result is smaller, by n - 1.
 
-The transform is as long as the image with its margins, not as the full convolution: what wraps around falls on
-samples that are cut off anyway. And it is done axis by axis, so that nothing is transformed that is not needed: along x
-only the rows that there are, before a mirror or zeros lengthen them along y, and on the way back only the rows that are
-kept. That saves a fifth of the two-dimensional transforms. Spectra are `[fx, fy]`, with half the frequencies along x.
+The transform is as long as the image with its margins, not as the full convolution: what wraps around falls on samples
+that are cut off. It is done axis by axis, along x only for the rows that there are, and back only for the rows that are
+kept, which saves a fifth of the two-dimensional transforms. Spectra are `[fx, fy]`, half the frequencies along x.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,21 +1,17 @@
 """Things close to the camera that cover part of its view, each drawn at random from physical parameters.
 
     view        the frame: eq. 11 of the paper, sizes of near things in pixels
-    parameters  ranges to draw from, their checks, and what a kind of obstruction is
+    parameters  ranges to draw from, their limits, and what a kind of obstruction is
     noise       gradient noise
     fence       chain-link, bars and grids of round wire
-    raindrop    drops of water that refract the scene
+    raindrop    drops of water that refract the scene; dirt or drops by the toss of a coin
     dirt        clumps of soil
-    mixed       dirt or raindrops by the toss of a coin
     release     the three with the numbers of the paper's public code
     folder      masks out of a user's folder
 
-A kind is a frozen dataclass of SI parameters; `kind.draw(rng, view, background)` gives an `Obstruction` as a pinhole
-would see it: sharp, in linear light, at a depth. Blur is left to the PSF. Lengths are those of the thing itself, so a
-kind looks larger the nearer it is drawn. The same state of the generator gives the same bytes.
-
-    view = View((512, 512), pixel_m=3.7e-6, focal_m=8e-3)
-    Dirt().draw(np.random.default_rng(0), view, background)
+A kind is a frozen dataclass of SI parameters, lengths being those of the thing itself; `kind.draw(rng, view,
+background)` gives an `Obstruction` as a pinhole would see it: sharp, in linear light, at a depth. Blur is left to the
+PSF. The same state of the generator gives the same bytes.
 """
 
 from collections.abc import Mapping
@@ -24,9 +20,8 @@ from types import MappingProxyType
 from sim.obstruction.dirt import Dirt
 from sim.obstruction.fence import Fence
 from sim.obstruction.folder import MaskFolder
-from sim.obstruction.mixed import DirtRaindrop
 from sim.obstruction.parameters import ObstructionKind
-from sim.obstruction.raindrop import Raindrop
+from sim.obstruction.raindrop import DirtRaindrop, Raindrop
 from sim.obstruction.release import ReleaseDirt, ReleaseFence, ReleaseRaindrop
 from sim.obstruction.view import CameraView
 

@@ -82,7 +82,8 @@ class Dirt(WithLimits):
         )
         field = layered_noise(rng, view.shape, cell, octaves=self.octaves, persistence=self.persistence, blur=blur)
         mask = layer(field, draw_from(rng, self.coverage), edge) * np.float32(draw_from(rng, self.opacity))
-        grain = 1 + self.grain * _unit(layered_noise(rng, view.shape, cell / 3, octaves=5, persistence=0.7))
+        texture = layered_noise(rng, view.shape, cell / 3, octaves=5, persistence=0.7)
+        grain = 1 + self.grain * (texture / max(float(np.std(texture)), 1e-12))
         radiance = np.clip(self.soil(rng)[:, None, None] * grain, 0, 1)
         return Obstruction(mask, radiance, depth_m)
 
@@ -101,7 +102,3 @@ def layer(field: Float[np.ndarray, "y x"], coverage: float, edge: float) -> Floa
     slope = np.sqrt(np.mean(np.square(np.diff(field, axis=0))) + np.mean(np.square(np.diff(field, axis=1))))
     inward = np.maximum(field - np.float32(threshold), 0) / np.float32(max(slope, 1e-12) * max(edge, 0.5))
     return -np.expm1(-inward)
-
-
-def _unit(field: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
-    return field / max(float(np.std(field)), 1e-12)

@@ -1,18 +1,15 @@
-"""Raindrops on a windshield or a cover glass: small lenses that show the whole surroundings, inverted.
+"""Raindrops on a windshield or cover glass: small lenses that show the whole surroundings, inverted.
 
 The paper (section 3.2): a half disc joined to half an oval along the airflow, showing a larger and higher region of the
-scene as a fish-eye lens does, at 5 to 12 cm, in random number and place. Here a drop is a water lens on tilted glass,
-and what a pixel shows follows from the law of refraction:
+scene as a fish-eye lens does, at 5 to 12 cm, in random number and place. Here a drop is a water lens on tilted glass:
 
 * A drop's outside is a spherical cap with the given contact angle, drawn out to the oval along the airflow.
-* A ray from the camera passes the glass (plane and parallel, so glass itself turns nothing), enters the water at the
-  glass and leaves it at the cap, refracted by Snell's law in vector form at both faces; rays across one drop are taken
-  parallel. Without tilt, at the height r s of the cap's sphere of radius r, that is asin(n s) - asin(s) towards the
-  axis: the image is inverted and spans asin(n sin t) - t to either side for a contact angle t. (K. Garg and S. Nayar,
-  "Photometric model of a rain drop", 2003, do so for a falling drop.)
+* A ray from the camera passes the plane glass unturned, enters the water and leaves it at the cap, refracted by Snell's
+  law in vector form; rays across one drop are taken parallel. Without tilt, at the height r s of the cap's sphere of
+  radius r, that is asin(n s) - asin(s) towards the axis: the image is inverted and spans asin(n sin t) - t to either
+  side for a contact angle t. (K. Garg and S. Nayar, "Photometric model of a rain drop", 2003, for a falling drop.)
 * Glass that leans back, as a windshield does, throws steep rays at the upper part back into the drop, which is dark
-  there, and the lower part looks upwards: at 60 degrees half of a drop is left, and looks 5 to 12 degrees up. (Of small
-  angles nothing is left on the average: the mean slope of a surface that begins and ends on the glass is zero.)
+  there, and the lower part looks upwards: at 60 degrees half of a drop is left, and looks 5 to 12 degrees up.
 * The cap passes the share of light that Fresnel's equations give; the rest, and all of it beyond the critical angle, is
   light from elsewhere, which is taken as a share (`rim`) of the picture's mean.
 
@@ -21,7 +18,7 @@ A camera sees a few degrees and a drop the whole front: the picture stands in fo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import cos, pi, radians, sin
 from typing import ClassVar, NamedTuple
 
@@ -30,6 +27,7 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
 from sim.imaging.scene import Obstruction
+from sim.obstruction.dirt import Dirt
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
@@ -112,7 +110,10 @@ class Raindrop(WithLimits):
             if number == _MOST_DROPS:
                 break
             y, x = rng.uniform(0, 1, 2) * sides - reach - 0.5
-            found = _with(found, self.drop(rng, float(y), float(x), pixel_m, airflow), view)
+            drop = self.drop(rng, float(y), float(x), pixel_m, airflow)
+            seen = all(part.start < part.stop for part in drop.window(view))
+            if seen and not any(drop.touches(old) for old in found):
+                found.append(drop)
         if not any(drop.centred(view) for drop in found):
             y, x = rng.uniform(-0.5, np.array(view.shape) - 0.5)
             own = self.drop(rng, float(y), float(x), pixel_m, airflow)
@@ -263,7 +264,26 @@ def _refract(ray: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], ratio:
     return ratio * ray + (np.sqrt(1 - ratio**2 * (1 - cosine**2)) - ratio * cosine) * normal
 
 
-def _with(drops: list[Drop], new: Drop, view: CameraView) -> list[Drop]:
-    rows, columns = new.window(view)
-    seen = rows.start < rows.stop and columns.start < columns.stop
-    return [*drops, new] if seen and not any(new.touches(old) for old in drops) else drops
+@dataclass(frozen=True)
+class DirtRaindrop(WithLimits):
+    """Dirt or raindrops, as the paper's network for windshields was trained.
+
+    Attributes:
+        dirt: the dirt.
+        raindrop: the drops.
+        dirt_share: how often it is dirt.
+    """
+
+    dirt: Dirt = field(default_factory=Dirt)
+    raindrop: Raindrop = field(default_factory=Raindrop)
+    dirt_share: float = 0.5
+
+    name: ClassVar[str] = "dirt_raindrop"
+    limits: ClassVar[Mapping[str, Range]] = {
+        "dirt_share": (0.0, 1.0),
+    }
+
+    def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
+        """Toss the coin and draw."""
+        kind = self.dirt if rng.uniform() < self.dirt_share else self.raindrop
+        return kind.draw(rng, view, background)

@@ -56,18 +56,14 @@ class ReleaseDirt(WithLimits):
         tile = perlin(lattice, *(np.linspace(0, n, 32 * n, endpoint=False) for n in cells))
         y, x = (a + np.arange(n) * (s / n) for a, s, n in zip(starts, spans, view.shape, strict=True))
         value = (perlin(lattice, y, x) - tile.min()) / np.ptp(tile)
-        value = np.where(value > 0.55, value, 0) * _fading(view.shape)
+        y, x = ((np.arange(n) - (n - 1) / 2) for n in view.shape)
+        radius = np.hypot(y[:, None], x[None, :])
+        value = np.where(value > 0.55, value, 0) * (1 - radius / radius.max())
         value = (value / max(float(value.max()), 1e-12)).astype(np.float32)
         mask = (value > 0.3).astype(np.float32)
         colour = np.array([30.0, 20.0, 10.0]) * rng.uniform(1, 2.5) + rng.uniform(-5, 5, 3)
         display = np.clip(colour / 255, 0, 1).astype(np.float32)[:, None, None] * value
         return Obstruction(mask, linear_from_srgb(display), depth_m)
-
-
-def _fading(shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
-    y, x = ((np.arange(n) - (n - 1) / 2) for n in shape)
-    radius = np.hypot(y[:, None], x[None, :])
-    return 1 - radius / radius.max()
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,11 @@ def plot_psfs(
     if len(camera.colours) == 3:
         rows.append(wavelength_order(camera.colours))
     side = min(max(10.0 / columns, 1.6), 3.2)
-    groups = [_group(bank, name, depths, round(DPI * side)) for name, depths in shown.items()]
+    groups = []
+    for name, depths in shown.items():
+        energy = np.asarray(bank.energy)[:, depths]
+        images = np.stack([[shrunk(image, round(DPI * side)) for image in row] for row in energy])
+        groups.append(_Group(name, depths, images, _scale(images, float(energy.max()))))
     # An empty column keeps the groups apart.
     widths = [1.0] * len(groups[0].depths) + ([0.15] + [1.0] * len(groups[1].depths) if groups[1:] else [])
     size = (max(0.9 + sum(widths) * (side + 0.1), 4.5), 1.3 + len(rows) * (side + 0.1))
@@ -77,12 +81,6 @@ def plot_psfs(
             axes.set_ylabel(f"{name}\ny (µm)")
         grid[0, 0].locator_params(nbins=3, steps=[1, 2, 5, 10])
     return figure
-
-
-def _group(bank: "Bank", name: str, depths: list[int], dots: int) -> _Group:
-    energy = np.asarray(bank.energy)[:, depths]
-    images = np.stack([[shrunk(image, dots) for image in row] for row in energy])
-    return _Group(name, depths, images, _scale(images, float(energy.max())))
 
 
 def _scale(images: Float[np.ndarray, "w d v u"], brightest: float) -> "LogNorm":
@@ -133,6 +131,8 @@ def _draw_group(
 
 def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, column: int, picked: list[int]) -> None:
     """Draw one depth in one colour, or in three."""
+    from matplotlib.patheffects import withStroke
+
     _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m)
     depth = group.depths[column]
     disc_m = camera.defocus_radius_m(bank.depths_m[depth])
@@ -141,7 +141,10 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
     shares = {"window": float(np.asarray(bank.energy)[picked[0], depth].sum(dtype=np.float64))}
     if group.name == "far":
         inset = axes.inset_axes((0.62, 0.62, 0.36, 0.36))
-        middle = _middle(np.asarray(bank.energy)[picked, depth], _inset_pixels(camera, bank))
+        # As centred as the whole: an odd window keeps its middle pixel.
+        size, pixels = bank.energy.shape[-1], _inset_pixels(camera, bank)
+        cut = slice(size // 2 - pixels, size - size // 2 + pixels)
+        middle = np.asarray(bank.energy)[picked, depth, cut, cut]
         _show(inset, _shade(middle, group), middle.shape[-2:], bank.pixel_m)
         radius_m = _spot_radius_m(camera, picked[0])
         _circle(inset, radius_m, ":")
@@ -149,7 +152,10 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
         inset.spines[:].set_color("white")
         shares["spot"] = float(energy_within(middle[0], bank.pixel_m, radius_m))
     if len(picked) == 1:
-        _write(axes, "\n".join(f"{name} {100 * share:.1f} %" for name, share in shares.items()))
+        words = "\n".join(f"{name} {100 * share:.1f} %" for name, share in shares.items())
+        rim = [withStroke(linewidth=2, foreground="black")]
+        style = {"color": "white", "fontsize": SMALL, "path_effects": rim, "va": "bottom"}
+        axes.text(0.03, 0.03, words, transform=axes.transAxes, **style)
 
 
 def _show(axes: "Axes", shades: np.ndarray, shape: tuple[int, ...], pixel_m: float) -> None:
@@ -162,14 +168,6 @@ def _circle(axes: "Axes", radius_m: float, line: str) -> None:
     axes.add_patch(Circle((0, 0), radius_m / UM, ls=line, ec="white", lw=0.9, fill=False))
 
 
-def _write(axes: "Axes", words: str) -> None:
-    """Write white words with a dark rim into the lower left corner."""
-    from matplotlib.patheffects import withStroke
-
-    rim = [withStroke(linewidth=2, foreground="black")]
-    axes.text(0.03, 0.03, words, transform=axes.transAxes, color="white", fontsize=SMALL, path_effects=rim, va="bottom")
-
-
 def _spot_radius_m(camera: Camera, colour: int) -> float:
     return spot_radius_m(camera, mean_wavelength_m(camera.colours[colour]))
 
@@ -178,13 +176,6 @@ def _inset_pixels(camera: Camera, bank: "Bank") -> int:
     """Pixels on each side of the centre that the inset shows: three radii of the largest far spot."""
     radius = max(_spot_radius_m(camera, i) for i in range(len(camera.colours)))
     return min(math.ceil(3 * radius / bank.pixel_m), bank.energy.shape[-1] // 2)
-
-
-def _middle(energy: Float[np.ndarray, "w y x"], pixels: int) -> Float[np.ndarray, "w v u"]:
-    """The pixels round the centre, as centred as the whole: an odd window keeps its middle pixel."""
-    size = energy.shape[-1]
-    cut = slice(size // 2 - pixels, size - size // 2 + pixels)
-    return energy[:, cut, cut]
 
 
 def _least_disc_m(bank: "Bank") -> float:

@@ -1,33 +1,30 @@
 """From the field behind the DOE to the energy in every sensor pixel: the default path (paper eqs. 7-9).
 
 With the sensor in the focal plane the lens cancels the quadratic term of Fresnel propagation and the field on the
-sensor is the Fourier transform of the pupil, U(u) = (1 / lambda d) ∫ t exp(-2 pi i x.u / (lambda d)) d²x. Three things
-make this both right and fast:
+sensor is the Fourier transform of the pupil, U(u) = (1 / lambda d) ∫ t exp(-2 pi i x.u / (lambda d)) d²x.
 
-* **The sensor's own pixels.** The paper takes one FFT and resizes the result by nearest neighbour. Here the
-  intensity is sampled finely enough to be integrated over each pixel (`sim.propagation.pixel`).
+* **The sensor's own pixels.** The paper takes one FFT and resizes the result by nearest neighbour. Here the intensity
+  is sampled finely enough to be integrated over each pixel (`sim.propagation.pixel`).
 * **The cell of the DOE.** A DOE is a plate of squares with a constant phase, not a comb of points; its far field
-  carries the factor sinc² along each axis and what that removes from the window goes to higher orders. At the
-  ring of the paper's design (lambda / 3 pitch) the factor is 0.68: a comb would overstate the ring by half.
-* **Nothing that is not needed.** The transform along x keeps only the samples the window needs before the transform
-  along y, both in blocks of rows that stay in the processor's cache, so the padded pupil never exists as a whole. The
-  *field* holds half the frequencies of its intensity: it is transformed at 1.25 samples per lambda d / D and
-  interpolated, by short banded products, to the spacing at which its intensity can be integrated.
+  carries the factor sinc² along each axis and what that removes from the window goes to higher orders. At the ring of
+  the paper's design (lambda / 3 pitch) the factor is 0.68: a comb would overstate the ring by half.
+* **Only what is needed.** The transform along x keeps the samples the window needs before the transform along y, both
+  in blocks of rows that stay in the processor's cache. The *field* holds half the frequencies of its intensity: it is
+  transformed at 1.25 samples per lambda d / D and interpolated, by short banded products, to the spacing at which its
+  intensity can be integrated.
 
-A near source lights the cells obliquely, each from its own side, so the sinc of a cell is centred on the direction
-in which its undiffracted light leaves, not on the axis. 5 cm before the paper's plate that is up to a seventh of the
-band; one sinc about the axis would take 3 % from the blur disc and leave errors of 3-8 % in the image. The
-direction is linear in the cell's position, so the interpolation can carry the factor: its weights become complex and
-nothing is transformed twice.
+A near source lights the cells obliquely, so the sinc of a cell is centred on the direction in which its undiffracted
+light leaves. 5 cm before the paper's plate that is up to a seventh of the band; one sinc about the axis would take 3 %
+from the blur disc and leave errors of 3-8 % in the image. The direction is linear in the cell's position, so the
+interpolation carries the factor: its weights become complex and nothing is transformed twice.
 
-A plan (`plan_far_field`) is made once in float64 on the host and holds float32 operators. `FarField.energy` applies
-it to a pupil given as a function of blocks of rows (`sim.propagation.pupil`), so a phase-only pupil is never stored
-either; its gradient is written out here (one adjoint transform) and checked against finite differences.
+A plan (`plan_far_field`) is made once in float64 on the host and holds float32 operators. `FarField.energy` applies it
+to a pupil given as a function of blocks of rows (`sim.propagation.pupil`), so a phase-only pupil is never stored; its
+gradient is written out (one adjoint transform) and checked against finite differences.
 
-Sampling. `sampling` counts samples per lambda d / D: 2 is the Nyquist rate of the intensity, and the default adds as
-much as a short integration rule needs for a predicted error of 2e-3. At `sampling=1` the transform is the bare FFT of
-the pupil: a quarter of the work, enough to estimate energies when the image moves by a fraction of a pixel from call
-to call (`displaced`).
+`sampling` counts samples per lambda d / D: 2 is the Nyquist rate of the intensity, and the default adds as much as a
+short integration rule needs for a predicted error of 2e-3. At 1 the transform is the bare FFT of the pupil: a quarter
+of the work, enough to estimate energies when the image moves by a fraction of a pixel from call to call (`displaced`).
 """
 
 from functools import lru_cache

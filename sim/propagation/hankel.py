@@ -1,14 +1,12 @@
 """The far field of a rotationally symmetric DOE, by a Hankel transform of its radial profile.
 
-The profile is a height per ring; a ring is as wide as a cell. Within a ring the DOE is constant, so its share of the
-field, 2 pi / (lambda d) ∫ J0(2 pi r rho / lambda d) r dr, is known exactly through J1; the source wave varies slowly
-and is sampled at a few sub-rings. Unlike a raster, rings have no staircase: this is the PSF of rings drawn as rings.
-What a raster of square cells makes of the same profile is the business of `sim.propagation.farfield`, and tests state
-the difference.
+Within a ring, as wide as a cell, the DOE is constant, so its share of the field,
+2 pi / (lambda d) ∫ J0(2 pi r rho / lambda d) r dr, is known exactly through J1; the source wave varies slowly and is
+sampled at a few sub-rings. Unlike a raster (`sim.propagation.farfield`), rings have no staircase.
 
-From profile to pixels in three steps: field on radii at a little more than its Nyquist rate (one matrix product);
-band-limited interpolation of the complex field to eight times finer radii; integration over pixels with weights that
-hold each pixel's area as a function of radius. Only one octant of the window is distinct.
+From profile to pixels: field on radii at a little more than its Nyquist rate (one matrix product); band-limited
+interpolation of the complex field to eight times finer radii; integration over pixels with weights that hold each
+pixel's area as a function of radius. Only one octant of the window is distinct.
 """
 
 from functools import lru_cache

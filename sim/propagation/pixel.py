@@ -1,16 +1,14 @@
 """Integration of an intensity known at equidistant samples over square sensor pixels.
 
-The intensity of an image is band-limited: behind an aperture of diameter D it holds no spatial frequency above
-D / (lambda f). Its integral over a pixel is therefore a weighted sum of samples that need not be finer than
-lambda f / (2D), and a short sum suffices if the weights are chosen well. Point samples at the pixel pitch are not
-enough: behind an f/1.8 lens the speckle of a rough DOE is finer than a pixel, and they miss the integral by 60-90 %.
+Behind an aperture of diameter D the intensity holds no spatial frequency above D / (lambda f). Its integral over a
+pixel is therefore a weighted sum of samples that need not be finer than lambda f / (2D), and a short sum suffices if
+the weights are chosen well. Point samples at the pixel pitch are not enough: behind an f/1.8 lens the speckle of a
+rough DOE is finer than a pixel, and they miss the integral by 60-90 %.
 
-The weights of one pixel minimise the expected squared error over intensities with the spectrum of fully
-developed speckle, whose power at spatial frequency nu is the autocorrelation of the disc (J. W. Goodman, *Speckle
-Phenomena in Optics*, §4.2), plus a strong term at nu = 0 that makes energy come out right. The same expectation
-predicts the error of the rule, so a plan can be chosen for an accuracy instead of by trial. The two axes separate.
-
-With fewer samples than lambda f / (2D) asks for, the rule degrades gracefully: it stays the best linear estimate.
+The weights of one pixel minimise the expected squared error over fully developed speckle, whose power at spatial
+frequency nu is the autocorrelation of the disc (J. W. Goodman, *Speckle Phenomena in Optics*, §4.2), plus a strong term
+at nu = 0 that makes energy come out right. The same expectation predicts the error of the rule. The two axes separate;
+with fewer samples the rule stays the best linear estimate.
 """
 
 from typing import NamedTuple

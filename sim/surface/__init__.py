@@ -1,14 +1,12 @@
-"""The plate that comes back from the cleanroom, as light sees it. The only model of the process.
+"""The DOE that comes back from the cleanroom, as light sees it. The only model of the process.
 
-`as_fabricated` takes what is drawn (a level map, split into masks here), a process and the errors of one plate
-(`fab.process.Variation`) and returns the transmission of every DOE cell. Nothing is oversampled: displaced and widened
-masks cut each cell into a few pieces of constant depth whose light is added exactly, rounded corners and tilted walls
-add what they change at the vertices and along the lines between the pieces, and slow errors (uniformity, rotation,
-magnification) are constants of tiles of 32 x 32 cells. Everything is differentiable in every floating-point error,
-except where edges of two masks coincide (there the light itself has a kink) and, for rounded corners, where the edge of
-another mask passes the corner (a jump of a small part of a small term).
-
-How each error enters:
+`as_fabricated` takes a level map, a process and the errors of one plate (`fab.process.Variation`) and returns the
+transmission of every DOE cell. Nothing is oversampled: displaced and widened masks cut each cell into a few pieces of
+constant depth whose light is added exactly, rounded corners and tilted walls add what they change at the vertices and
+along the lines between the pieces, and slow errors (uniformity, rotation, magnification) are constants of tiles of
+32 x 32 cells. Everything is differentiable in every floating-point error, except where edges of two masks coincide
+(there the light itself has a kink) and, for rounded corners, where the edge of another mask passes the corner (a jump
+of a small part of a small term).
 
 * depth, missed and doubled etches, uniformity: the depth a mask takes away; the bottom profile follows the top's.
 * overlay, rotation, magnification, line width: where the masks' edges lie. A mask pixel narrower than twice a negative
@@ -16,8 +14,7 @@ How each error enters:
 * corner rounding: (1 - pi/4) r^2 of area at every corner of an opening or an island; two openings that touch at a
   corner neither merge nor part.
 * side walls: floors are narrower than the drawn opening by depth x tan(angle) at each wall, depth falls linearly.
-* etch lag: an opening of width w loses the share lag x depth / w of its depth; w is the shorter of its runs along x and
-  y as drawn.
+* etch lag: an opening of width w, the shorter of its runs along x and y, loses the share lag x depth / w of its depth.
 * roughness: a random height for every cell with the given rms and correlation length; what varies within a cell is
   light lost to angles beyond the sensor, exp(-variance / 2) of the amplitude.
 * particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, and pinholes.

@@ -85,7 +85,7 @@ def corners(
     segments_x = along_x.state.shape[1]
 
     def seen_from_sides(mask_and_opening: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
-        """Place (y, x) and amount `[side, cell]` of odd openings (or gaps) at a mask's crossings, and the light there."""
+        """Places (y, x) and amounts `[side, cell]` of a mask's odd openings (or gaps), and the light there."""
         k, opening = mask_and_opening
         step, own_kinds = _CORNER_MIDDLE * radius, kinds[k]
         y, row, low_y, outer_y = _beside(along_y, k, _SIDE_Y, opening, bias[k], step)
@@ -115,7 +115,7 @@ def corners(
             gain = Pair(jnp.cos(phase) - 1, jnp.sin(phase)).each(lambda part, a=amounts[at]: part[:, None] * a[:, None])
             gained = changed.times(gain).times(Pair(found[at, :, 0], found[at, :, 1]))
             points = point_moments(axis_values(ys[at], plan.parts), axis_values(xs[at], plan.parts))
-            total = total + jnp.stack([summed(points, gained.real), summed(points, gained.imaginary)], axis=1)
+            total = total + jnp.stack([summed(points, part, kept=2) for part in gained], axis=1)
             gains.append(gain)
         # On one side a cell has an odd opening or an odd gap of this mask, not both.
         earlier.append(gains[0].plus(gains[1], jnp.ones(())))

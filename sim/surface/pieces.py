@@ -102,8 +102,8 @@ class Pair(NamedTuple):
         return Pair(work(self.real), work(self.imaginary))
 
 
-def summed(weights: Float[Array, "m ..."], values: Float[Array, "..."]) -> Float[Array, "m ..."]:
-    """Sum over pieces (or lines, or crossings), the first axes of both, of values times each row of weights."""
-    rows, rest = weights.shape[0], values.shape[weights.ndim - 1 :]
+def summed(weights: Float[Array, "m ..."], values: Float[Array, "..."], kept: int = 3) -> Float[Array, "m ..."]:
+    """Sum over pieces (or lines, or crossings) of values times each row of weights; the last `kept` axes stay."""
+    rows, rest = weights.shape[0], values.shape[-kept:]
     product = jnp.dot(weights.reshape(rows, -1), values.reshape(-1, np.prod(rest)), precision=PRECISION)
     return product.reshape(rows, *rest)
