@@ -37,11 +37,7 @@ def camera_from_spec(spec: Spec) -> Camera:
 
 
 def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:
-    """Return the staircase that a process makes, `chosen` where its spec leaves the depths to the optimisation.
-
-    Raises:
-        InputError: the depths are still to be chosen.
-    """
+    """Return the staircase that a process makes, `chosen` where its spec leaves the depths to the optimisation."""
     depths_m = spec.etch_depths_m
     if isinstance(depths_m, str):
         if chosen is not None:
@@ -88,9 +84,6 @@ def resolve_process(
     """Return a process for a staircase: one that is given, by itself, its spec, its stock name or its TOML file.
 
     None stands for the `default`, the process of the design's spec, or else for the ideal process.
-
-    Raises:
-        InputError: the file cannot be read, or the process makes another staircase.
     """
     where, given = "process", default if given is None else given
     if isinstance(given, Path) or (isinstance(given, str) and given not in STOCK):
@@ -113,11 +106,7 @@ def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:
 
 
 def spec_from_process(process: Process, like: ProcessSpec | None = None) -> ProcessSpec:
-    """Return the spec of a process, with every number given; the overlap of the chrome is that of `like`.
-
-    Raises:
-        InputError: a number that no spec may hold.
-    """
+    """Return the spec of a process, with every number given; the overlap of the chrome is that of `like`."""
     errors = {}
     for error in DEVIATIONS:
         spreads = [process.spreads.get(name, Normal()) for name in error_names(process.masks, error)]

@@ -13,7 +13,6 @@ crossing is closed in on by Brent's method. Two errors are mixed in the proporti
 effects added; where along it the ratio is met is then found with the model itself.
 """
 
-import contextlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -303,7 +302,7 @@ def explain_ratio(
         rule = "the source must be near enough to be blurred by more than a pixel"
         raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
     names = chosen_names(prior.masks, errors or _DEFAULT)
-    writing = contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder)
+    writing = results_folder(out, design.name, design.folder)
     # About ten models for every error and six for a pair.
     with writing as fresh, models_meter("explanations", 200) as on_model:
         camera = replace(design.camera, colours=(Colour("probe", (targets.wavelength_m,), (1.0,)),))

@@ -26,18 +26,14 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-for _command in (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate):
+_COMMANDS = (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate)
+for _command in _COMMANDS:
     app.command(_command)
 app.command(reconstruct, usage="Usage: doedesign reconstruct [OPTIONS] [RUN] CAPTURE...")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `doedesign` command."""
-    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False), _option_names())
-
-
-def _option_names() -> frozenset[str]:
-    """Names of the arguments that commands take as options."""
-    functions = (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate, reconstruct)
-    given = (p for function in functions for p in signature(function).parameters.values())
-    return frozenset(p.name.rstrip("_") for p in given if p.kind is p.KEYWORD_ONLY)
+    given = (p for command in (*_COMMANDS, reconstruct) for p in signature(command).parameters.values())
+    options = frozenset(p.name.rstrip("_") for p in given if p.kind is p.KEYWORD_ONLY)
+    return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False), options)

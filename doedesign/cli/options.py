@@ -15,11 +15,7 @@ AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON 
 
 
 def length_of(option: str, text: str | None) -> float | None:
-    """A length in metres, or None where none was given.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """A length in metres, or None where none was given."""
     if text is None:
         return None
     from fab.units import parse_length

@@ -116,11 +116,7 @@ BUILT_IN: dict[str, Callable[..., Array]] = {name: globals()[name] for name in O
 
 
 def terms_from_spec(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
-    """Return a spec's objectives, with options bound and images read from its `doedesign.spec.input_files`.
-
-    Raises:
-        InputError: a function that cannot be imported, an option it does not take, or an image that cannot be read.
-    """
+    """Return a spec's objectives, with options bound and images read from its `doedesign.spec.input_files`."""
     terms = []
     for i, objective in enumerate(spec.objectives):
         where = f"objective[{i}] {objective.name}"

@@ -55,11 +55,7 @@ def initial_state(
     files: Mapping[str, Path],
     read_start: Callable[[Path], Float[np.ndarray, "y x"]],
 ) -> OptimizationState:
-    """Parameters and moments before the first step; `read_start` reads a height map, metres, from one of the `files`.
-
-    Raises:
-        InputError: a start that does not fit the grid or is no raster of rings where rings are optimised.
-    """
+    """Parameters and moments before the first step; `read_start` reads a height map, metres, from one of `files`."""
     camera = problem.camera
     if spec.optimize.start in STARTS:
         setup = StartSetup(

@@ -18,11 +18,7 @@ Image = Float[np.ndarray, "y x"]
 
 
 def positive_length(text: object, where: str) -> float:
-    """Length in metres of an option such as "250 um"; `where` is its key, for messages.
-
-    Raises:
-        InputError: anything else than a positive length with a unit.
-    """
+    """Length in metres of an option such as "250 um"; `where` is its key, for messages."""
     cure = f'For example {where.rpartition(" ")[2].rpartition(".")[2]} = "250 um".'
     try:
         length = parse_length(str(text))
@@ -101,9 +97,6 @@ def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, 
 
     `pattern` is "spots" (count, spacing), "square" (width) or "disc" (diameter); `where` is the key of the objective,
     for messages.
-
-    Raises:
-        InputError: an unknown pattern, a missing or impossible option, an unreadable or black picture.
     """
     if picture is not None:
         target = _picture(camera, picture)

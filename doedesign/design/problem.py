@@ -77,30 +77,23 @@ class SourceSet(NamedTuple):
             order = np.random.default_rng((seed, salt, step // count)).permutation(count)
             return [int(order[step % count])]
 
-        near, far = pick(len(self.near[0]), 0), pick(len(self.far[0]), 1)
         offset = None
         if self.displacement_m > 0:
             shift = np.random.default_rng((seed, 2, step)).uniform(-1.0, 1.0, 2) * self.displacement_m
             offset = jnp.asarray(shift, jnp.float32)
-        return StepSources(
-            tuple(tuple(line[i] for i in near) for line in self.near),
-            tuple(tuple(line[i] for i in far) for line in self.far),
-            jnp.asarray(self.lens[:, near]),
-            offset,
-        )
+        return self._chosen(pick(len(self.near[0]), 0), pick(len(self.far[0]), 1), offset)
 
     def first_look(self) -> StepSources:
         """The first near and far depth, with the image on the axis."""
-        near, far = (tuple(line[:1] for line in lines) for lines in (self.near, self.far))
-        return StepSources(near, far, jnp.asarray(self.lens[:, :1]), None)
+        return self._chosen([0] if self.near[0] else [], [0] if self.far[0] else [], None)
+
+    def _chosen(self, near: list[int], far: list[int], offset_m: Array | None) -> StepSources:
+        waves = (tuple(tuple(line[i] for i in at) for line in w) for w, at in ((self.near, near), (self.far, far)))
+        return StepSources(*waves, jnp.asarray(self.lens[:, near]), offset_m)
 
 
 def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSet]:
-    """Prepare plans, sources and objectives of a spec.
-
-    Raises:
-        InputError: objectives that cannot be read, or a direct path that eq. 6 forbids.
-    """
+    """Prepare plans, sources and objectives of a spec."""
     problem = plans_of(spec, files)
     camera, optic = problem.camera, problem.optic
     sources: Any = optic.source

@@ -126,11 +126,7 @@ BUILT_IN = {name: globals()[name] for name in STARTS}
 
 
 def start_heights(name: str, options: Mapping[str, Any], setup: StartSetup) -> Heights:
-    """Heights, metres, of a start of `doedesign.spec.values.STARTS` with its options.
-
-    Raises:
-        InputError: an option that the start does not take, or an impossible value.
-    """
+    """Heights, metres, of a start of `doedesign.spec.values.STARTS` with its options."""
     if unknown := [key for key in options if key not in STARTS[name]]:
         known = ", ".join(STARTS[name]) or "none"
         raise InputError(_WHERE, f'options of start "{name}" are: {known}', unknown[0], "Remove or rename it.")

@@ -1,6 +1,5 @@
 """The DOE that the lab measured beside the predictions of its run sheet."""
 
-import contextlib
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -72,10 +71,7 @@ def as_built(
     sources = [each for each in ("measured", "process mean", "not measured, taken as 0") if count[each]]
     log.info(", ".join(f"{count[each]} errors: {each}" for each in sources))
     about = {"level_map_sha256": design.level_map.digest, "measured_sha256": sha256_file(Path(file))}
-    writing = (
-        contextlib.nullcontext() if out is None else results_folder(Path(out), design.name, design.folder, **about)
-    )
-    with writing as folder:
+    with results_folder(out, design.name, design.folder, **about) as folder:
         try:
             prediction = predict(design, made_by, doe.variation)
         except InputError as error:

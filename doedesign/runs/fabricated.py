@@ -79,13 +79,12 @@ def fabricated(
     made_by = design.process(process)
     errors, words = design.plate_errors(made_by, variation, seed, draw)
     log.info(f"plate: {words}")
-    if out is None:
-        return _computed(design, made_by, errors)
     about = {"level_map_sha256": design.level_map.digest, "plate": words}
-    with results_folder(Path(out), design.name, design.folder, **about) as folder:
+    with results_folder(out, design.name, design.folder, **about) as folder:
         found = _computed(design, made_by, errors)
-        log.info("writing bank and pictures")
-        _write(folder, design, found, words)
+        if folder is not None:
+            log.info("writing bank and pictures")
+            _write(folder, design, found, words)
     return found
 
 

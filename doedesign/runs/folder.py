@@ -130,9 +130,6 @@ def alone_in(folder: Path) -> Iterator[None]:
     """Keep other processes out of a run folder (made if missing), and remove the temporary files of a killed one.
 
     The system unlocks the folder when this process ends, however it ends.
-
-    Raises:
-        InputError: another process works in the folder, or the system refuses it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -245,9 +242,6 @@ def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:
     """Return the spec of a finished run with overrides, "table.key=value", that its DOE does not depend on.
 
     Those of the `free` tables may be changed; of the sensor, only its response to light.
-
-    Raises:
-        InputError: an override that breaks a rule, or of something else.
     """
     if not overrides:
         return run.spec
@@ -274,11 +268,7 @@ def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: 
 def load_checkpoint(
     run: Run, shapes: Sequence[tuple[int, ...]]
 ) -> tuple[list[np.ndarray], int, list[dict[str, Any]]] | None:
-    """Return what `save_checkpoint` stored, or None if there is no checkpoint yet.
-
-    Raises:
-        InputError: the file is cut off, corrupt, or of another spec.
-    """
+    """Return what `save_checkpoint` stored, or None if there is no checkpoint yet."""
     path = run.path(CHECKPOINT)
     if not path.exists():
         return None

@@ -40,9 +40,6 @@ def read_any_height(
         pitch_m: pixel pitch, metres; needed unless the file holds it (EXR of our own).
         scale_m: metres per count, for integers.
         aperture_m: diameter of the relief, metres; by default what the file says, or its shorter side.
-
-    Raises:
-        InputError: the file cannot be read or something needed is missing.
     """
     if path.is_dir():
         raise InputError(str(path), f"a height map is a file ({', '.join(HEIGHT_FILES)})", "a folder", "Give the file.")
@@ -61,11 +58,7 @@ def read_any_height(
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
-    """Return the level map of a run, or its continuous design rounded to another `count` of levels of the same height.
-
-    Raises:
-        InputError: a file of the run cannot be read, or is not for the staircase that the run chose.
-    """
+    """Return the level map of a run, or its continuous design rounded to another `count` of levels as high."""
     own = levels_from_spec(run.spec.process)
     if count in (None, own.count):
         file = run.path(LEVEL_MAP)
@@ -197,11 +190,7 @@ def drawing_from(
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
-    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws.
-
-    Raises:
-        InputError: no mask order, a broken file, or a drawing on another raster or with other levels.
-    """
+    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws."""
     from fab.verification.verify import read_drawn_levels  # slow to import
 
     manifest = read_manifest(folder)

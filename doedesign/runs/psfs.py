@@ -1,6 +1,5 @@
 """PSFs of a finished run: of the continuous design, the quantised one, and the one drawn in the masks."""
 
-import contextlib
 import logging
 import shutil
 from collections.abc import Sequence
@@ -63,8 +62,7 @@ def psfs(
     near, far = _near_and_far(run.spec, depths_m)
     designs = _heights_of(run, masks)
     total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
-    writing = contextlib.nullcontext() if out is None else results_folder(Path(out), run.spec.name, run.folder)
-    with writing as fresh:
+    with results_folder(out, run.spec.name, run.folder) as fresh:
         with meter("PSFs", total) as progress:
             done = count(1)
 

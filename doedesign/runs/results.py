@@ -10,21 +10,27 @@ from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, s
 
 
 @contextlib.contextmanager
-def results_folder(folder: Path, design: str, run: Path | None = None, **about: str) -> Iterator[Path]:
+def results_folder(
+    folder: str | Path | None, design: str, run: Path | None = None, **about: str
+) -> Iterator[Path | None]:
     """Open a folder of results; its kind is its name. Nobody else may write into the run meanwhile.
 
     Args:
-        folder: the folder; an earlier result is replaced.
+        folder: the folder, where an earlier result is replaced; None where nothing is to be written.
         design: name of the design.
         run: folder of its run, if it has one.
         about: further entries of the manifest.
 
     Yields:
-        the folder to write to; it takes its name when all is written.
+        the folder to write to, if any; it takes its name when all is written.
 
     Raises:
         InputError: the folder holds something else, or another process works in the run.
     """
+    if folder is None:
+        yield None
+        return
+    folder = Path(folder)
     if (folder / MANIFEST_NAME).is_file():
         listed = {MANIFEST_NAME, *read_json(folder / MANIFEST_NAME).get("results_sha256", ())}
         for path in sorted(folder.iterdir()):

@@ -98,20 +98,12 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
 
 
 def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
-    """Rebuild a spec from the JSON object that `spec_to_json` returned; `source` names it in messages.
-
-    Raises:
-        InputError: the object is not a spec of this version.
-    """
+    """Rebuild a spec from the JSON object that `spec_to_json` returned; `source` names it in messages."""
     return _checked(Spec, data, source, si=True)
 
 
 def load_process(path: str | Path) -> ProcessSpec:
-    """Read a process from the `[process]` table of a TOML file, whose other tables, those of a spec, are passed over.
-
-    Raises:
-        InputError: the file cannot be read, is no TOML, has no process, or breaks a rule.
-    """
+    """Read a process from the `[process]` table of a TOML file; other tables of a spec are passed over."""
     return _load(ProcessFile, path, "process").process
 
 
@@ -121,20 +113,12 @@ def load_wafer(path: str | Path) -> WaferSpec:
 
 
 def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:
-    """Make a process from plain SI values by attribute; `source` names where they came from in messages.
-
-    Raises:
-        InputError: the values are not those of a process, or break a rule.
-    """
+    """Make a process from plain SI values by attribute; `source` names where they came from in messages."""
     return _checked(ProcessFile, {"process": data}, source, si=True).process
 
 
 def load_variation(path: str | Path) -> Variation:
-    """Read the errors of one DOE from TOML, as `variation_to_toml` writes them.
-
-    Raises:
-        InputError: the file cannot be read, is no TOML, or breaks a rule.
-    """
+    """Read the errors of one DOE from TOML, as `variation_to_toml` writes them."""
     return _load(VariationFile, path).value()
 
 
@@ -162,9 +146,6 @@ def input_files(spec: Spec) -> dict[str, Path]:
     """Return the files a spec names by dotted key ("optimize.start", "objective[0].options.image").
 
     They are found relative to the folder of the spec file, or to the current one.
-
-    Raises:
-        InputError: a file is missing.
     """
     named = {} if spec.optimize.start in STARTS else {"optimize.start": spec.optimize.start}
     for index, objective in enumerate(spec.objectives):
@@ -183,11 +164,7 @@ def input_files(spec: Spec) -> dict[str, Path]:
 
 
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
-    """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages.
-
-    Raises:
-        InputError: the file cannot be read or is no TOML.
-    """
+    """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages."""
     cure = f"Give {what} such as {example}."
     try:
         return tomllib.loads(path.read_bytes().decode())

@@ -41,11 +41,7 @@ _RULES = {
 
 
 class SpecError(InputError):
-    """Several mistakes in one spec; its text lists them, one per line.
-
-    Attributes:
-        mistakes: the single errors.
-    """
+    """Several mistakes in one spec, each an error by itself; its text lists them, one per line."""
 
     def __init__(self, mistakes: Sequence[InputError]) -> None:
         """Join the mistakes; the parts of the first stand for the whole where only one can be shown."""
@@ -69,9 +65,6 @@ def validated(
         source: where they came from, for the message.
         overridden: dotted keys whose value came from the command line, not from the file.
         si: whether keys are attributes and lengths numbers in SI units, as in JSON, instead of those of TOML.
-
-    Raises:
-        InputError: a value that the model refuses.
     """
     try:
         return model.model_validate(raw, by_alias=not si, by_name=si, context=None if si else FROM_TOML)

@@ -1,9 +1,7 @@
 """The spec: one frozen table per section of the TOML, without arrays and without defaults hidden elsewhere.
 
-An attribute that holds a length ends in `_m` and is metres; its TOML key has no suffix and is text with a unit
-(`focal_length = "8 mm"` becomes `focal_length_m = 0.008`). Everything is compared, hashed and stored by value.
-Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both. The tables of the process are in
-`process`, those of scene and sensor in `scene`, those of the network and its training in `training`.
+`focal_length = "8 mm"` in TOML becomes `focal_length_m = 0.008` (`doedesign.spec.table`). Everything is compared,
+hashed and stored by value. Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
 """
 
 import re

@@ -44,11 +44,7 @@ class Response(NamedTuple):
 
 
 def with_response(raw: Mapping[str, Any], source: Path) -> dict[str, Any]:
-    """Put the colours of a response file, which lies beside the spec file `source`, into the tables of the spec.
-
-    Raises:
-        InputError: the file cannot be read or holds no response, or the colours are stated twice.
-    """
+    """Put the colours of a response file, which lies beside the spec file `source`, into the tables of the spec."""
     optics = raw.get("optics")
     if not isinstance(optics, dict) or not any(key in optics for key in RESPONSE_KEYS):
         return dict(raw)
@@ -100,11 +96,7 @@ def lines_of(response: Response, count: int) -> tuple[NDArray[np.float64], NDArr
 
 
 def read_responses(path: Path) -> list[Response]:
-    """Read a response file.
-
-    Raises:
-        InputError: it cannot be read, or a line or a column makes no sense.
-    """
+    """Read a response file."""
     try:
         text = path.read_bytes().decode()
     except OSError as error:

@@ -23,7 +23,13 @@ HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
 
 # The built-in objectives, each a function of the same name in `doedesign.design.objectives`, and those of them that
 # need a near depth in the scene.
-OBJECTIVES = ("far_spot", "near_spread", "window_loss", "handcrafted", "target_pattern")
+OBJECTIVES = (
+    "far_spot",
+    "near_spread",
+    "window_loss",
+    "handcrafted",
+    "target_pattern",
+)
 NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 
 # The built-in starts with their options; each is a function of the same name in `doedesign.design.starts`.

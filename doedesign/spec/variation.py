@@ -89,11 +89,7 @@ class VariationFile(SpecTable, frozen=True):
 
 
 def variation_file(variation: Variation) -> VariationFile:
-    """Return the file that says what a variation is, whose errors may be numbers of any kind that `float` takes.
-
-    Raises:
-        ValueError: a value that is not finite, or an error below zero that never is.
-    """
+    """Return the file that says what a variation is, whose errors may be numbers of any kind that `float` takes."""
     errors = {name: getattr(variation, name) for name in DEVIATIONS}
     plain = {name: tuple(map(float, v)) if DEVIATIONS[name].per_mask else float(v) for name, v in errors.items()}
     particles, pinholes = (
