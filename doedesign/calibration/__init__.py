@@ -15,7 +15,7 @@ Reading order:
     uncertainty     the posterior, and checks of it
     estimate        `calibrate`: all of this behind one function
     explanations    `explain_ratio`: errors that would give two measured numbers
-    files           what both write; plots and explanation_plots draw their pictures
+    files           what both write; plots draws their pictures
 
 The model is `sim.surface.as_fabricated` and the far-field path, the same that design, tolerance and prediction use.
 """

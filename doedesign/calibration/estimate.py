@@ -100,11 +100,7 @@ class Calibration:
         return "\n".join([*lines, *self.remarks])
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
-        """Draw every measured image beside the model's; see `doedesign.calibration.plots` for other pictures.
-
-        Args:
-            ax: axes whose place the picture takes; a new figure by default.
-        """
+        """Draw every measured image beside the model's; other pictures are in `doedesign.calibration.plots`."""
         return plot_fitted_psfs(self, ax)
 
     def _repr_html_(self) -> str:

@@ -24,9 +24,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from doedesign.calibration.estimate import models_meter
-from doedesign.calibration.explanation_plots import plot_explanations
 from doedesign.calibration.files import write_explanations
 from doedesign.calibration.objective import OnModel
+from doedesign.calibration.plots import plot_explanations
 from doedesign.calibration.unknowns import chosen_names, definite_means, prior_sigma
 from doedesign.design.design import Design
 from doedesign.prediction import predict
@@ -46,15 +46,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 _DEFAULT = (
-    "common_depth_scale",
-    "depth_scale",
-    "radial_nonuniformity",
-    "overlay_x_m",
-    "common_cd_bias_m",
-    "cd_bias_m",
-    "corner_radius_m",
-    "sidewall_rad",
-    "etch_lag",
+    *("common_depth_scale", "depth_scale", "radial_nonuniformity", "overlay_x_m", "common_cd_bias_m", "cd_bias_m"),
+    *("corner_radius_m", "sidewall_rad", "etch_lag"),
 )
 _CLOSE = 0.01  # standard deviations to which a crossing is found
 _ANGLES = 120  # proportions of a pair that are tried on the sum of effects

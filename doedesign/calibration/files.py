@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from doedesign.build import spec_from_process
-from doedesign.calibration.explanation_plots import plot_explanations
-from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
+from doedesign.calibration.plots import plot_check, plot_estimates, plot_explanations, plot_fitted_psfs
 from doedesign.design.design import Design
 from doedesign.spec import load_process, process_to_toml, variation_to_toml
 from fab.figure import save

@@ -1,9 +1,6 @@
-"""Pictures of a calibration: measured images beside the model's, errors and their uncertainty, quality of the fit.
+"""Pictures of a calibration and of explanations; each takes the place of axes `ax` of a subplot, or is a new figure."""
 
-Each takes the place of axes `ax` of a subplot, or makes a new figure.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,12 +30,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
     from doedesign.calibration.estimate import Calibration
-
-__all__ = ["plot_check", "plot_estimates", "plot_fitted_psfs"]
+    from doedesign.calibration.explanations import Explanation, ExplanationSet
 
 _SIDE = 2.6  # inches of an image
 _ROW = 0.27  # inches of one error's row
 _MOST_SIGMA = 5.0
+_MOST_EXPLANATIONS = 14
+_BESIDE: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": SMALL}
 _READINGS = {"ring_to_disc": "ring:disc", "far_spot": "far spot", "throughput": "throughput"}
 
 
@@ -107,7 +105,7 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
     )
     with panels(ax, (7.8 + height, height + 1.2), note=words) as figure:
         errors, correlation = figure.subplots(1, 2, width_ratios=(3.6, height))
-        rows = np.arange(count)[::-1]
+        rows = _name_rows(errors, map(error_label, unknowns.names))
         centre = (posterior.values - unknowns.mean) / unknowns.sigma
         spread = posterior.sigma / unknowns.sigma
         errors.barh(rows, 2, 0.75, left=-1, color=FAINT, alpha=0.35, lw=0)
@@ -116,19 +114,15 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
             style: dict[str, Any] = {"color": LINE, "mec": LINE, "capsize": 3, "lw": 1.6, "ms": 5}
             fill = LINE if result.determined[name] else "white"
             errors.errorbar(centre[i], row, xerr=spread[i], fmt="o", mfc=fill, **style)
-            words = value_text(name, posterior.values[i], posterior.sigma[i])
-            errors.annotate(words, (1.03, row), xycoords=("axes fraction", "data"), va="center", fontsize=SMALL)
-        errors.set_yticks(rows, [error_label(name) for name in unknowns.names])
-        errors.set_ylim(-0.6, count - 0.4)
+            errors.annotate(result.estimates[name], (1.03, row), **_BESIDE)
         reach = max(1.3, float(np.max(np.abs(centre) + spread)) * 1.1)
-        errors.set_xlim(-reach, reach)
-        errors.set_xlabel("distance from the prior's mean, in its standard deviations")
-        errors.set_title(f"errors of the plate, {posterior.chi2_per_pixel:.3g} chi2 per pixel")
+        title = f"errors of the plate, {posterior.chi2_per_pixel:.3g} chi2 per pixel"
+        xlabel = "distance from the prior's mean, in its standard deviations"
+        errors.set(xlim=(-reach, reach), xlabel=xlabel, title=title)
         shown = correlation.imshow(posterior.correlation, cmap="RdBu_r", vmin=-1, vmax=1, origin="upper", aspect="auto")
-        correlation.set_ylim(count - 0.4, -0.6)  # the rows of the errors
-        correlation.set_xticks([])
-        correlation.set_yticks(range(count), [""] * count)
-        correlation.set_title("correlation, same order")
+        ticks = {"xticks": [], "yticks": range(count), "yticklabels": [""] * count}
+        # The rows of the errors.
+        correlation.set(ylim=(count - 0.4, -0.6), **ticks, title="correlation, same order")
         figure.colorbar(shown, ax=correlation)
     return figure
 
@@ -156,35 +150,88 @@ def _draw_residuals(axes: "Axes", result: "Calibration") -> None:
         axes.hist(np.clip(pulls, -5.999, 5.999), bins.tolist(), density=True, **style)
     middle = (bins[1:] + bins[:-1]) / 2
     axes.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color=INK, ls="--", lw=1)
-    axes.set_yscale("log")
-    axes.set_ylim(1e-4, 2)
-    axes.set_xlabel("residual / standard deviation")
-    axes.set_ylabel("density")
+    axes.set(yscale="log", ylim=(1e-4, 2), xlabel="residual / standard deviation", ylabel="density")
     axes.legend(loc="upper left")
 
 
 def _draw_left_out(axes: "Axes", result: "Calibration") -> None:
     fitted = [found.chi2_per_pixel for found in result.fit.at.matches]
-    rows = np.arange(len(fitted))[::-1]
+    rows = _name_rows(axes, [target.name for target in result.objective.targets])
     axes.barh(rows + 0.17, fitted, 0.3, color=LINE, label="fit of all")
     if result.left_out:
         axes.barh(rows - 0.17, result.left_out, 0.3, color=MARK, label="from the others")
     axes.axvline(1, color=INK, ls="--", lw=1)
-    axes.set_yticks(rows, [target.name for target in result.objective.targets])
-    axes.set_ylim(-0.6, len(fitted) - 0.4)
     axes.set_xlabel("chi2 per pixel")
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, ncols=2, handlelength=1, columnspacing=1)
 
 
 def _draw_readings(axes: "Axes", readings: Sequence[Any]) -> None:
     axes.use_sticky_edges = False  # a margin beyond the shades
-    rows = np.arange(len(readings))[::-1]
+    rows = _name_rows(axes, [f"{_READINGS[r.quantity]}, {r.image}" for r in readings])
     for row, reading in zip(rows, readings, strict=True):
         (value, sigma), (model, spread) = reading.measured, reading.predicted
         ratio = 100 * (value / model - 1)
         axes.errorbar(ratio, row, xerr=100 * sigma / model, fmt="o", color=LINE, capsize=3, ms=4)
         axes.barh(row, 200 * spread / model, 0.5, left=-100 * spread / model, color=MARK, alpha=0.3, lw=0)
     axes.axvline(0, color=INK, ls="--", lw=1)
-    axes.set_yticks(rows, [f"{_READINGS[r.quantity]}, {r.image}" for r in readings])
-    axes.set_ylim(-0.6, max(len(readings), 1) - 0.4)
     axes.set_xlabel("measured - predicted (%)")
+
+
+def _name_rows(axes: "Axes", labels: Iterable[str], **style: Any) -> np.ndarray:
+    """Put labels at rows, the first on top; returns the rows."""
+    names = list(labels)
+    rows = np.arange(len(names))[::-1]
+    axes.set_yticks(rows, names, **style)
+    axes.set_ylim(-0.6, max(len(names), 1) - 0.4)
+    return rows
+
+
+def plot_explanations(found: "ExplanationSet", ax: "Axes | None" = None) -> "FigureBase":
+    """Draw the ring:disc ratio along every error, and the explanations of the measured ratio in order."""
+    shown = [*found.singles[:_MOST_EXPLANATIONS], *found.pairs[: _MOST_EXPLANATIONS // 2]]
+    targets = found.targets
+    title = f"what gives a ring:disc ratio of {targets.ring_to_disc:.3g} at {length_text(targets.depth_m)}"
+    with panels(ax, (11.1, max(_ROW * len(shown), 3.4) + 1.6), title, _words(found)) as figure:
+        curves, bars = figure.subplots(1, 2, width_ratios=(3.1, 2.2))
+        _draw_curves(curves, found)
+        _draw_explanations(bars, shown)
+    return figure
+
+
+def _words(found: "ExplanationSet") -> str:
+    words = (
+        "left: the model's ratio along the errors that change it most, dashed: measured; right: distance of each "
+        "explanation from the process's means, in its standard deviations, with the throughput that comes with it"
+    )
+    throughput = found.targets.throughput
+    if throughput is not None:
+        words += f"; full bars: throughput within two standard deviations of the {100 * throughput:.3g} % measured"
+    alone = list(map(error_label, found.unreached))
+    return words + (f"; none within {found.reach:g} standard deviations: {'; '.join(alone)}" if alone else "")
+
+
+def _draw_curves(axes: "Axes", found: "ExplanationSet") -> None:
+    reached = list(dict.fromkeys(name for each in found.singles for name in each.scores))[: 2 * len(SERIES)]
+    # Besides those that explain it, those that change it most.
+    others = sorted(found.curves, key=lambda name: -np.ptp(np.log(found.curves[name].ring_to_disc)))
+    shown = list(dict.fromkeys([*reached, *others]))[: max(len(reached), len(SERIES))]
+    for i, name in enumerate(shown):
+        curve = found.curves[name]
+        style = "-" if i < len(SERIES) else ":"
+        hue, label = SERIES[i % len(SERIES)], error_label(name)
+        axes.plot(curve.scores, curve.ring_to_disc, style, color=hue, marker=".", label=label)
+    axes.axhline(found.targets.ring_to_disc, color=INK, ls="--", lw=1)
+    axes.set(xlabel="error, standard deviations of the process", ylabel="ring:disc ratio")
+    axes.grid(True)
+    axes.legend(loc="best", fontsize=SMALL - 1)
+
+
+def _draw_explanations(axes: "Axes", shown: "Sequence[Explanation]") -> None:
+    labels = [" + ".join(f"{error_label(n)} {value_text(n, v)}" for n, v in each.values.items()) for each in shown]
+    if not shown:
+        axes.text(0.5, 0.5, "none", ha="center", va="center", transform=axes.transAxes)
+    for row, each in zip(_name_rows(axes, labels, fontsize=SMALL - 1), shown, strict=True):
+        axes.barh(row, each.distance, 0.6, color="white" if each.fits is False else LINE, ec=LINE, lw=1.0)
+        axes.annotate(f"{100 * each.throughput:.1f} %", (1.03, row), **_BESIDE)
+    axes.set_xlabel("standard deviations")
+    axes.annotate("throughput", (1.03, 1.02), xycoords="axes fraction", fontsize=SMALL)

@@ -38,9 +38,7 @@ class Posterior(NamedTuple):
 
     Attributes:
         covariance: of all scores, errors first.
-        values: best values of the errors, SI units.
-        sigma: their standard deviations.
-        correlation: of the errors.
+        values: best values of the errors, SI units; `sigma` and `correlation` are those of the errors.
         ratio: standard deviation over that of the prior.
         chi2_per_pixel: of all images; 1 where noise alone is left.
         inflation: factor on the standard deviation of what the images determine.

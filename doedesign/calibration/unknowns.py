@@ -29,16 +29,9 @@ _STEEPEST = 0.7  # radians
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Errors to find, SI units.
+    """Errors to find by flat name, SI units: prior mean and root of the covariance, range, and start of the search.
 
-    Attributes:
-        process: the process; its other errors stay at their means (`definite_means`).
-        names: flat names of the errors.
-        mean: prior means.
-        root: lower triangle that makes values of independent standard normals.
-        low: smallest values looked at.
-        high: largest ones.
-        start: where the search begins.
+    The other errors of the process stay at their means (`definite_means`).
     """
 
     process: Process

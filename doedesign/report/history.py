@@ -39,8 +39,8 @@ def plot_history(records: Sequence[Mapping[str, Any]], ax: "Axes | None" = None)
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=min(0.0, float(values.min())))
-        axes.set_xlabel(f"step (running mean of {window})" if window > 1 else "step")
-        axes.set_ylabel("loss and its terms without weights")
+        label = f"step (running mean of {window})" if window > 1 else "step"
+        axes.set(xlabel=label, ylabel="loss and its terms without weights")
         axes.grid(True)
         axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
     return axes
@@ -70,9 +70,8 @@ def plot_training(records: Sequence[Mapping[str, Any]], title: str = "", ax: "Ax
         margin = 0.03 * len(steps)
         for axes in (left, right):
             # The same steps in both, however few validations there were.
-            axes.set_xlim(steps[0] - margin, steps[-1] + 1 + margin)
+            axes.set(xlim=(steps[0] - margin, steps[-1] + 1 + margin), xlabel="step")
             axes.grid(True)
-            axes.set_xlabel("step")
             # Above the panel, so that no line hides behind the names.
             axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.01), borderaxespad=0.0, ncols=2)
     return figure

@@ -45,11 +45,7 @@ class Yield(NamedTuple):
 
 
 def yield_of(good: Bool[np.ndarray, " draw"]) -> Yield:
-    """Yield of draws that are good or not.
-
-    Raises:
-        ValueError: no draws.
-    """
+    """Yield of draws that are good or not; a ValueError without draws."""
     from scipy.stats import binomtest
 
     if not len(good):
@@ -151,7 +147,7 @@ class Sample:
         """Share of draws that obey every limit; None where there are no limits.
 
         Raises:
-            InputError: a limit that concerns no colour and depth of the design.
+            InputError: a limit that concerns no row.
         """
         return yield_of(self.good) if self.limits else None
 

@@ -31,12 +31,7 @@ _KEPT = "Finished draws are kept."
 
 
 def evaluate_there(model: DrawModel, draws: Mapping[str, Variation], address: str) -> Iterator[tuple[str, Any]]:
-    """Evaluate draws, by key, by the workers of a Dask cluster.
-
-    Args:
-        model: how, and of what design and process.
-        draws: variations by key.
-        address: of the scheduler, such as "tcp://10.0.0.1:8786".
+    """Evaluate draws, by key, by the workers of the Dask scheduler at an address such as "tcp://10.0.0.1:8786".
 
     Yields:
         key and result of every draw, as they are finished.

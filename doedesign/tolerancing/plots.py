@@ -56,8 +56,7 @@ def _per_quantity(
     with panels(ax, size, note=note) as figure:
         grid = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, quantity in zip(grid, map(QUANTITIES.__getitem__, quantities), strict=False):
-            axes.set_title(quantity.label)
-            axes.set_xlabel(quantity.label + (" (%)" if quantity.share else ""))
+            axes.set(title=quantity.label, xlabel=quantity.label + (" (%)" if quantity.share else ""))
         for spare in grid[len(quantities) :]:
             spare.set_axis_off()
         if keys:
@@ -159,11 +158,9 @@ def plot_yield(sample: Sample, ax: "Axes | None" = None) -> "FigureBase":
             for hue, (where, values) in zip(SERIES, curves.items(), strict=False):
                 words = ", ".join([where[0] or "", *([length_text(where[1])] if where[1] is not None else [])])
                 _plot_yield_curve(axes, values, quantity, hue, words.removeprefix(", ") or "all")
-            axes.set_ylim(0, 103)
-            axes.set_ylabel("yield (%)")
-            axes.grid(True)
             sign = "at most" if QUANTITIES[quantity].worse == "high" else "at least"
-            axes.set_title(f"{QUANTITIES[quantity].label} {sign} ...")
+            axes.set(ylim=(0, 103), ylabel="yield (%)", title=f"{QUANTITIES[quantity].label} {sign} ...")
+            axes.grid(True)
             if len(places) > 1:
                 axes.legend(loc="best")
     return figure
@@ -220,9 +217,8 @@ def _plot_bars(axes: "Axes", shown: Sequence[Effect], scale: float) -> None:
                 ends.append(scale * value)
     room = 0.06 * (max(ends) - min(ends))
     axes.axvline(expected, color=INK, lw=0.8)
-    axes.set_xlim(min(ends) - room, max(ends) + room)
+    axes.set(xlim=(min(ends) - room, max(ends) + room), ylim=(len(shown) - 0.4, -0.6))
     axes.set_yticks(range(len(shown)), [error_label(c.error) for c in shown])
-    axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.grid(axis="x")
 
 
@@ -251,10 +247,8 @@ def plot_variance_shares(shares: Sequence[VarianceShare], camera: "Camera", ax: 
                 axes.barh(position, 100 * max(one.first.value, 0.0), 0.5, color=_HIGHER)
                 axes.plot([100 * one.total.low, 100 * one.total.high], [position] * 2, color=INK, lw=0.9)
             axes.set_yticks(range(len(sources)), sources)
-            axes.set_ylim(len(sources) - 0.4, -0.6)
-            axes.set_xlim(0, 105)
+            axes.set(xlim=(0, 105), ylim=(len(sources) - 0.4, -0.6), xlabel="share of the variance (%)")
             axes.grid(axis="x")
-            axes.set_xlabel("share of the variance (%)")
     return figure
 
 
@@ -271,10 +265,7 @@ def plot_budget(budget: Budget, ax: "Axes | None" = None) -> "Axes":
         if budget.verdict == "found":
             axes.axvspan(budget.low, budget.high, **_BAD)
             axes.plot(budget.factor, 100 * budget.wanted, "o", color=MARK, ms=6)
-        axes.set_xlim(0, budget.factors[-1])
-        axes.set_ylim(0, 103)
+        labels = {"xlabel": f"sigma of {budget.what} over that of the process", "ylabel": "yield (%)"}
+        axes.set(xlim=(0, budget.factors[-1]), ylim=(0, 103), title=f"How large may {budget.what} errors be?", **labels)
         axes.grid(True)
-        axes.set_xlabel(f"sigma of {budget.what} over that of the process")
-        axes.set_ylabel("yield (%)")
-        axes.set_title(f"How large may {budget.what} errors be?")
     return axes

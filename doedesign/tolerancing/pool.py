@@ -48,14 +48,7 @@ class OutOfModel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawModel:
-    """Model of a study: how a draw is evaluated, of which design and process. It is sent to workers.
-
-    Attributes:
-        evaluate: what is asked of every draw.
-        design: the design.
-        process: the process.
-        token: tells one model from another where copies of it arrive.
-    """
+    """Model of a study: how a draw is evaluated, of which design and process; its copies in workers share a token."""
 
     evaluate: Evaluate
     design: "Design"

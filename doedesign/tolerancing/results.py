@@ -165,8 +165,7 @@ def tolerance(
 
     Args:
         design: a design, a finished run or its folder.
-        process: a process, the name of a stock process ("contact_aligner") or a TOML file; that of the design's spec
-            by default.
+        process: a process, its name or a TOML file; that of the design's spec by default.
         errors: errors to be changed, `{"overlay_x": "0.5 um"}` or, in SI units, `{"overlay_x_m": 0.5e-6}`.
         limits: what a good DOE obeys, such as "strehl >= 0.6"; the limits of the design's spec by default.
         draws: Monte-Carlo draws; also the draws per point of the budget.
@@ -176,12 +175,12 @@ def tolerance(
         budget: errors for which the largest sigma is sought, such as "overlay", "overlay_x" or "overlay_x[3]".
         wanted: yield that the budget is for, 0-1.
         seed: seed of every draw.
-        masks: mask order of the run; `masks/NAME` if there is one.
+        masks: mask order of the run; see `study`.
         out: folder for draws, results and pictures, in which a stopped study goes on where it was stopped, and one that
             asks for more takes the finished draws over; without one everything stays in memory.
         workers: worker processes; see `study`.
-        scheduler: address of a Dask scheduler whose workers are taken instead.
-        evaluate: what is asked of every draw; see `study`.
+        scheduler: address of a Dask scheduler; see `study`.
+        evaluate: evaluation of a draw; see `study`.
 
     Raises:
         InputError: something that cannot be used; see `study`.

@@ -88,14 +88,9 @@ class SensitivityIndex(NamedTuple):
 
 
 class VarianceShare(NamedTuple):
-    """Share of the variance of a quantity that a source causes.
+    """Share of the variance of a quantity that a source causes by itself, and in total, together with others.
 
-    Attributes:
-        source: the source of error.
-        quantity: the quantity.
-        colour: the colour, or None for the worst row of all.
-        first: by itself.
-        total: by itself and together with others.
+    The quantity is that of the worst row of a colour, or of all where the colour is None.
     """
 
     source: str

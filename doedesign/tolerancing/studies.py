@@ -51,17 +51,8 @@ _FEW_CELLS = 3_000_000
 class Study:
     """A design and a process, and the draws that were evaluated so far. Made by `study`.
 
-    Every question evaluates what it needs and has not been evaluated before.
-
-    Attributes:
-        design: the design.
-        process: the process.
-        limits: what a good DOE obeys.
-        seed: seed of every draw.
-        journal: the finished draws.
-        evaluate: evaluation of one draw.
-        run: evaluation of many draws, here or on a cluster.
-        quiet: whether no progress is shown.
+    Every question evaluates what it needs and has not been evaluated before: each draw by `evaluate`, all of them by
+    `run`, here or on a cluster. `quiet` shows no progress.
     """
 
     design: "Design"
@@ -151,13 +142,10 @@ class Study:
         return sobol_keys(self.process, count)
 
     def sobol(self, count: int = 64) -> list[VarianceShare]:
-        """Sobol indices of every source from `count` times (sources + 2) draws.
-
-        Args:
-            count: a power of two; 64 tell the important sources from the others.
+        """Sobol indices of every source from `count` times (sources + 2) draws; 64 find the important sources.
 
         Raises:
-            InputError: not a power of two.
+            InputError: `count` is no power of two.
         """
         return sobol(self.process, self.sample(self.sobol_keys(count)), count, self.seed)
 
@@ -166,8 +154,7 @@ class Study:
     ) -> list[list[str]]:
         """The draws that `budget` needs, a list per factor."""
         if not self.limits:
-            cure = 'Give limits, such as "strehl >= 0.8".'
-            raise InputError("budget", "a yield needs limits", "none", cure)
+            raise InputError("budget", "a yield needs limits", "none", 'Give limits, such as "strehl >= 0.8".')
         if not 0 < wanted < 1:
             raise InputError("yield", "must lie between 0 and 1", wanted, "Write 90 % as 0.9.")
         if len(factors) < 2 or factors[0] != 0 or any(b <= a for a, b in pairwise(factors)):
@@ -225,8 +212,8 @@ def study(
             do not depend on how many there are. Without this and `out`, few draws of a small design are evaluated in
             this process, whose numbers may differ in the last digits of single precision.
         scheduler: address of a Dask scheduler, whose workers are taken instead.
-        evaluate: what is asked of every draw; the prediction of `doedesign.prediction` by default. A function that
-            returns rows as that does, and raises `InputError` for errors it cannot describe.
+        evaluate: evaluation of a draw, by default the prediction of `doedesign.prediction`: a function that returns
+            rows as that does, and raises `InputError` for errors it cannot describe.
         quiet: show no progress.
 
     Raises:
@@ -235,7 +222,7 @@ def study(
     design = open_design(design, masks)
     made = resolve_process(process, design.levels, design.spec and design.spec.process)
     # Errors are those of the lab; the design sees them through its masks.
-    made = with_edge_moves(with_errors(made, errors) if errors else made, design.edge_moves_m)
+    made = with_edge_moves(_with_errors(made, errors) if errors else made, design.edge_moves_m)
     if not sources_of(made):
         rule = "a tolerance study needs errors that vary"
         cure = 'Give a process with errors, such as "contact_aligner".'
@@ -252,12 +239,8 @@ def study(
     return Study(design.bare(), made, obeyed, seed, journal, evaluate, run, quiet)
 
 
-def with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
-    """A process with some errors changed; see `study`.
-
-    Raises:
-        InputError: no such error, or a value it cannot have.
-    """
+def _with_errors(process: Process, errors: Mapping[str, Any]) -> Process:
+    """A process with some errors changed as in `study`."""
     from doedesign.spec import ErrorsSpec, process_from_json, validated
 
     in_si = {name: value for name, value in errors.items() if name in DEVIATIONS and DEVIATIONS[name].unit != "1"}

@@ -8,9 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from doedesign.calibration.estimate import Calibration, calibrate
-from doedesign.calibration.explanation_plots import plot_explanations
 from doedesign.calibration.explanations import Curve, Explanation, ExplanationSet, Targets
-from doedesign.calibration.plots import plot_check, plot_estimates, plot_fitted_psfs
+from doedesign.calibration.plots import plot_check, plot_estimates, plot_explanations, plot_fitted_psfs
 from doedesign.report.labels import value_text
 from fab.figure import png_bytes
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
