@@ -11,8 +11,8 @@ from .capture.folder import simulate_files as simulate_files
 from .capture.simulate import SimulatedCapture as SimulatedCapture
 from .capture.simulate import simulate as simulate
 from .design.design import Design as Design
-from .lab.as_built_run import AsBuiltPrediction as AsBuiltPrediction
-from .lab.as_built_run import as_built as as_built
+from .lab.as_built import AsBuiltPrediction as AsBuiltPrediction
+from .lab.as_built import as_built as as_built
 from .lab.order import write_masks as write_masks
 from .optimization import optimize as optimize
 from .prediction import predict as predict

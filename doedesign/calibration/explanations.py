@@ -73,14 +73,10 @@ class Targets(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """Errors that give the measured ratio.
+    """Errors by flat name, SI units, that give the measured ratio, and the model's metrics there.
 
-    Attributes:
-        values: the errors by flat name, SI units.
-        scores: how many standard deviations each lies from its mean.
-        distance: how many they lie from it together.
-        ring_to_disc, throughput, zeroth_order, strehl: the model's metrics there.
-        fits: whether the throughput is within two standard deviations of that measured; None if none was.
+    Scores are standard deviations from the means, `distance` those of all errors together. `fits` says whether the
+    throughput is within two standard deviations of that measured; None if none was.
     """
 
     values: dict[str, float]
@@ -105,10 +101,9 @@ class ExplanationSet(NamedTuple):
     """All explanations of some measured numbers.
 
     Attributes:
-        targets: what was measured.
+        targets: the measured numbers.
         nominal: the model's row at the process's means.
-        singles: explanations by one error, the most plausible first.
-        pairs: explanations by two errors, likewise.
+        singles: explanations by one error, the most plausible first; `pairs` likewise by two.
         none: errors, or pairs, that do not reach the ratio.
         curves: the ratio along every error.
         assumed: errors on which the process is silent, with the standard deviations that were assumed.

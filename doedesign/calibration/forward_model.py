@@ -67,14 +67,7 @@ def _energy(optic: _Optic, plate: VariedDoe, motion: Float[Array, "3"]) -> Float
 
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
-    """A plate in front of a camera, images of point sources at some depths.
-
-    Attributes:
-        level: `[y, x]` levels as drawn.
-        camera: optics and sensor, of one wavelength.
-        unknowns: which errors of the process vary.
-        depths_m: depth of every image.
-    """
+    """A plate, drawn in levels, in front of a camera of one wavelength; images of point sources at some depths."""
 
     level: UInt8[np.ndarray, "y x"]
     camera: Camera

@@ -136,8 +136,6 @@ class Measurement(NamedTuple):
     """A measurement that was read.
 
     Attributes:
-        spec: how it was taken.
-        images: the images.
         window: pixels per side to compare.
         digests: SHA-256 of every file by its name in the TOML file, and of that.
         full: unusable pixels, by image: full in every exposure, or of another colour.

@@ -19,12 +19,9 @@ Image = Float[np.ndarray, "y x"]
 
 
 class MeasuredImage(NamedTuple):
-    """A measured image as it came.
+    """A measured image as it came: the whole merged frame of a point source at a depth.
 
     Attributes:
-        name: its name.
-        depth_m: depth of the point source.
-        psf: the whole merged frame.
         centre: row and column about which its light lies.
         brightness: rate that all light on the clear aperture would give, and its relative standard deviation; None
             where only the shape is known.
@@ -40,13 +37,9 @@ class MeasuredImage(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A measured image in the window, in units in which its light adds up to about 1.
+    """A measured image in the window, in units of `scale` in which its light adds up to about 1.
 
-    Attributes:
-        image: the image as it came.
-        psf: the window.
-        scale: rate of one unit.
-        shift_px: where the chief ray lies, pixels from the window's middle (y, x), as found before the fit.
+    The chief ray lies `shift_px` from the window's middle (y, x), as found before the fit.
     """
 
     image: MeasuredImage
@@ -71,16 +64,9 @@ class Target(NamedTuple):
 
 
 class Match(NamedTuple):
-    """A model's image beside a measured one.
+    """A model's image beside a measured one: residual = image - gain * model - background, weighted.
 
-    Attributes:
-        target: the measured image.
-        weights: inverse variances of its pixels; zero where a pixel says nothing.
-        model: the model's image.
-        gain: what one unit of the model's energy is in the image.
-        background: level of the image.
-        residual: `[y, x]` image - gain * model - background.
-        chi2: weighted sum of squares, with the gain's own term.
+    Weights are inverse variances, zero where a pixel says nothing; chi2 has a term for a gain that is known.
     """
 
     target: Target

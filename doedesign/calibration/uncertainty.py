@@ -11,10 +11,6 @@ of the prior. Nothing more is claimed than the images bear out:
 * What the model gets wrong alike everywhere (`sim.surface`: some thousandths of the light) is in neither. On DOEs
   computed with finer cells than those of the fit it moved overlay by up to 30 nm, line width by 7 nm, depth by 0.1 %.
 * An error counts as determined where its standard deviation is less than half of that of the prior.
-
-Checks: chi2 per pixel of every image; one image predicted from the others; what a lab reads off an image (ring:disc
-ratio, share in the spot) measured and predicted, each with its uncertainty; and whether the cost really rises by one at
-a standard deviation along the least known directions.
 """
 
 from typing import NamedTuple
@@ -118,13 +114,10 @@ def left_out(fit: Linearization) -> list[float]:
 
 
 class Reading(NamedTuple):
-    """A number read off an image, as measured and as the fitted model has it, each with its standard deviation.
+    """A number read off an image, measured (None where an image cannot show it) and predicted by the fitted model.
 
-    Attributes:
-        image: the image.
-        quantity: "ring_to_disc", "far_spot" (share of the window's light), "throughput" or "zeroth_order".
-        measured: as measured; None where an image cannot show it.
-        predicted: by the model.
+    Each with its standard deviation: "ring_to_disc", "far_spot" (share of the window's light), "throughput" or
+    "zeroth_order".
     """
 
     image: str

@@ -69,7 +69,7 @@ def masks(
     if as_built is not None:
         if wafer is not None:
             raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
-        from doedesign.lab.as_built_run import as_built as predict
+        from doedesign.lab.as_built import as_built as predict
 
         folder = source / "as-built"
         predict(source, as_built, order, process=process, out=folder)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from doedesign.build import camera_from_spec, process_from_spec, resolve_process, wafer_from_spec
 from doedesign.design.design import Design
-from doedesign.lab.predictions import PROBE_M, SheetPrediction, predict_sheet
+from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
@@ -108,7 +108,13 @@ def _run_sheet(
 ) -> tuple[RunSheet, bytes | None]:
     """The run sheet of an order in the making, and the picture of what the lab should see."""
     moves_m = [move * order.dbu_m for move in order.edge_moves()]
-    found = _predicted(design, order, moves_m, probe_m)
+    found = None
+    if design is not None and design.spec is not None:
+        drawn = replace(design, level_map=order.level_map)
+        try:
+            found = predict_sheet(drawn, order.process, design.spec.optics.design_wavelength_m, probe_m, moves_m)
+        except InputError as error:
+            log.warning("the run sheet says nothing of the light: %s", error)
     files = {
         plate.name: PhotomaskFile(
             file=f"{order.plate_stem(plate)}.gds",
@@ -134,17 +140,6 @@ def _run_sheet(
         predictions=None if found is None else found.predictions,
     )
     return sheet, None if found is None else found.picture
-
-
-def _predicted(design: Design | None, order: Order, moves_m: list[float], probe_m: float) -> SheetPrediction | None:
-    if design is None or design.spec is None:
-        return None
-    drawn = replace(design, level_map=order.level_map)
-    try:
-        return predict_sheet(drawn, order.process, design.spec.optics.design_wavelength_m, probe_m, moves_m)
-    except InputError as error:
-        log.warning("the run sheet says nothing of the light: %s", error)
-        return None
 
 
 def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Process:

@@ -23,15 +23,7 @@ _WORST = {name: math.inf if metric.worse == "high" else -math.inf for name, metr
 
 
 class Yield(NamedTuple):
-    """Share of good DOEs, with its 95 % confidence interval (Wilson).
-
-    Attributes:
-        share: good ones over all, 0-1.
-        low: lower end of the interval.
-        high: upper end.
-        good: number of good ones.
-        plates: number of all.
-    """
+    """Share of good DOEs, 0-1, with its 95 % confidence interval (Wilson), and the numbers of good ones and of all."""
 
     share: float
     low: float
@@ -119,11 +111,7 @@ class Sample:
         return Sample(tuple(keys), self.places, values, self.limits)
 
     def obeys(self, limit: LimitSpec) -> Bool[np.ndarray, " draw"]:
-        """Whether every row of a draw that a limit concerns obeys it.
-
-        Raises:
-            InputError: the limit concerns no row.
-        """
+        """Whether every row of a draw that a limit concerns obeys it; an InputError if it concerns none."""
         rows = self.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in self.values else []
         if not rows:
             rule = "must match a colour and depth"
@@ -135,20 +123,12 @@ class Sample:
 
     @property
     def good(self) -> Bool[np.ndarray, " draw"]:
-        """Whether a draw obeys every limit; one beyond the model does not.
-
-        Raises:
-            InputError: a limit that concerns no row.
-        """
+        """Whether a draw obeys every limit; one beyond the model does not."""
         return np.logical_and.reduce([self.within, *map(self.obeys, self.limits)])
 
     @property
     def yield_(self) -> Yield | None:
-        """Share of draws that obey every limit; None where there are no limits.
-
-        Raises:
-            InputError: a limit that concerns no row.
-        """
+        """Share of draws that obey every limit; None where there are no limits."""
         return yield_of(self.good) if self.limits else None
 
     @property
@@ -190,10 +170,8 @@ class Sample:
 def sample_of(draws: Mapping[str, Rows | OutOfModel], limits: Sequence[LimitSpec] = ()) -> Sample:
     """Sample of the results of some draws.
 
-    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
-
-    Raises:
-        ValueError: no draws with rows, or draws with different rows.
+    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite. Draws must have the same
+    rows, and one of them any.
     """
     first = next((found for found in draws.values() if not isinstance(found, OutOfModel)), None)
     if first is None:

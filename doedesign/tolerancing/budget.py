@@ -14,13 +14,12 @@ FACTORS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 
 
 class Budget(NamedTuple):
-    """Which standard deviation of some errors gives a wanted yield, all others as they are.
+    """Standard deviation of some errors that gives a wanted yield, all others as they are.
 
     Attributes:
         what: the errors: a source, an error, or an error of one mask.
         wanted: the wanted yield.
-        factors: by which the standard deviations were multiplied.
-        yields: the yield at each factor.
+        factors: by which the standard deviations were multiplied, with the yield at each.
         verdict: "found"; "beyond": even the largest factor gives the wanted yield; "out of reach": not even none of
             these errors does.
         factor: the factor that gives the wanted yield; the largest one tried where the verdict is "beyond", and 0 where

@@ -24,12 +24,9 @@ STUDY_NAME, DRAWS_NAME = "study.json", "draws.jsonl"
 
 
 class Journal:
-    """Results of finished draws.
+    """Results of finished draws by key, kept in a folder or, where that is None, in memory alone.
 
-    Attributes:
-        folder: where they are kept, or None for memory alone.
-        study: what was studied, as JSON.
-        finished: results by key. Only `add` changes it.
+    Only `add` changes `finished`. `study` says what was studied, as JSON.
     """
 
     def __init__(self, folder: Path | None, study: Mapping[str, Any]) -> None:

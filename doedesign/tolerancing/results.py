@@ -201,10 +201,8 @@ def tolerance(
     if budget is not None:
         keys += [key for some in asked.budget_keys(budget, wanted, draws) for key in some]
     keys = list(dict.fromkeys(keys))
-    plan = {
-        **{"draws": draws, "sensitivity": sensitivity, "sobol": sobol},
-        **{"corners": corners, "budget": budget, "wanted": wanted},
-    }
+    plan = {"draws": draws, "sensitivity": sensitivity, "sobol": sobol}
+    plan |= {"corners": corners, "budget": budget, "wanted": wanted}
     with asked.journal.open():
         asked.sample(keys)
         result = ToleranceResult(

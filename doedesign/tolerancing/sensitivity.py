@@ -21,17 +21,11 @@ _RESAMPLES = 500
 
 
 class Effect(NamedTuple):
-    """Effect of one error alone on one quantity, in the worst row or the worst row of one colour.
+    """Effect of one error alone on one quantity, in the worst row of one colour or, where that is None, of all.
 
-    Attributes:
-        error: flat name.
-        source: source of error it belongs to.
-        quantity: the quantity.
-        colour: the colour, or None for all.
-        low: the quantity one standard deviation below the mean; None where the error strays to one side only.
-        expected: with every error at its mean.
-        high: one standard deviation above.
-        variance: about what the error alone adds to the variance, from the slope and the curvature of these three.
+    `low` and `high` are the quantity one standard deviation below and above the mean; there is no lower one where the
+    error strays to one side only. `variance` is about what the error alone adds to the variance, from the slope and the
+    curvature of these and the one with every error at its mean.
     """
 
     error: str

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from doedesign.design.design import Design
-from doedesign.lab.as_built import as_built_doe, compare_gratings, compare_with_sheet
-from doedesign.lab.as_built_run import as_built
+from doedesign.lab.as_built import as_built, as_built_doe, compare_gratings, compare_with_sheet
 from doedesign.lab.predictions import predicted_metrics
 from doedesign.prediction import predict
 from doedesign.runs.folder import open_run
