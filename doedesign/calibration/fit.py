@@ -19,18 +19,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.optimize import LinearConstraint, least_squares, minimize
 
-from doedesign.calibration.objective import (
-    WIDEST_STEP,
-    Evaluation,
-    FitObjective,
-    Jacobian,
-    Linearization,
-    OnModel,
-    difference_jacobian,
-    difference_steps,
-    evaluate_with_gradient,
-    linearised,
-)
+from doedesign.calibration.objective import WIDEST_STEP, Evaluation, FitObjective, Jacobian, Linearization, OnModel
 from doedesign.calibration.target import measured_weights, weights_at
 
 _ROUNDS = 15
@@ -80,8 +69,7 @@ def search(
     if polish:
         after = _polish(found, polish, on_model)
         if after is not found.at:
-            jacobian = difference_jacobian(after, difference_steps(found.sigma), on_model)
-            found = linearised(after, jacobian)
+            found = after.linearised(after.difference_jacobian(found.steps, on_model))
     return found
 
 
@@ -117,7 +105,7 @@ def _global(start: Evaluation, evaluations: int, seed: int, on_model: OnModel) -
 def _local(at: Evaluation, errors: Sequence[float], on_model: OnModel) -> Linearization:
     """Least-squares fits from a model on, each with the weights of the last one's images."""
     most = _EXPLAINED * at.objective.pixels
-    jacobian = difference_jacobian(at, np.full(len(at.scores), WIDEST_STEP), on_model)
+    jacobian = at.difference_jacobian(np.full(len(at.scores), WIDEST_STEP), on_model)
     for _ in range(_ROUNDS):
         explained = at.chi2 < most
         if explained:
@@ -125,11 +113,11 @@ def _local(at: Evaluation, errors: Sequence[float], on_model: OnModel) -> Linear
             at = at.reweighted(
                 tuple(weights_at(m.target, m.gain * m.model, e, max(m.background, 0.0)) for m, e in each)
             )
-        fitting = _LeastSquares(linearised(at, jacobian), explained, on_model)
+        fitting = _LeastSquares(at.linearised(jacobian), explained, on_model)
         before, at, jacobian = at, *fitting.solve()
         if not at.chi2 < most or _settled(fitting.found, before, at):
             break
-    return linearised(at, jacobian)
+    return at.linearised(jacobian)
 
 
 def _settled(around: Linearization, before: Evaluation, after: Evaluation) -> bool:
@@ -185,11 +173,10 @@ class _LeastSquares:
         if (at := self.best) is not self.found.at:
             if _settled(self.found, self.found.at, at):
                 raise _Converged
-            jacobian = difference_jacobian(at, difference_steps(self.found.sigma), self.on_model)
-            self.found = linearised(at, jacobian)
+            self.found = at.linearised(at.difference_jacobian(self.found.steps, self.on_model))
             if not self.explained and at.chi2 < _EXPLAINED * self.objective.pixels:
                 raise _Converged
-        rows = self.found.residual_jacobians()
+        rows = self.found.jacobian.of_residuals(at)
         return np.concatenate([*rows, np.eye(len(at.scores))], axis=1).T @ self.scores_per_x
 
 
@@ -201,7 +188,7 @@ def _polish(found: Linearization, steps: int, on_model: OnModel) -> Evaluation:
     best = [found.at]
 
     def cost(point: np.ndarray) -> tuple[float, np.ndarray]:
-        at, gradient = evaluate_with_gradient(objective, found.at.weights, start + turn @ point)
+        at, gradient = objective.evaluate_with_gradient(found.at.weights, start + turn @ point)
         if at.cost < best[0].cost:
             best[0] = at
         on_model(f"{best[0].chi2 / objective.pixels:.4g} per pixel")

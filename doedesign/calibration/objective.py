@@ -84,6 +84,22 @@ class FitObjective:
         images = (doe.image(i, self.motion(scores, i)) for i in range(len(self.targets)))
         return Evaluation(self, scores, doe, tuple(map(match, self.targets, weights, images)))
 
+    def evaluate_with_gradient(self, weights: Weights, scores: Scores) -> tuple["Evaluation", Scores]:
+        """The model at some scores and the exact gradient of the cost with respect to them."""
+        doe, doe_vjp = self.model.plate_and_vjp(self.values(scores))
+        gradient, matches, total = 2 * scores, [], None
+        for i, target in enumerate(self.targets):
+            image, image_vjp = doe.image_and_vjp(i, self.motion(scores, i))
+            found = match(target, weights[i], image)
+            to_doe, to_motion = image_vjp(-2 * found.gain * weights[i] * found.residual)
+            for place, (kind, unit) in self.motion_units(i).items():
+                gradient[place] += unit * to_motion[kind]
+            matches.append(found)
+            total = to_doe if total is None else VariedDoe(*(a + b for a, b in zip(total, to_doe, strict=True)))
+        assert total is not None  # there is at least one image
+        gradient[: self.errors] += self.unknowns.root.T @ doe_vjp(total)
+        return Evaluation(self, scores, doe, tuple(matches)), gradient
+
 
 class Evaluation(NamedTuple):
     """The model at some scores (errors, then motions) beside the measurement."""
@@ -113,12 +129,55 @@ class Evaluation(NamedTuple):
         images = (found.model for found in self.matches)
         return self._replace(matches=tuple(map(match, self.objective.targets, weights, images)))
 
+    def difference_jacobian(self, steps: Scores, on_model: OnModel = lambda _: None) -> "Jacobian":
+        """Derivatives with respect to all scores by central differences; `on_model` is called after every error."""
+        objective, scores, unknowns = self.objective, self.scores, self.objective.unknowns
+        columns = tuple(np.zeros((len(scores), *found.model.shape)) for found in self.matches)
+        zeroth = np.zeros(len(scores))
+        slack = 1e-3 * unknowns.sigma
+
+        def within(end: Scores) -> bool:
+            values = unknowns.values(end[: objective.errors])
+            return bool(((values >= unknowns.low - slack) & (values <= unknowns.high + slack)).all())
+
+        def difference(k: int) -> None:
+            ends = [scores + sign * steps[k] * np.eye(len(scores))[k] for sign in (1, -1)]
+            if k < objective.errors:
+                # At the end of an error's range the derivative is that to one side.
+                inside = [within(end) for end in ends]
+                ends = [e if fits or not any(inside) else scores for e, fits in zip(ends, inside, strict=True)]
+                does = [objective.model.plate(objective.values(e)) for e in ends]
+                on_model("derivatives")
+            else:
+                does = [self.doe, self.doe]
+            width = float(ends[0][k] - ends[1][k])
+            zeroth[k] = (does[0].zeroth_order() - does[1].zeroth_order()) / width
+            for i, column in enumerate(columns):
+                if k < objective.errors or k in objective.motion_units(i):
+                    high, low = (s.image(i, objective.motion(e, i)) for s, e in zip(does, ends, strict=True))
+                    column[k] = (high - low) / width
+
+        # A DOE keeps one core busy.
+        with ThreadPoolExecutor(min(len(scores), os.cpu_count() or 1, _MOST_THREADS)) as pool:
+            list(pool.map(difference, range(len(scores))))
+        return Jacobian(columns, zeroth)
+
+    def linearised(self, jacobian: "Jacobian") -> "Linearization":
+        """The objective's Hessians and gradients from the derivatives of the images."""
+        rows = jacobian.of_residuals(self)
+        descents = tuple(-j @ found.residuals() for j, found in zip(rows, self.matches, strict=True))
+        return Linearization(self, jacobian, tuple(j @ j.T for j in rows), descents)
+
 
 class Jacobian(NamedTuple):
     """Derivatives of every image and of the DOE's zeroth order with respect to every score."""
 
     images: tuple[Float[np.ndarray, "s y x"], ...]
     zeroth_order: Scores
+
+    def of_residuals(self, at: Evaluation) -> list[Float[np.ndarray, "s n"]]:
+        """Derivatives of every image's residuals with respect to the scores."""
+        return [found.residual_jacobian(columns) for found, columns in zip(at.matches, self.images, strict=True)]
 
 
 class Linearization(NamedTuple):
@@ -139,73 +198,7 @@ class Linearization(NamedTuple):
         """Standard deviation of every score if noise alone counts."""
         return np.sqrt(np.diag(np.linalg.inv(self.half_hessian)))
 
-    def residual_jacobians(self) -> list[Float[np.ndarray, "s n"]]:
-        """Derivatives of every image's residuals with respect to the scores."""
-        return _residual_jacobians(self.at, self.jacobian)
-
-
-def _residual_jacobians(at: Evaluation, jacobian: Jacobian) -> list[Float[np.ndarray, "s n"]]:
-    return [found.residual_jacobian(columns) for found, columns in zip(at.matches, jacobian.images, strict=True)]
-
-
-def linearised(at: Evaluation, jacobian: Jacobian) -> Linearization:
-    """The objective's Hessians and gradients from the derivatives of the images."""
-    rows = _residual_jacobians(at, jacobian)
-    descents = tuple(-j @ found.residuals() for j, found in zip(rows, at.matches, strict=True))
-    return Linearization(at, jacobian, tuple(j @ j.T for j in rows), descents)
-
-
-def evaluate_with_gradient(objective: FitObjective, weights: Weights, scores: Scores) -> tuple[Evaluation, Scores]:
-    """Evaluate the model and the exact gradient of the cost with respect to the scores."""
-    doe, doe_vjp = objective.model.plate_and_vjp(objective.values(scores))
-    gradient, matches, total = 2 * scores, [], None
-    for i, target in enumerate(objective.targets):
-        image, image_vjp = doe.image_and_vjp(i, objective.motion(scores, i))
-        found = match(target, weights[i], image)
-        to_doe, to_motion = image_vjp(-2 * found.gain * weights[i] * found.residual)
-        for place, (kind, unit) in objective.motion_units(i).items():
-            gradient[place] += unit * to_motion[kind]
-        matches.append(found)
-        total = to_doe if total is None else VariedDoe(*(a + b for a, b in zip(total, to_doe, strict=True)))
-    assert total is not None  # there is at least one image
-    gradient[: objective.errors] += objective.unknowns.root.T @ doe_vjp(total)
-    return Evaluation(objective, scores, doe, tuple(matches)), gradient
-
-
-def difference_steps(sigma: Scores) -> Scores:
-    """Steps of central differences for scores known to `sigma`: as wide as what is not yet known."""
-    return np.clip(2 * sigma, _NARROWEST_STEP, WIDEST_STEP)
-
-
-def difference_jacobian(at: Evaluation, steps: Scores, on_model: OnModel = lambda _: None) -> Jacobian:
-    """Derivatives with respect to all scores by central differences; `on_model` is called after every error."""
-    objective, scores, unknowns = at.objective, at.scores, at.objective.unknowns
-    columns = tuple(np.zeros((len(scores), *found.model.shape)) for found in at.matches)
-    zeroth = np.zeros(len(scores))
-    slack = 1e-3 * unknowns.sigma
-
-    def within(end: Scores) -> bool:
-        values = unknowns.values(end[: objective.errors])
-        return bool(((values >= unknowns.low - slack) & (values <= unknowns.high + slack)).all())
-
-    def difference(k: int) -> None:
-        ends = [scores + sign * steps[k] * np.eye(len(scores))[k] for sign in (1, -1)]
-        if k < objective.errors:
-            # At the end of an error's range the derivative is that to one side.
-            inside = [within(end) for end in ends]
-            ends = [e if fits or not any(inside) else scores for e, fits in zip(ends, inside, strict=True)]
-            does = [objective.model.plate(objective.values(e)) for e in ends]
-            on_model("derivatives")
-        else:
-            does = [at.doe, at.doe]
-        width = float(ends[0][k] - ends[1][k])
-        zeroth[k] = (does[0].zeroth_order() - does[1].zeroth_order()) / width
-        for i, column in enumerate(columns):
-            if k < objective.errors or k in objective.motion_units(i):
-                high, low = (s.image(i, objective.motion(e, i)) for s, e in zip(does, ends, strict=True))
-                column[k] = (high - low) / width
-
-    # A DOE keeps one core busy.
-    with ThreadPoolExecutor(min(len(scores), os.cpu_count() or 1, _MOST_THREADS)) as pool:
-        list(pool.map(difference, range(len(scores))))
-    return Jacobian(columns, zeroth)
+    @property
+    def steps(self) -> Scores:
+        """Steps of central differences: as wide as what is not yet known."""
+        return np.clip(2 * self.sigma, _NARROWEST_STEP, WIDEST_STEP)

@@ -89,7 +89,7 @@ def posterior_of(fit: Linearization) -> Posterior:
 def _scatter(fit: Linearization) -> Float[np.ndarray, "s s"]:
     """Sum over blocks of pixels of the outer product of their gradients."""
     total = np.zeros_like(fit.half_hessian)
-    for found, j in zip(fit.at.matches, fit.residual_jacobians(), strict=True):
+    for found, j in zip(fit.at.matches, fit.jacobian.of_residuals(fit.at), strict=True):
         shape = found.model.shape
         gradients = (j * found.residuals())[:, : found.model.size].reshape(-1, *shape)
         side = -(-shape[0] // _BLOCKS)

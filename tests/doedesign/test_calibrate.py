@@ -11,12 +11,7 @@ from doedesign.calibration.estimate import Calibration, calibrate
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import ForwardModel
 from doedesign.calibration.measurement import read_measurement
-from doedesign.calibration.objective import (
-    FitObjective,
-    difference_jacobian,
-    evaluate_with_gradient,
-    linearised,
-)
+from doedesign.calibration.objective import FitObjective
 from doedesign.calibration.target import measured_weights
 from doedesign.calibration.uncertainty import posterior_of
 from doedesign.calibration.unknowns import definite_means, unknowns_of
@@ -247,7 +242,7 @@ def test_slopes_of_the_objective(objective: FitObjective):
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
     scores = scores_near_the_truth(objective)
     at = objective.evaluate(weights, scores)
-    linear = linearised(at, difference_jacobian(at, np.full(len(scores), 0.01)))
+    linear = at.linearised(at.difference_jacobian(np.full(len(scores), 0.01)))
     gradient = 2 * (scores - sum(linear.descents))
     for k in range(len(scores)):
         step = 0.005 * np.eye(len(scores))[k]
@@ -261,8 +256,8 @@ def test_the_exact_gradient_agrees_and_polishes_nothing_away(objective: FitObjec
     """Backwards through light and plate: the same slope as central differences, and the same place to end."""
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)
     scores = scores_near_the_truth(objective)
-    at, gradient = evaluate_with_gradient(objective, weights, scores)
-    linear = linearised(at, difference_jacobian(at, np.full(len(scores), 0.005)))
+    at, gradient = objective.evaluate_with_gradient(weights, scores)
+    linear = at.linearised(at.difference_jacobian(np.full(len(scores), 0.005)))
     expected = 2 * (scores - sum(linear.descents))
     np.testing.assert_allclose(gradient, expected, rtol=0.01, atol=0.01 * np.abs(expected).max())
     plain, polished = search(objective), search(objective, polish=4)
