@@ -1,12 +1,8 @@
 """Arrays on the disk: a header of JSON and named arrays in one file, whole or not at all.
 
-    FILE.npz
-        header      JSON: what the caller says, and "sha256" of that and all arrays
-        NAME ...    the arrays
-
-It is a plain archive, as `numpy.savez` writes it and `numpy.load` reads it: nothing is compressed, and nothing is ever
-unpickled. The same content gives the same bytes. It is written beside an old file and renamed
-(`fab.files.write_atomic`), so a full disk or a kill leaves the old one.
+It is a plain archive, as `numpy.savez` writes it: member "header" is JSON, what the caller says and "sha256" of that
+and of all arrays; the other members are the arrays. Nothing is compressed, nothing is ever unpickled, the same content
+gives the same bytes, and a full disk or a kill leaves the old file (`fab.files.write_atomic`).
 """
 
 import hashlib
@@ -37,10 +33,9 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
 def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read the header and the arrays by name that `write_archive` wrote, after every check on the way.
 
-    Messages say that it should be a whole `what` ("checkpoint"), and end with `cure`.
-
     Raises:
-        InputError: the file is missing, cut off, another archive, or changed since it was written.
+        InputError: the file is missing, cut off, another archive, or changed since it was written; the message says
+            that it must be a whole `what` ("checkpoint") and ends with `cure`.
     """
     rule = f"must be a whole {what}"
     with os_errors_explained(path):

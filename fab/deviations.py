@@ -31,12 +31,7 @@ _MEASURED = {
 
 
 class Source(NamedTuple):
-    """Where a number comes from.
-
-    Attributes:
-        kind: "sourced" for a published number, "estimate" for one that is not.
-        text: who published it, or what it rests on.
-    """
+    """Where a number comes from: "sourced" was published, by whom `text` says; "estimate" rests on what `text` says."""
 
     kind: Literal["sourced", "estimate"]
     text: str
@@ -292,13 +287,7 @@ def error_names(masks: int, *errors: str) -> tuple[str, ...]:
 
 
 def variation_of(masks: int, values: Mapping[str, float], **rest: Any) -> Variation:
-    """A variation from values by flat name; errors that are not named are zero.
-
-    Args:
-        masks: number of etch masks.
-        values: error values by flat name, SI units.
-        rest: `repeats`, `particles`, `pinholes`, `seed`.
-    """
+    """Return a variation from values (SI units) by flat name, other errors zero; `rest` are the other fields."""
     chosen: dict[str, Any] = {}
     for name, value in values.items():
         key, mask = _split(name)

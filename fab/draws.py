@@ -49,11 +49,9 @@ def sources_of(process: Process) -> tuple[str, ...]:
 
 
 def chosen_errors(process: Process, what: str) -> tuple[str, ...]:
-    """Flat names of the varying errors that a source, an error, or an error of one mask means.
+    """Return the flat names of the varying errors that a source, an error, or an error of one mask means.
 
-    Args:
-        process: the process.
-        what: "overlay", "overlay_x", "overlay_x_m", "overlay_x[2]" or "defects", for which no name is returned.
+    `what` is "overlay", "overlay_x", "overlay_x_m", "overlay_x[2]" or "defects", for which no name is returned.
 
     Raises:
         InputError: nothing of that name varies in this process.
@@ -87,10 +85,7 @@ def corner_keys(process: Process) -> list[str]:
 
 
 def one_at_a_time_keys(process: Process) -> list[str]:
-    """Keys of every error alone, one standard deviation to either side.
-
-    An error that is never negative and whose mean is zero strays to one side only.
-    """
+    """Keys of every error alone, one sigma to either side; to one only if never negative and of mean zero."""
     return [
         f"one_at_a_time/{name}/{reach:+g}"
         for name in varying(process)
@@ -112,13 +107,7 @@ def budget_keys(what: str, factors: Iterable[float], count: int) -> list[str]:
 
 
 def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Variation:
-    """The plate a key stands for.
-
-    Args:
-        process: the process.
-        seed: seed of the study.
-        plate_m: side of the square on which particles and pinholes fall.
-        key: the key.
+    """Return the plate that a key stands for, in a study of a seed; `plate_m` is as in `fab.sampling.normal_draw`.
 
     Raises:
         InputError: no such key in a study of this process.

@@ -6,13 +6,8 @@ from collections.abc import Sequence
 class InputError(ValueError):
     """A mistake in what the user gave: a file, a key, a value (exit code 2).
 
-    The message is one sentence and its cure: ``{where}: {rule}, but got {got}. {cure}``.
-
-    Attributes:
-        where: the file, or "file: key", that holds the mistake.
-        rule: what has to hold, without a full stop ("levels must be a power of two").
-        got: what came instead.
-        cure: what to do about it, a full sentence.
+    The message is one sentence and its cure, ``{where}: {rule}, but got {got}. {cure}``: the file or "file: key" with
+    the mistake, what has to hold (no full stop), what came instead, and what to do about it, a full sentence.
     """
 
     def __init__(self, where: str, rule: str, got: object, cure: str) -> None:

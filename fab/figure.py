@@ -161,11 +161,7 @@ def png_bytes(drawn: "Axes | FigureBase") -> bytes:
 
 
 def save(drawn: "Axes | FigureBase", path: str | Path) -> None:
-    """Write the figure that a picture was drawn on as a PNG file.
-
-    Raises:
-        InputError: the system refuses the path.
-    """
+    """Write the figure that a picture was drawn on as a PNG file."""
     write_atomic(path, png_bytes(drawn))
 
 

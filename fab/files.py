@@ -1,8 +1,8 @@
 """Files and folders that appear whole or not at all, their digests, and canonical JSON.
 
-A result is first written under a temporary name beside its final place, forced to the disk and then renamed.
-Whatever happens in between (an exception, a full disk, a kill), the final path holds the old content or the
-new one and never a half. What the operating system refuses is an `InputError` that names the path.
+A result is written under a temporary name beside its final place, forced to the disk and then renamed. Whatever happens
+in between (an exception, a full disk, a kill), the final path holds the old content or the new one and never a half.
+What the operating system refuses is an `InputError` that names the path.
 """
 
 import errno
@@ -124,8 +124,8 @@ def _swap(fresh: Path, path: Path) -> None:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Fill a folder that appears at its final path only when everything in it is on the disk.
 
-    The final folder may be missing, empty, or an earlier result (one that holds ``manifest.json``), which is then
-    replaced whole. What is yielded is a temporary folder beside it to write into; it is removed if the body raises.
+    The temporary folder beside it, which is yielded, is removed if the body raises. An earlier result (with
+    ``manifest.json``) is replaced whole.
 
     Raises:
         InputError: the path is a file, a folder with foreign content, or refused by the system.
@@ -164,10 +164,7 @@ def sha256_file(path: str | Path) -> str:
 
 
 def canonical_json(value: object) -> bytes:
-    """Return a value as JSON whose bytes depend on it alone: sorted keys, one-space indent, newline at the end.
-
-    NaN and infinities, which JSON cannot say, raise a ValueError.
-    """
+    """Return a value as JSON whose bytes depend on it alone; NaN and infinities raise a ValueError."""
     return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
@@ -186,11 +183,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 
 def read_npy(path: str | Path, most: int = 1 << 28) -> NDArray[Any]:
-    """Read an array file of at most `most` elements into memory; objects that would have to be unpickled are refused.
-
-    Raises:
-        InputError: the file is missing, cut off, corrupt, an archive, too large, or holds objects.
-    """
+    """Read an array file of at most `most` elements; anything but one whole array of plain numbers is an InputError."""
     rule = f"the file must be a whole .npy file of 1 to {most} plain numbers"
     cure = "Write the file again from its source."
     try:

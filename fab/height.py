@@ -1,9 +1,8 @@
 """HeightMap: the relief that a user brings, and the reader of its file.
 
-Three kinds of file are read. A bare array (.npy) of floats is metres, ``[y, x]``, row 0 at the lowest y.
-A picture (.png, .tif) is stored from the top row down, as pictures are, so it is turned: what is up in
-the picture is +y. Numbers that are not metres need a scale, the metres that one count stands for: a
-16-bit picture whose full scale 65535 means 1.2 um has the scale 1.2e-6 / 65535.
+A bare array (.npy) of floats is metres, ``[y, x]``, row 0 at the lowest y. A picture (.png, .tif) is stored from the
+top row down, as pictures are, so it is turned: up in the picture is +y. Numbers that are not metres need a scale, the
+metres that one count stands for: a 16-bit picture whose full scale 65535 means 1.2 um has the scale 1.2e-6 / 65535.
 """
 
 from dataclasses import dataclass
@@ -72,11 +71,7 @@ class HeightMap:
 
 
 def refuse_where(height_m: NDArray[np.floating], wrong: NDArray[np.bool_], where: str, rule: str, cure: str) -> None:
-    """Raise InputError if any pixel breaks a rule, saying how many do and where the first is.
-
-    `where`, `rule` and `cure` are those of the message; `wrong` is true where the rule is broken, ``[y, x]`` like
-    `height_m`.
-    """
+    """Raise InputError, with how many and where the first is, if any pixel of `wrong` ``[y, x]`` breaks a rule."""
     count = int(np.count_nonzero(wrong))
     if count:
         row, column = (int(i) for i in np.unravel_index(int(np.argmax(wrong)), wrong.shape))
@@ -119,18 +114,17 @@ def read_height(
     """Read a height map that a user brings; lengths are metres, or text with a unit such as ``"1.85 um"``.
 
     Args:
-        path: ``.npy`` (row 0 at the lowest y), ``.tif``, ``.tiff`` or ``.png`` (first row on top; turned).
+        path: ``.npy``, ``.tif``, ``.tiff`` or ``.png``.
         pitch: edge of a pixel. None of these files holds it, so it must be given.
-        scale: length that one count of the file stands for. Floats are metres if it is left out;
-            integers, and so every PNG, need it.
+        scale: length that one count of the file stands for. Floats are metres if it is left out; integers need it.
         aperture: diameter of the clear aperture; the shorter side of the map if left out.
 
     Returns:
         The height map, float32 if the file holds float32 or float16, otherwise float64.
 
     Raises:
-        InputError: the file is missing, of another kind, cut off, corrupt, too large, complex, not
-            two-dimensional, or holds NaN, infinite or negative heights; or pitch or scale is missing.
+        InputError: the file is missing, damaged, of another kind or too large, its numbers are no heights
+            (`HeightMap`), or pitch or scale is missing.
     """
     path = Path(path)
     if pitch is None:

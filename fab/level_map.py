@@ -72,9 +72,7 @@ class LevelMap:
 
     @classmethod
     def from_height(cls, height: HeightMap, levels: Levels, name: str = "doe", *, wrapped: bool = False) -> "LevelMap":
-        """Give every pixel of a height map the nearest level.
-
-        If `wrapped`, heights repeat after one wave of the design (`fab.levels.quantise_wrapped`).
+        """Give every pixel of a height map the nearest level; if `wrapped`, heights repeat after one wave.
 
         Raises:
             InputError: a height above the staircase that is not to be wrapped, or the aperture does not fit.

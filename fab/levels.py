@@ -144,14 +144,10 @@ def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np
 
 
 def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8]:
-    """Give every pixel the nearest level; halfway goes up, and the top level catches the half step above it.
-
-    Heights ``[y, x]`` are metres above the deepest floor, float32 or float64. Levels ``[y, x]`` are 0 to ``levels.count
-    - 1``.
+    """Give every pixel ``[y, x]`` (metres) the nearest level; halfway goes up, the top takes half a step above it.
 
     Raises:
-        InputError: heights that are NaN, infinite, negative or more than half a step above the top level (the message
-            says how many and where the first is), or an array of another kind.
+        InputError: no heights, or heights more than half a step above the top level.
     """
     require_heights(height_m, "height map")
     top = (levels.count - 0.5) * levels.step_m if levels.is_binary else levels.total_m + 0.5 * levels.step_m
@@ -179,9 +175,8 @@ def quantise(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8
 def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Divide one wave of height among the levels, each of which gets what is nearest to it, waves taken off.
 
-    Returns:
-        Edges in ascending order, metres, ``(count,)``, and the level below the first edge, between any two, and above
-        the last one, ``(count + 1,)``. The first and the last are the same: the wave begins within that level's share.
+    Returns ascending edges, metres, ``(count,)``, and the level below, between and above them, ``(count + 1,)``; the
+    first and the last are the same, since the wave begins within that level's share.
     """
     period = np.float64(levels.period_m)
     places = np.mod(levels.heights_m(), period)
@@ -194,10 +189,7 @@ def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8
 
 
 def quantise_wrapped(height_m: NDArray[np.floating], levels: Levels) -> NDArray[np.uint8]:
-    """Give every pixel ``[y, x]`` the nearest level if heights (metres) repeat after one wave of the design.
-
-    The top of the wave is as near to the lowest level as its foot is.
-    """
+    """Give every pixel ``[y, x]`` (metres) the nearest level, heights repeating after one wave of the design."""
     if levels.is_binary:
         return np.mod(np.rint(height_m / levels.step_m), levels.count).astype(np.uint8)
     edges, cells = wrapped_cells(levels)

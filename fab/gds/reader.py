@@ -1,10 +1,9 @@
 """This package's own GDSII reader: a walk along the chain of records, without any library.
 
-It accepts what `fab.gds.writer` writes and no more: cells of plain boundaries and upright references, every record
-in its place.
-Whatever it does not expect is refused with the file and the offset, so a damaged file cannot pass for a
-different drawing. The file is read a few megabytes at a time; a compiled kernel takes whole elements
-from the front of each block and what is left moves to the front of the next.
+It accepts what `fab.gds.writer` writes and no more: cells of plain boundaries and upright references, every record in
+its place. Anything else is refused with the file and the offset, so a damaged file cannot pass for a different drawing.
+The file is read a few megabytes at a time; a compiled kernel takes whole elements from the front of each block and what
+is left moves to the front of the next.
 """
 
 import struct
@@ -49,11 +48,11 @@ def _from_real(data: bytes) -> float:
 
 @njit(cache=True, nogil=True)
 def _walk(words, rects, rect_keys, points, ends, keys):  # pragma: no cover - compiled
-    """Read whole elements from the front of the words; see `_Found` for the arrays that are filled.
+    """Read whole elements from the front of the words into the arrays of `_Found`.
 
-    Every record of a boundary ends on a multiple of four bytes from the start of the element, so an element is a row of
-    32-bit words: BOUNDARY, LAYER with its number across two words, DATATYPE likewise, XY, points, ENDEL. Returns how
-    many words were read, how many rectangles and polygons, and why it stopped.
+    Every record of a boundary ends on a multiple of four bytes, so an element is a row of 32-bit words: BOUNDARY, LAYER
+    with its number across two words, DATATYPE likewise, XY, points, ENDEL. Returns the counts of words read, rectangles
+    and polygons, and why it stopped.
     """
     p = 0
     count = polygons = used = 0
@@ -252,14 +251,11 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
 def read_gds(path: str | Path) -> Layout:
     """Read a GDSII file of boundaries and upright references, and check every record of it.
 
-    Returns:
-        The layout, every cell after those that it places. Axis-parallel boundaries of four points come back as
-        rectangles, in the order of the file, all others (degenerate ones too) as polygons; layers are sorted and have
-        no names.
+    Axis-parallel boundaries of four points become rectangles, in the order of the file, all others (degenerate ones
+    too) polygons; layers are sorted and have no names.
 
     Raises:
-        InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the file and the
-            offset.
+        InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the offset.
     """
     with os_errors_explained(path), open(path, "rb", buffering=0) as file:
         stream, found, cells = _Stream(path, file), _Found(), []

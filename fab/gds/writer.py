@@ -1,12 +1,11 @@
-"""GDSII and OASIS: the files that carry the geometry, written and read.
+"""GDSII and OASIS: the files that carry the geometry, written.
 
-A GDSII file is a chain of records: two bytes of length, two bytes of type, then big-endian data. A
-rectangle takes exactly 64 bytes, sixteen 32-bit words of which only ten change, so rectangles are written
-as rows of an integer array and go to the disk a few megabytes at a time. Times are fixed, so the same
-layout gives the same bytes.
+A GDSII file is a chain of records: two bytes of length, two bytes of type, then big-endian data. A rectangle takes
+exactly 64 bytes, sixteen 32-bit words of which only ten change, so rectangles go to the disk as rows of an integer
+array, a few megabytes at a time. Times are fixed, so the same layout gives the same bytes.
 
-OASIS is written by KLayout from the rectangles of a GDSII file. They are never merged: polygons with
-10**5 holes take KLayout hours to cut, rectangles compress fiftyfold in seconds.
+OASIS is written by KLayout from the rectangles of a GDSII file. They are never merged: polygons with 10**5 holes take
+KLayout hours to cut, rectangles compress fiftyfold in seconds.
 """
 
 import struct
@@ -93,10 +92,7 @@ def _write_polygon(stream: BinaryIO, layer: Layer, polygon: NDArray[np.int32]) -
 
 
 def write_gds(path: str | Path, layout: Layout) -> None:
-    """Write a layout as GDSII; the memory needed does not grow with the file.
-
-    Write it inside an `atomic_folder` where a half-written file would do harm.
-    """
+    """Write a layout as GDSII; the memory needed does not grow with the file. Not atomic: use `atomic_folder`."""
     with os_errors_explained(path), open(path, "wb", buffering=0) as stream:
         stream.write(_opening(layout.dbu_m))
         for cell in layout.cells:
@@ -130,10 +126,7 @@ def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> N
 
 
 def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:
-    """Write the content of an OASIS file, which may be broken, as GDSII, through KLayout.
-
-    It may hold at most `most` shapes, since a broken count can stand for billions.
-    """
+    """Write an OASIS file, which may be broken and so stand for billions of shapes, as GDSII through KLayout."""
     import klayout.db as kdb
 
     layout = kdb.Layout()

@@ -82,10 +82,7 @@ def _fill(boxes, out):  # pragma: no cover - compiled
 
 
 class _Raster(NamedTuple):
-    """The lines of a moved raster, and the pixels within the move of its cells, by first and end.
-
-    Shrinking is growing of the complement, which has one more pixel on every side: the blank glass around the plate.
-    """
+    """Lines of a moved raster, and first and end pixel within the move of its cells; shrinking grows the complement."""
 
     x: NDArray[np.int64]
     y: NDArray[np.int64]
@@ -120,15 +117,7 @@ class _Raster(NamedTuple):
 
 
 def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shapes:
-    """Draw a plane ``[y, x]`` of 0 and 1 (1 where etched) with all its edges moved.
-
-    Args:
-        plane: the plane.
-        edges: where the pixel edges fall in the drawing.
-        move_units: how far every edge of an etched area moves outward, database units; inward where negative.
-
-    Returns:
-        Rectangles that do not overlap, sorted by y0, then x0.
+    """Draw a plane ``[y, x]`` of 0 and 1 (1 where etched), its edges moved outward by database units, inward if < 0.
 
     Raises:
         InputError: moving the edges back would not give the plane, because a line or a space is not wider than twice
@@ -150,13 +139,10 @@ def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shape
 
 
 def read_back(shapes: Shapes, edges: PixelEdges, move_units: int) -> NDArray[np.uint8]:
-    """Return the plane ``[y, x]`` that a drawing was made from by `grown`, and prove that it was.
-
-    Drawing it again with this move covers exactly the same area.
+    """Return the plane ``[y, x]`` of which `grown` makes this drawing, and prove that it does.
 
     Raises:
-        InputError: polygons, rectangles that overlap, a coordinate that is no moved pixel edge, or an area that no
-            plane gives with this move.
+        InputError: polygons, rectangles that overlap, an edge that is no moved pixel edge, or the area of no plane.
     """
     raster, where = _Raster.of(edges, move_units), "compensated mask"
     boxes = shapes.rectangles.astype(np.int64)

@@ -15,18 +15,10 @@ def mask_layout(
     edge_moves: Sequence[int] = (),
     bits: Sequence[int] = (),
 ) -> Layout:
-    """Draw the planes and the chrome of one DOE as one cell, centred on the clear aperture.
+    """Draw planes and chrome of one DOE as one cell, centred on the aperture: a layer per etch mask, the chrome last.
 
-    Args:
-        level_map: the DOE.
-        cell: name of the cell.
-        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
-        edge_moves: per mask, how far every edge of an etched area is moved outward, database units; nowhere if left out
-            (`fab.layout.compensation`).
-        bits: which plane each mask draws, its own if left out (`fab.layout.split`).
-
-    Returns:
-        One layer per etch mask, mask 0 first, and the chrome last.
+    `edge_moves` says per mask how far every edge of an etched area is moved outward, database units
+    (`fab.layout.compensation`), `bits` which plane each mask draws, its own by default (`fab.layout.split`).
     """
     levels, edges = level_map.levels, pixel_edges(level_map.grid)
     moves = edge_moves or (0,) * levels.bits

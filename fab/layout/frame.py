@@ -70,17 +70,11 @@ def draw_frame(
     chrome_m: float,
     dbu_m: float,
 ) -> Frame:
-    """Draw everything around a DOE.
+    """Draw everything around a DOE; lengths in metres.
 
-    Args:
-        wafer: what is filled.
-        plates: the photomasks in the order in which they are used.
-        level_map: the DOE.
-        splits: how the DOE is drawn, as ordered first; the others take one die each, the last ones.
-        stem: name of the job; that of the top cell. The cells of the DOE are named after it and the split's code.
-        minimum_line_m: narrowest line that the process prints, metres.
-        chrome_m: diameter of the DOE with its chrome, metres.
-        dbu_m: database unit, metres.
+    The photomasks come in the order in which they are used. The DOE as ordered is the first of the splits; the others
+    take one die each, the last ones. `stem` names the job and the top cell, and begins the names of the others.
+    `chrome_m` is the diameter of the DOE with its chrome.
 
     Raises:
         InputError: the wafer is too small for what is asked, or the dies lie too close.

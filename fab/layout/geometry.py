@@ -33,13 +33,7 @@ _LIMIT = 2**31 - 1
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of the drawing. Two layers are the same if number and datatype are; files lose the name.
-
-    Attributes:
-        number: GDSII layer number.
-        datatype: GDSII datatype.
-        name: what it is, for people.
-    """
+    """A layer of the drawing by its GDSII numbers; its name, for people, is left out of files and comparisons."""
 
     number: int
     datatype: int = 0
@@ -58,12 +52,7 @@ def layer_from(text: str) -> Layer:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """The rectangles and polygons of one layer.
-
-    Attributes:
-        rectangles: ``(n, 4)`` int32: x0, y0, x1, y1 with x0 < x1 and y0 < y1, in database units.
-        polygons: simple polygons, each ``(v, 2)`` int32 vertices x, y, not closed.
-    """
+    """Rectangles ``(n, 4)``, x0 < x1 and y0 < y1, and simple polygons ``(v, 2)``, not closed, in database units."""
 
     rectangles: NDArray[np.int32]
     polygons: tuple[NDArray[np.int32], ...] = ()
@@ -97,14 +86,7 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Reference:
-    """A cell placed in another one, once or on a raster; never turned, never mirrored.
-
-    Attributes:
-        cell: name of the placed cell.
-        x: where its origin comes to lie, in database units; likewise `y`.
-        columns: copies along x, `step_x` apart.
-        rows: copies along y, `step_y` apart.
-    """
+    """A cell placed with its origin at x, y (database units), once or on a raster; never turned, never mirrored."""
 
     cell: str
     x: int = 0
@@ -126,12 +108,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Everything in one file.
-
-    Attributes:
-        dbu_m: database unit, metres.
-        cells: every cell after those that it places; the last one is the top.
-    """
+    """Everything in one file: its database unit in metres, and every cell after those that it places, the top last."""
 
     dbu_m: float
     cells: tuple[Cell, ...]
@@ -208,13 +185,9 @@ class Chrome:
 
 @dataclass(frozen=True, eq=False)
 class PixelEdges:
-    """Where the pixel edges of a grid fall in the drawing.
+    """Pixel edges of a grid in the drawing: ``(nx + 1,)`` x and ``(ny + 1,)`` y in database units of `dbu_m` metres.
 
-    Attributes:
-        x: coordinates of the edges along x in database units, ``(nx + 1,)`` int32.
-        y: the same along y, ``(ny + 1,)``.
-        dbu_m: the database unit, metres.
-        shift_m: how far the worst edge was moved to fall on the database unit; 0 if every one is exact.
+    `shift_m` is how far the worst edge was moved to fall on the database unit; 0 if every one is exact.
     """
 
     x: NDArray[np.int32]
@@ -232,11 +205,7 @@ def _axis_edges(count: int, pitch_fm: int, unit_fm: int) -> tuple[NDArray[np.int
 
 
 def pixel_edges(grid: Grid) -> PixelEdges:
-    """Place the pixel edges of a grid on a database unit, 1 nm wherever it can be; the grid's centre is the origin.
-
-    Raises:
-        InputError: pixels finer than 10 nm, or a raster too large for 32-bit coordinates.
-    """
+    """Place the pixel edges of a grid on a database unit, 1 nm wherever it can be; the grid's centre is the origin."""
     # The pitch is meant as a decimal number; whole femtometres recover it from the binary one.
     pitch_fm = round(grid.pitch_m * _FEMTO)
     if pitch_fm < 10 * _NANO_FM or max(grid.extent_m) / 2 > _LIMIT * NM:
@@ -271,10 +240,7 @@ def chrome_layer(levels: Levels) -> Layer:
 
 
 def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
-    """Draw the chrome around the clear aperture as an annulus; a polygon means "chrome here".
-
-    The polygons are sectors that share their radial edges, on a database unit of `dbu_m` (metres).
-    """
+    """Draw the chrome around the clear aperture as sectors of an annulus that share their radial edges."""
     inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(level_map))
     if outer > _LIMIT:
         got = format_length(outer * dbu_m)

@@ -69,10 +69,7 @@ _GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {
 
 
 def letter_boxes(text: str) -> NDArray[np.int32]:
-    """Return the disjoint rectangles of a line of text that stands on y = 0 from x = 0.
-
-    They are ``(n, 4)``: x0, y0, x1, y1, in strokes. The text may hold A-Z, 0-9, ``. - _ / : +`` and spaces.
-    """
+    """Return the disjoint rectangles ``(n, 4)`` x0, y0, x1, y1, in strokes, of text that stands on y = 0 from x = 0."""
     odd = sorted(set(text) - set(_GLYPHS))
     if odd:
         rule = "must hold A-Z, 0-9, . - _ / : + and spaces only"
@@ -82,10 +79,7 @@ def letter_boxes(text: str) -> NDArray[np.int32]:
 
 
 def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
-    """Draw a line of text that stands on y = 0 from x = 0, with letters of a height in metres.
-
-    A stroke is a seventh of the height, rounded to whole database units.
-    """
+    """Draw text that stands on y = 0 from x = 0, letters `height_m` high, a stroke a seventh of it in whole units."""
     stroke = round(height_m / HEIGHT / dbu_m)
     if stroke < 1:
         rule = "letters must be seven database units high or more"
@@ -105,10 +99,10 @@ def mask_label(job: str, plate: Photomask, reading: str, digest: str) -> list[st
 
 
 def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: float, dbu_m: float) -> Part:
-    """Write the labels of several masks one below the other, so that no two meet on the wafer.
+    """Write the labels of masks (photomask and lines), the first on top, on datatype 3 of each, so that no two meet.
 
-    Labels are photomasks and their lines, the first on top; letters are `height_m` (metres) high. The lettering is on
-    datatype 3 of each plate, its lower left corner at (0, 0). Places: "label, mask 3", the lower left corner of each.
+    The lower left corner is (0, 0), letters are `height_m` high. Places: "label, mask 3", the lower left corner of
+    each.
     """
     stroke_m = height_m / HEIGHT
     blocks = []

@@ -180,17 +180,11 @@ def _brackets(first: Photomask, box: tuple[int, int, int, int], dbu_m: float) ->
 
 
 def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
-    """Draw a site of the wafer where all masks are aligned.
+    """Draw a site of the wafer where all masks are aligned; the first photomask in order of use makes the marks.
 
-    Args:
-        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`); the first makes
-            the marks.
-        dbu_m: database unit, metres.
-
-    Returns:
-        Marks on datatype 1 and lettering on datatype 3 of each plate, centred on the origin; brackets, a cross and a
-        title of the first plate show where the site is. Places: the centre of every mark, such as "vernier x, mask 3",
-        "box 5 um, chrome", "finder, mask 1", and the lower left corner of each "F, mask 2".
+    Marks are on datatype 1 and lettering on datatype 3 of each plate, centred on the origin; brackets, a cross and a
+    title of the first plate show where the site is. Places: the centre of every mark, such as "vernier x, mask 3", "box
+    5 um, chrome", "finder, mask 1", and the lower left corner of each "F, mask 2".
     """
     first, others = plates[0], plates[1:]
     title = f"REF {first.code} " + ("CHROME" if first.bit is None else first.depth.upper())
@@ -203,11 +197,7 @@ def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
 
 
 def die_marks(plates: Sequence[Photomask], dbu_m: float) -> Part:
-    """Draw the smaller marks that stand beside a die, to measure the overlay there.
-
-    They are the boxes with gaps of 5, 3 and 2 um, the verniers and the F of every plate, centred on the origin; layers
-    and places as in `alignment_site`.
-    """
+    """Draw the smaller marks beside a die, to measure overlay there: boxes, verniers and F of `alignment_site`."""
     first, others = plates[0], plates[1:]
     slots = [_die_slot(first, plate, dbu_m) for plate in others]
     f = _letter_f(first, 16, dbu_m)

@@ -29,13 +29,7 @@ _LIMIT = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A group of shapes on any layers.
-
-    Attributes:
-        dbu_m: database unit, metres.
-        shapes: what is drawn, about the part's own origin, in database units.
-        places: named points that people measure at, ``(x_m, y_m)`` in metres from the same origin.
-    """
+    """Shapes on any layers about their own origin, and named points x, y (metres from it) that people measure at."""
 
     dbu_m: float
     shapes: Mapping[Layer, Shapes]
@@ -52,14 +46,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Photomask:
-    """One mask of the set.
+    """One mask of the set: its layer, what polygons are on the plate, and what it makes.
 
-    Attributes:
-        layer: number of its layer; marks are datatype 1 of it, test structures 2, lettering 3.
-        tone: what polygons are on the plate, "clear" or "dark".
-        makes: "etch", "liftoff" or "wet etch" of the chrome aperture, or the "zero layer".
-        bit: bit of the levels that it etches; None if it makes chrome.
-        depth_m: depth that it etches, metres; 0 if it makes chrome.
+    Marks are datatype 1 of the layer, test structures 2, lettering 3. An etch mask has its bit of the levels and the
+    depth that it etches (metres); one that makes chrome has None and 0.
     """
 
     layer: int
@@ -91,21 +81,11 @@ class Photomask:
 def photomasks_of(
     levels: Levels, order: Sequence[int], tone: Tone, chrome: Literal["liftoff", "etch", "none"], zero_layer: bool
 ) -> tuple[Photomask, ...]:
-    """List the photomasks of a job in the order in which they are used.
+    """List the photomasks of a job in the order in which they are used: zero layer, etch masks, chrome.
 
-    The resist is the same at every step, so that chrome that is etched away around its polygons needs the other tone
-    than chrome that is lifted off, or than an etch.
-
-    Args:
-        levels: the staircase.
-        order: the etch masks by bit, first etched first.
-        tone: what polygons of the etch masks are on their plates.
-        chrome: how the chrome aperture is made, or "none".
-        zero_layer: whether chrome marks are made before the first etch.
-
-    Returns:
-        The zero layer if there is one, the etch masks, and the chrome if there is any. The first of them makes the
-        marks that all others are aligned to.
+    The first of them makes the marks that all others are aligned to. `tone` is that of the etch masks. The resist is
+    the same at every step, so that chrome that is etched away around its polygons needs the other tone than chrome that
+    is lifted off, or than an etch.
     """
     opposite: Tone = "dark" if tone == "clear" else "clear"
     chrome_tone = opposite if chrome == "etch" else tone
@@ -117,11 +97,7 @@ def photomasks_of(
 
 
 def without(areas: ArrayLike, holes: ArrayLike = ()) -> NDArray[np.float64]:
-    """Cover some boxes less some others with disjoint boxes.
-
-    Boxes are ``(n, 4)``: x0, y0, x1, y1. `areas` may overlap; what lies in one of `holes` is left out. The corners of
-    the result are corners of the arguments.
-    """
+    """Cover boxes ``(n, 4)`` x0, y0, x1, y1, which may overlap, less some holes, with disjoint boxes."""
     areas, holes = (np.asarray(boxes, dtype=np.float64).reshape(-1, 4) for boxes in (areas, holes))
     both = np.concatenate([areas, holes])
     x, y = (np.unique(both[:, axis::2]) for axis in (0, 1))
@@ -140,10 +116,7 @@ def turned(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def block(layer: Layer, boxes_um: ArrayLike, dbu_m: float) -> Part:
-    """Draw disjoint boxes ``(n, 4)`` (x0, y0, x1, y1 in micrometres) on one layer; the part has no places.
-
-    A corner that is no whole database unit is a ValueError.
-    """
+    """Draw disjoint boxes ``(n, 4)`` on one layer; corners (micrometres) off the database unit are a ValueError."""
     exact = np.asarray(boxes_um, dtype=np.float64).reshape(-1, 4) * (UM / dbu_m)
     whole = np.rint(exact)
     # 1e-3 of a unit is far above the rounding of these products and far below anything that is meant.
@@ -176,10 +149,7 @@ def prefixed(part: Part, prefix: str) -> Part:
 
 
 def joined(parts: Iterable[Part]) -> Part:
-    """Put parts together as they lie; layers come in the order of their numbers and datatypes.
-
-    ValueError where there is no part, or different units, or a name of a place twice.
-    """
+    """Put parts together as they lie, layers in order; ValueError for none, mixed units or a place named twice."""
     parts = list(parts)
     if len({part.dbu_m for part in parts}) != 1:
         raise ValueError("parts that are joined must have one database unit")

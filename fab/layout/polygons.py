@@ -76,15 +76,10 @@ def _sweep(bitmap, x_edges, y_edges, out):  # pragma: no cover - compiled
 def rectangles(
     bitmap: NDArray[np.uint8], x_edges: NDArray[np.int32] | None = None, y_edges: NDArray[np.int32] | None = None
 ) -> NDArray[np.int32]:
-    """Cover the set pixels of a bitmap ``[y, x]`` with disjoint rectangles.
+    """Cover the set pixels of a bitmap ``[y, x]`` with disjoint rectangles ``(n, 4)``: x0, y0, x1, y1 by y0, then x0.
 
-    Args:
-        bitmap: zero or not.
-        x_edges: coordinate of each pixel edge along x, increasing, ``(nx + 1,)``; pixel numbers if left out.
-        y_edges: the same along y, ``(ny + 1,)``.
-
-    Returns:
-        ``(n, 4)`` int32: x0, y0, x1, y1 of each rectangle, sorted by y0, then x0.
+    The edges are the coordinates of the pixel edges, increasing, ``(nx + 1,)`` and ``(ny + 1,)``; pixel numbers if left
+    out.
     """
     bitmap = np.ascontiguousarray(bitmap).view(np.uint8)
     ny, nx = bitmap.shape
@@ -178,10 +173,7 @@ def _smallest_runs(bitmap, none):  # pragma: no cover - compiled
 
 
 def smallest_runs(bitmap: NDArray[np.uint8]) -> tuple[int | None, int | None]:
-    """Return the narrowest line and the narrowest gap of a plane ``[y, x]``, along x or y, in pixels.
-
-    They are the shortest run of set pixels, and of clear pixels between two set ones; None where there is no such run.
-    """
+    """Return narrowest line, and gap between two, of a plane ``[y, x]`` along x or y, in pixels; None if none."""
     none = max(bitmap.shape) + 1
     lines = (np.ascontiguousarray(bitmap), np.ascontiguousarray(bitmap.T))
     width, space = (min(pair) for pair in zip(*(_smallest_runs(line, none) for line in lines), strict=True))
@@ -208,17 +200,11 @@ def run_lengths(bitmap: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[np.int32]]:
-    """Draw the annulus between two centred circles as sectors without holes; lengths in database units.
+    """Draw the annulus between two centred circles as sectors ``(v, 2)`` of at most `MAX_VERTICES`; database units.
 
-    The vertices lie on the circles (rounded to whole units) and the chords inside them, so the opening is
-    smaller than the circle by at most the chord error. The number of sectors is a multiple of four.
-
-    Returns:
-        One ``(v, 2)`` int32 polygon of x, y per sector, counter-clockwise from angle 0, at most
-        `MAX_VERTICES` vertices each.
-
-    Raises:
-        ValueError: the radii are not ``0 < inner < outer`` or the chord error is not positive.
+    The vertices lie on the circles (rounded to whole units) and the chords inside them, so the opening is smaller than
+    the circle by at most the chord error. The number of sectors is a multiple of four. ValueError unless 0 < inner <
+    outer.
     """
     if not 0 < inner < outer or not chord_error > 0:
         raise ValueError(f"need 0 < inner < outer and chord_error > 0, but got {inner}, {outer}, {chord_error}")

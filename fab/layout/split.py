@@ -18,12 +18,8 @@ from fab.units import format_length
 class DieSplit:
     """One way to draw a DOE.
 
-    Attributes:
-        code: end of its cells' names.
-        words: what is special about it; empty for the DOE as ordered.
-        lettering: what is written on its die.
-        bits: which plane each mask draws, mask 0 first.
-        moves: how far each mask moves the edges of etched areas outward, database units, mask 0 first.
+    Its cells' names end with `code`, `words` say what is special (nothing for the DOE as ordered), `lettering` says it
+    on the die. Mask k draws plane `bits[k]`, the edges of etched areas moved outward by `moves[k]` database units.
     """
 
     code: str
@@ -34,17 +30,7 @@ class DieSplit:
 
 
 def splits_of(wafer: Wafer, levels: Levels, moves: tuple[int, ...], dbu_m: float) -> tuple[DieSplit, ...]:
-    """List the ways in which a wafer's dies are drawn.
-
-    Args:
-        wafer: says which are wanted.
-        levels: the staircase.
-        moves: how far each mask of the DOE as ordered moves its edges outward, database units.
-        dbu_m: database unit, metres.
-
-    Returns:
-        The DOE as ordered, the line-width splits in the order of the wafer's list, the control of the etch order.
-    """
+    """List the ways to draw a wafer's dies: as ordered (edges moved by `moves`), line-width splits, order control."""
     bits = tuple(range(levels.bits))
     splits = [DieSplit("DOE", "", "", bits, moves)]
     for number, move_m in enumerate(wafer.line_splits_m, 1):

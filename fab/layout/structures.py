@@ -54,11 +54,10 @@ def _group(width_um: float, gaps: bool) -> list[Boxes]:
 
 
 def cd_bars(plate: Photomask, dbu_m: float) -> Part:
-    """Draw the bars by which line widths are measured.
+    """Draw the bars by which line widths are measured, a row per width, thinnest on top: lines left, gaps right.
 
-    A line per width, thinnest on top: lines at the left, gaps at the right; in each five side by side and one alone
-    along y, then the same along x. Places: the middle of the lone bar along y, "CD 2 um line, mask 3" and "CD 2 um gap,
-    mask 3".
+    Each is five side by side and one alone along y, then along x. Places: the middle of the lone one along y, "CD 2 um
+    line, mask 3" and "CD 2 um gap, mask 3".
     """
     parts = []
     for number, width in enumerate(BAR_WIDTHS_UM):
@@ -106,11 +105,10 @@ def _stripes(codes: Sequence[int], bits: Sequence[int], width: int, height: int,
 
 
 def staircase(levels: Levels, bits: Sequence[int], step_m: float, dbu_m: float) -> Part:
-    """Draw all the depths that some masks make together as one staircase down toward +x.
+    """Draw all depths that some masks make together as one staircase down toward +x, 0.2 mm high, from the blank glass.
 
-    Its steps are `step_m` (metres) wide. It goes from the blank glass (which is not drawn) to the deepest floor, from x
-    = 0 on, 0.2 mm high along y. Places: on the blank glass before the first step and behind the last one, "staircase 16
-    levels, start" and "..., end": a scan from one to the other crosses every step once.
+    Steps are `step_m` (metres) wide. Places: on the blank glass before the first step and behind the last one,
+    "staircase 16 levels, start" and "..., end": a scan from one to the other crosses every step once.
     """
     codes = codes_by_depth(levels, bits)
     step, height = round(step_m / dbu_m), round(_STAIR_UM * UM / dbu_m)
@@ -177,20 +175,12 @@ def _gratings(levels: Levels, plates: Sequence[Photomask], stripe: int, dbu_m: f
 def process_monitor(
     levels: Levels, plates: Sequence[Photomask], pitch_m: float, dbu_m: float, minimum_line_m: float
 ) -> Part:
-    """Draw all test structures of a job.
+    """Draw all test structures of a job, centred on the origin, about 4.5 mm x 5 mm for 16 levels.
 
-    Args:
-        levels: the staircase.
-        plates: all photomasks (`fab.layout.part.photomasks_of`); the zero layer has no test structures.
-        pitch_m: pixel pitch of the DOE, metres; the gratings are made of such pixels.
-        dbu_m: database unit, metres.
-        minimum_line_m: narrowest line and gap the process prints, metres; the gratings keep to it, the bars do not,
-            since they are there to find it.
-
-    Returns:
-        The structures, centred on the origin, about 4.5 mm x 5 mm for 16 levels. Places: those of `cd_bars`,
-        `depth_pads` and `staircase`, and the middles of "grating binary", "grating blazed" and "grating blank" (an
-        empty window in the same chrome frame, if there is chrome).
+    The gratings are made of pixels of the DOE (`pitch_m`) and keep to the narrowest line of the process; the bars do
+    not, since they are there to find it. Places: those of `cd_bars`, `depth_pads` and `staircase`, and the middles of
+    "grating binary", "grating blazed" and "grating blank" (an empty window in the same chrome frame, if there is
+    chrome).
     """
     tested = sorted((plate for plate in plates if plate.makes != "zero layer"), key=lambda plate: plate.layer)
     cells = []

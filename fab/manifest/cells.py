@@ -11,10 +11,7 @@ from fab.units import UM
 
 
 def geometry(shapes: Shapes, dbu_m: float) -> dict[str, object]:
-    """Return count, area and box of shapes in the units of the manifest.
-
-    They are `polygons`, `area_um2` and `box_um` (x0, y0, x1, y1, or None where there is nothing).
-    """
+    """Return polygons, area_um2 and box_um (x0, y0, x1, y1, or None) of shapes, as the manifest states them."""
     box, unit_um = shapes.box, dbu_m / UM
     return {
         "polygons": len(shapes),
