@@ -11,7 +11,6 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: str, rule: str, got: object, cure: str) -> None:
-        """Build the message from its four parts."""
         self.where = where
         self.rule = rule
         self.got = got
@@ -27,7 +26,6 @@ class CheckFailed(Exception):
     """Differences that a verification found, each naming its file (exit code 1); the input itself is not wrong."""
 
     def __init__(self, differences: Sequence[str]) -> None:
-        """Collect the differences, one sentence each."""
         self.differences = tuple(differences)
         super().__init__(self.differences)
 

@@ -29,7 +29,6 @@ class Grid:
     pitch_m: float
 
     def __post_init__(self) -> None:
-        """Check the values."""
         ny, nx = self.shape
         if ny < 1 or nx < 1:
             raise InputError("grid: shape", "must have at least one pixel per axis", self.shape, "Give a filled map.")

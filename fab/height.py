@@ -44,7 +44,6 @@ class HeightMap:
     aperture_m: float
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.height_m.shape != self.grid.shape:
             got = f"{self.height_m.shape} on {self.grid.shape}"
             raise InputError("height map", "must have the grid's shape", got, "Use its own grid.")

@@ -57,7 +57,6 @@ class LevelMap:
     name: str = "doe"
 
     def __post_init__(self) -> None:
-        """Check the values and leave the glass blank outside the aperture."""
         checked = require_levels(np.asarray(self.level), self.levels)
         if checked.shape != self.grid.shape:
             rule = f"must have the grid's shape {self.grid.shape}"

@@ -46,7 +46,6 @@ class Levels:
     depths_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the values, and fill in the depths."""
         if self.count not in (2, 4, 8, 16, 32, 64):
             raise InputError(
                 "levels", "must be a power of two from 2 to 64", self.count, "Choose 2, 4, 8, 16, 32 or 64."

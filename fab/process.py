@@ -68,11 +68,6 @@ class Defects:
     doubled: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: a negative density or radius, or chances that are none.
-        """
         for field_ in fields(self):
             value = getattr(self, field_.name)
             if not 0 <= value < math.inf:
@@ -112,12 +107,6 @@ class Process:
     name: str = "ideal"
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            InputError: an order that does not name every mask once, an unknown error or an impossible spread, an
-                unknown tone, or a length that cannot be.
-        """
         masks = tuple(range(self.levels.bits))
         if not self.order:
             object.__setattr__(self, "order", tuple(sorted(masks, key=self.levels.etch_depth_m)))

@@ -32,15 +32,10 @@ def source_of(name: str) -> str:
 
 
 def draw_at(process: Process, scores: NDArray[np.floating], seed: int = 0, **rest: object) -> Variation:
-    """The plate whose errors stray by these scores.
+    """Return the plate whose errors stray by scores, one per name of `varying`, in standard deviations from the mean.
 
-    Args:
-        process: the process.
-        scores: one per name of `varying(process)`, standard deviations from the mean.
-        seed: seed of the roughness.
-        rest: `repeats`, `particles`, `pinholes`.
-
-    One-sided errors are the absolute value of mean + score * sigma (a folded normal distribution).
+    One-sided errors are the absolute value of mean + score * sigma (a folded normal distribution). `seed` is that of
+    the roughness, `rest` may be `repeats`, `particles`, `pinholes`.
     """
     strayed = dict(zip(varying(process), (float(s) for s in scores), strict=True))
     values = {}
@@ -56,13 +51,9 @@ def normal_scores(process: Process, seed: int, index: int) -> NDArray[np.float64
 
 
 def normal_draw(process: Process, seed: int, index: int, plate_m: float) -> Variation:
-    """Draw number `index` of a Monte-Carlo study, rare events included.
+    """Draw `index` of a Monte-Carlo study of a seed, rare events included; it depends on nothing else.
 
-    Args:
-        process: the process.
-        seed: seed of the study.
-        index: number of the draw; the result depends on nothing else.
-        plate_m: side of the square on which particles and pinholes fall.
+    Particles and pinholes fall on a square of side `plate_m`.
     """
     # A second stream, so that rare events do not shift the scores.
     rng = np.random.default_rng([seed, index, 1])
@@ -96,13 +87,10 @@ def _discs(rng: np.random.Generator, mean_count: float, radius_m: float, side_m:
 
 
 def corner_scores(process: Process, reach: float = 2.0) -> NDArray[np.float64]:
-    """Worst-case corners: every varying error at `reach` standard deviations to one side or the other.
+    """Return scores ``[corner, error]`` of the worst cases, every varying error at `reach` sigma to either side.
 
     Up to six errors give every combination of signs; more give the rows of a Hadamard matrix and their opposites, in
     which every pair of errors meets in all four combinations equally often.
-
-    Returns:
-        `[corner, error]` scores.
     """
     count = len(varying(process))
     if count <= _ALL_CORNERS:
@@ -114,11 +102,7 @@ def corner_scores(process: Process, reach: float = 2.0) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=32)
 def sobol_scores(errors: int, power: int, seed: int = 0) -> NDArray[np.float64]:
-    """First `2**power` rows of a scrambled Sobol sequence as normal scores; more rows leave them as they are.
-
-    Returns:
-        `[draw, error]` scores, read-only.
-    """
+    """Return `2**power` rows ``[draw, error]`` of a scrambled Sobol sequence as normal scores, read-only."""
     if errors == 0:
         return np.zeros((2**power, 0))
     from scipy.stats import norm, qmc
@@ -131,10 +115,6 @@ def sobol_scores(errors: int, power: int, seed: int = 0) -> NDArray[np.float64]:
 
 
 def one_at_a_time_scores(process: Process, reaches: Sequence[float] = (-1.0, 1.0)) -> NDArray[np.float64]:
-    """Each varying error alone at each of some scores, all others at their mean.
-
-    Returns:
-        `[error * reach, error]` scores, reaches of the first error first.
-    """
+    """Return scores ``[error * reach, error]`` of each varying error alone, reaches of the first error first."""
     count = len(varying(process))
     return np.repeat(np.eye(count), len(reaches), axis=0) * np.tile(np.asarray(reaches, np.float64), count)[:, None]

@@ -29,14 +29,7 @@ class Figure(NamedTuple):
 
 
 class Number(NamedTuple):
-    """A number of a stock process, ready to be printed.
-
-    Attributes:
-        name: what it is a number of; an error's name as in `DEVIATIONS`, or an attribute of `Stock` or `Defects`.
-        kind: "mean", "sigma" or "value".
-        value: the number, SI units.
-        source: where it comes from.
-    """
+    """A number of a stock process with its source; named as in `DEVIATIONS`, `Stock` or `Defects`, SI units."""
 
     name: str
     kind: Literal["mean", "sigma", "value"]
@@ -50,18 +43,7 @@ class Number(NamedTuple):
 
 @dataclass(frozen=True)
 class Stock:
-    """The usual numbers of one kind of process.
-
-    Attributes:
-        name: its key in `STOCK`.
-        title: what it is, in words.
-        errors: errors by their name in `DEVIATIONS`; what is missing is zero.
-        minimum_line_m: narrowest line.
-        minimum_space_m: narrowest gap.
-        wafer_radius_m: radius of the wafers it takes.
-        defects: rare events by their name in `fab.process.Defects`.
-        tone: what polygons mean on its plates, as in `fab.process.Process`.
-    """
+    """The usual numbers of one kind of process, errors by their name in `DEVIATIONS` (zero where missing)."""
 
     name: str
     title: str
@@ -98,11 +80,7 @@ class Stock:
 
 
 def process_from(given: Process | str | None, levels: Levels) -> Process:
-    """Return a process for a staircase: itself, the stock process of a name, or an ideal one.
-
-    Args:
-        given: a process, a key of `STOCK`, "ideal", or None for the ideal one.
-        levels: the staircase that it must make.
+    """Return a process for a staircase: itself, the stock process of a name ("ideal" is one), or the ideal one.
 
     Raises:
         InputError: an unknown name, or a process that makes another staircase.

@@ -56,9 +56,7 @@ def _parse(text: object, unit: str, example: str) -> float:
 def parse_length(text: str) -> float:
     """Return a length given as text with its unit (``"75 nm"``, ``"1.85um"``, ``"0.4 m"``) in metres.
 
-    Raises:
-        ValueError: no unit, a unit that is not a length, or no finite number; the text says so and gives an example,
-            ready to stand behind a file and a key.
+    The text of a ValueError names no key, says what is wrong and gives an example.
     """
     return _parse(text, "m", "75 nm")
 
@@ -71,10 +69,7 @@ def parse_angle(text: str) -> float:
 def metres(value: float | str, name: str = "length", *, infinite: bool = False) -> float:
     """Return a length in metres, given as an SI number or as text with a unit.
 
-    Args:
-        value: metres, or text such as ``"75 nm"``.
-        name: what the length is of, for messages.
-        infinite: whether infinity will do, as a number or as ``"inf"``.
+    It is the length of `name`, for messages. If `infinite`, infinity will do, as a number or as ``"inf"``.
 
     Raises:
         InputError: anything else: text without a unit, a number that is not finite, another type.
@@ -94,10 +89,7 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
 
 
 def format_length(length_m: float) -> str:
-    """Return a length of any sign in the largest unit of m, mm, um, nm that leaves at least one whole unit.
-
-    The text (``"75 nm"``, ``"4.44 mm"``) is ASCII and exact to twelve digits, which `parse_length` reads back.
-    """
+    """Return a length as ASCII ("75 nm") in the largest unit of m, mm, um, nm of which it has one, to twelve digits."""
     size = abs(length_m)
     for unit_m, name in _LENGTH_STEPS:
         if size >= unit_m * (1 - 1e-12):

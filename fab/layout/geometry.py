@@ -58,7 +58,6 @@ class Shapes:
     polygons: tuple[NDArray[np.int32], ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of shapes."""
         return len(self.rectangles) + len(self.polygons)
 
     @property

@@ -45,7 +45,6 @@ class Wafer:
     order_control: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ("diameter_m", "thickness_m", "blank_m"):
             if not 0 < getattr(self, name) < 1:
                 got = format_length(getattr(self, name))

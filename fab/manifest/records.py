@@ -63,10 +63,7 @@ class CellEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class FileEntry:
-    """One file of the folder: its name, kind, size and SHA-256.
-
-    Of a mask file also its top cell, the layers of the DOE in it, and every cell but that of the DOE.
-    """
+    """One file of the folder; of a mask file also its top cell, the DOE's layers in it, and all other cells."""
 
     file: str
     format: str
@@ -79,10 +76,10 @@ class FileEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class MaskEntry:
-    """One etch mask. `box_um` is x0, y0, x1, y1; box, width and space are None where there is none.
+    """One etch mask; box (x0, y0, x1, y1), width and space are None where there is none.
 
-    `edge_move_nm`: how far every edge of an etched area is drawn outward, against the bias of the process; width, space
-    and digest are those of the plane before the move.
+    Every edge of an etched area is drawn `edge_move_nm` outward, against the bias of the process; width, space and
+    digest are those of the plane before the move.
     """
 
     mask: int
@@ -154,10 +151,7 @@ class WaferEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class ModelEntry:
-    """A solid or a height map: its content; by part its volume, how exact that is, and its centre; or its scale.
-
-    The window is row, column, rows and columns of the pixels that it shows, if not all.
-    """
+    """A solid or a height map: content, volume (with its error) and centre by part, scale, pixels of its window."""
 
     file: str
     content: str
@@ -276,11 +270,7 @@ def _manifest_from(data: bytes, where: str) -> Manifest:
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read the manifest of a mask order and check it; every file name in it is a plain name in the folder.
-
-    Raises:
-        InputError: the manifest is missing, corrupt, of another format, or holds impossible values.
-    """
+    """Read the manifest of a mask order and check it; every file name in it is a plain name in the folder."""
     path = Path(folder) / MANIFEST_NAME
     data = read_json(path)
     if data.get("format") != FORMAT:

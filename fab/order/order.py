@@ -140,10 +140,9 @@ def plan_order(
 
 
 def order_id(name: str, digest: str) -> str:
-    """Turn a name into what mask shops accept in file and cell names.
+    """Turn a name into what mask shops accept in file and cell names: capitals, digits and _.
 
-    It is the name in capitals, with _ for everything that is not a letter or digit; if that is longer than 13
-    characters, its first 8 and 4 of `digest`, that of the level map, which keeps shortened names apart.
+    One of more than 13 characters keeps 8, and 4 of the level map's digest, which keeps shortened names apart.
     """
     plain = re.sub(r"[^A-Z0-9]+", "_", name.upper()).strip("_")
     if not plain:

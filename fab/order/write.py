@@ -197,14 +197,7 @@ def _require_own(folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class WrittenOrder:
-    """A mask order on the disk.
-
-    Attributes:
-        folder: where its files lie.
-        order: what was drawn.
-        manifest: what every file is.
-        report: the read-back, every check passed.
-    """
+    """A mask order in a folder: what was drawn, what every file is, and the read-back, every check passed."""
 
     folder: Path
     order: Order
@@ -237,18 +230,17 @@ def write_order(
     Args:
         folder: the final folder; missing, empty, or an earlier order, which is replaced.
         level_map: the DOE; file names are made from its name.
-        process: order of the etches, tone of the masks and what is printed, or the name of a stock process; an ideal
-            process if left out.
-        wafer: what the masks are filled with; the defaults of `Wafer` if left out.
-        chrome: how the chrome is drawn; the defaults of `Chrome` if left out.
+        process: order of the etches, tone of the masks and what is printed, or the name of a stock process; ideal by
+            default.
+        wafer: what the masks are filled with.
+        chrome: how the chrome is drawn.
         patch: a window to write as a solid at full resolution, too.
         source: where the level map came from, for the manifest; JSON values only.
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
 
     Raises:
-        InputError: an argument is out of range; the folder holds anything else than an earlier order;
-            the system refuses it.
+        InputError: an argument is out of range; the folder holds anything else than an earlier order.
         CheckFailed: what was read back differs; nothing is left at the final path.
     """
     order = plan_order(
@@ -265,12 +257,9 @@ def write_order(
 
 
 def write_planned(folder: str | Path, order: Order, *, add: Add = lambda *_: ()) -> WrittenOrder:
-    """Write an order that `plan_order` made, and prove it; see `write_order`.
+    """Write an order of `plan_order`, and prove it; see `write_order`.
 
-    Args:
-        folder: the final folder.
-        order: what is drawn.
-        add: writes further files into the folder and returns their names; what needs light to be written.
+    What needs light is written by `add`, which puts further files into the folder and returns their names.
     """
     folder = Path(folder)
     _require_own(folder)

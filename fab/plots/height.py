@@ -27,13 +27,8 @@ def plot_height(
     """Draw a height map: the whole, a window at the centre and one at the edge, and the share of area at every height.
 
     The overview is a smooth mean where there are more cells than dots, and says so; the windows show single cells.
-    Outside the clear aperture, where chrome covers the glass, all is grey.
-
-    Args:
-        height: heights, quantised or not.
-        levels: the staircase whose heights the axis names, or None. A map that stands on it is counted per level.
-        title: a line above the picture.
-        ax: axes whose place the picture takes; a new figure by default.
+    Outside the clear aperture, where chrome covers the glass, all is grey. With `levels` the axis names their heights,
+    and a map that stands on them is counted per level. The picture takes the place of `ax`; a new figure by default.
     """
     grid = height.grid
     inside = grid.inside_circle(height.aperture_m)
@@ -94,16 +89,9 @@ def _draw_whole(axes: "Axes", height: "HeightMap", inside: NDArray[np.bool_], st
 def height_shares(
     heights: NDArray[np.floating], levels: "Levels | None", ends_m: tuple[float, float]
 ) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
-    """Share of the cells at every height.
+    """Return edges of bins in metres, and the share of cells (heights in metres, ``(n,)``) in each; they sum to 1.
 
-    Args:
-        heights: heights of the cells, metres, ``(n,)``.
-        levels: the staircase, or None.
-        ends_m: range that holds all heights, metres.
-
-    Returns:
-        Edges of the bins in metres and the shares, which sum to 1: one bin per level where every height is a level,
-        narrow bins otherwise.
+    There is one bin per level where every height is a level, and narrow ones between the ends otherwise.
     """
     edges = np.linspace(*ends_m, _FINE_BINS + 1)
     if levels is not None and heights.size and not levels.is_binary:

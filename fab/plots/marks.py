@@ -29,12 +29,7 @@ def plot_part(
 ) -> "Axes":
     """Draw all masks of a part over each other, each in its colour, as in the drawing (polygons filled).
 
-    Args:
-        part: marks or test structures.
-        masks: the photomasks, for the legend, in the order in which they are used.
-        title: a line above the picture.
-        window_m: x0, y0, x1, y1 of what is shown, metres; all by default.
-        ax: axes to draw on; those of a new figure by default.
+    The legend lists the photomasks. `window_m` is x0, y0, x1, y1 of what is shown; all by default.
     """
     from matplotlib.patches import Patch
 
@@ -51,15 +46,9 @@ def plot_part(
 def plot_through_mask(
     part: "Part", first: "Photomask", mask: "Photomask", title: str = "", name: str = "finder", ax: "Axes | None" = None
 ) -> "Axes":
-    """Draw what a microscope shows through a photomask on the wafer, around the mask's own place in a part.
+    """Draw what a microscope shows through a photomask on the wafer, around its own mark of a name in a part.
 
-    Args:
-        part: an alignment site.
-        first: the photomask that made the marks on the wafer; they are coloured.
-        mask: the photomask that lies on the wafer; its chrome hides the wafer.
-        title: a line above the picture.
-        name: which mark is in the middle.
-        ax: axes to draw on; those of a new figure by default.
+    The photomask `first` made the marks on the wafer, which are coloured; the chrome of `mask` hides the wafer.
     """
     from matplotlib.patches import Patch
 

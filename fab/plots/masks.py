@@ -28,13 +28,9 @@ _SIDE_IN = 2.7
 def plot_masks(
     level_map: "LevelMap", chrome_m: tuple[float, float], title: str = "", ax: "Axes | None" = None
 ) -> "FigureBase":
-    """Draw a mask set: heights, chrome, and every etch mask as a whole and through a window.
+    """Draw a mask set: heights, chrome (radii of opening and rim, metres), and every mask whole and in a window.
 
-    Args:
-        level_map: the DOE.
-        chrome_m: radius of the chrome's opening and its outer radius, metres.
-        title: a line above the picture.
-        ax: axes whose place the picture takes; a new figure by default.
+    The picture takes the place of `ax`; a new figure by default.
     """
     from matplotlib.colors import LinearSegmentedColormap
 

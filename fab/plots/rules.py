@@ -43,12 +43,8 @@ def plot_rules(report: "RulesReport", title: str = "", ax: "Axes | None" = None)
     """Draw where every etch mask breaks a rule: the whole mask, and below it the surroundings of its worst place.
 
     In the overview a block of pixels is coloured if anything in it is broken, the stronger the more of it is. Few
-    blocks are ringed, so that a single pixel is found on the largest map. The window shows single pixels.
-
-    Args:
-        report: the rules, and where the level map breaks them.
-        title: a line above the picture.
-        ax: axes whose place the picture takes; a new figure by default.
+    blocks are ringed, so that a single pixel is found on the largest map. The window shows single pixels. The picture
+    takes the place of `ax`; a new figure by default.
     """
     level_map = report.level_map
     grid, planes = level_map.grid, level_map.planes()

@@ -21,14 +21,8 @@ def plot_wafer(
 ) -> "Axes":
     """Draw where everything lies on a mask plate, seen from the etched side.
 
-    Args:
-        wafer: the wafer.
-        frame: the cells around the DOE (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
-            number.
-        aperture_m: diameter of the clear aperture, metres.
-        dbu_m: database unit of the frame, metres.
-        title: a line above the picture.
-        ax: axes to draw on; those of a new figure by default.
+    The cells around the DOE are the frame (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
+    number. Diameter of the clear aperture and database unit are metres.
     """
     from matplotlib.patches import Circle, Rectangle
 

@@ -54,9 +54,9 @@ def _pack(levels, top, spans, out):  # pragma: no cover - compiled
 
 
 def pack(level_map: NDArray[np.uint8], bits: int, spans: NDArray[np.int64]) -> Words:
-    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into packed etch masks ``[bit, y, word]``.
+    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into etch masks ``[bit, y, word]``, set where etched.
 
-    A pixel is set where the mask etches it; `spans` holds first and end column of every row that may be, ``(ny, 2)``.
+    `spans` holds first and end column of every row that may be etched, ``(ny, 2)``.
     """
     ny, nx = level_map.shape
     top = np.uint64(2**bits - 1)
@@ -133,10 +133,7 @@ def erode(words: Words, axis: int, length: int, outside: np.uint64) -> None:  # 
 
 @njit(cache=True, nogil=True)
 def split(words: Words, axis: int, outside: np.uint64, alone: Words) -> Any:  # pragma: no cover - compiled
-    """Take the runs of one pixel out of a plane into `alone`; return how many there were.
-
-    All others are shortened, in place, by one at their end. `outside` is what lies beyond the sides of the plane.
-    """
+    """Move the runs of one pixel from a plane into `alone`, and shorten others by one at their end; return how many."""
     ny, nw = words.shape
     total = 0
     if axis == 1:
@@ -185,17 +182,10 @@ def corners(words: Words, found: Words) -> Any:  # pragma: no cover - compiled
 def longest_runs(
     starting: Words, words: Words, axis: int, most: int, looks: int
 ) -> NDArray[np.int64]:  # pragma: no cover - compiled
-    """List the longest of the runs along an axis that are met first, from the middle row up and around.
+    """List row, column and length ``(n, 3)`` of the longest runs of `words` that begin where those of `starting` do.
 
-    Args:
-        starting: a plane whose runs begin where some of the runs of `words` do; the outside is clear.
-        words: the plane whose runs are measured; the outside is clear.
-        axis: along which the runs lie.
-        most: how many are listed at most.
-        looks: how many are measured at most.
-
-    Returns:
-        ``(n, 3)`` row, column and length of each, longest first.
+    Of at most `looks` of them, met from the middle row up and around, the `most` longest, longest first. The outside is
+    clear.
     """
     ny, nw = words.shape
     out = np.empty((most + 1, 3), np.int64)

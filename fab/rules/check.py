@@ -53,13 +53,13 @@ _LONGEST_RUN = 255
 
 @dataclass(frozen=True)
 class Rules:
-    """Limits of what a mask may hold.
+    """Limits of what a mask may hold, metres.
 
     Attributes:
-        minimum_line_m: narrowest etched line, metres; 0 for any.
-        minimum_space_m: narrowest gap between etched lines, metres; 0 for any.
-        address_m: address unit of the mask writer, metres; None for the database unit of the drawing.
-        window_m: side of the square windows in which the density is compared, metres.
+        minimum_line_m: narrowest etched line; 0 for any.
+        minimum_space_m: narrowest gap between etched lines; 0 for any.
+        address_m: address unit of the mask writer; None for the database unit of the drawing.
+        window_m: side of the square windows in which the density is compared.
 
     Raises:
         InputError: a length that is negative or not finite, or an address unit or window of no size.
@@ -71,7 +71,6 @@ class Rules:
     window_m: float = 100 * UM
 
     def __post_init__(self) -> None:
-        """Check the values."""
         cure = "Give a length such as 1e-6."
         for name in ("minimum_line_m", "minimum_space_m"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -100,11 +99,7 @@ class Rules:
 
 
 class Violation(NamedTuple):
-    """One place where a rule is broken.
-
-    `what` is "line", "space" or "kissing corner"; `y_m` and `x_m` are its middle from the centre of the aperture,
-    `size_m` and `length_m` width and length of the line or space (0 for a corner), all in metres.
-    """
+    """One place where a rule is broken: its middle from the aperture's centre, width and length (0 for a corner)."""
 
     what: Kind
     y_m: float
@@ -117,12 +112,8 @@ class Violation(NamedTuple):
 class Widths:
     """The lines, or the spaces, of one plane.
 
-    Attributes:
-        minimum_m: what the process prints, metres.
-        smallest_m: narrowest one, metres; None if there is none.
-        narrow: places narrower than the minimum.
-        narrow_share: share of all cross-sections along x and y that are narrower.
-        slivers: how many of the narrow places are slivers.
+    The minimum is what the process prints; `smallest_m` is None if there is none; `narrow` places are below the
+    minimum, some of them slivers; `narrow_share` is that of all cross-sections along x and y that are narrower.
     """
 
     minimum_m: float
@@ -134,17 +125,10 @@ class Widths:
 
 @dataclass(frozen=True)
 class PlaneRules:
-    """Lines, spaces, corners and densities of one etch mask.
+    """One etch mask: lines (etched), spaces between them, and how many corners kiss.
 
-    Attributes:
-        bit: the mask's bit; its number is one more.
-        line: what is etched.
-        space: the gaps in it.
-        kissing: kissing corners.
-        density: etched share of the clear aperture.
-        emptiest: etched share of the emptiest window inside the aperture.
-        fullest: the same of the fullest one.
-        places: some of the worst places, narrowest first and then longest.
+    The densities are the etched share of the clear aperture, and of its emptiest and fullest window. `places` are some
+    of the worst, narrowest first and then longest.
     """
 
     bit: int
@@ -165,13 +149,7 @@ class PlaneRules:
 
 @dataclass(frozen=True)
 class OffGrid:
-    """Pixel edges that the mask writer will round.
-
-    Attributes:
-        address_m: its address unit, metres.
-        edges: how many of the raster's edges along x and y lie off it, of `of` in all.
-        worst_m: the farthest that one has to move, metres.
-    """
+    """Pixel edges off the address grid of the mask writer: how many of all, and the farthest that one has to move."""
 
     address_m: float
     edges: int
@@ -181,14 +159,7 @@ class OffGrid:
 
 @dataclass(frozen=True, eq=False)
 class RulesReport:
-    """Rules checked on every etch mask of a level map; lengths in metres.
-
-    Attributes:
-        level_map: the DOE that was checked.
-        rules: the rules.
-        planes: one entry per etch mask, mask 0 first.
-        off_grid: the raster against the mask writer's address grid.
-    """
+    """Rules checked on every etch mask of a level map, mask 0 first, and on its raster; lengths in metres."""
 
     level_map: LevelMap
     rules: Rules

@@ -44,12 +44,9 @@ _WIDEST = 32
 class RepairCost:
     """Extent and cost of a repair, over the clear aperture.
 
-    Attributes:
-        changed_share: share of the pixels that got another level.
-        rms_height_m: rms of the change of height, metres.
-        efficiency: |mean exp(2 pi i dh waves_per_metre)|^2: share of the light that still goes where it was meant to.
-        broken_before: places that broke a rule, over all masks.
-        broken_after: places that still do: corners that touch, at worst; no narrow line and no narrow space.
+    `changed_share` is that of pixels with another level; `efficiency`, |mean exp(2 pi i dh waves_per_metre)|^2, of the
+    light that still goes where it was meant to. Broken places are counted over all masks; afterwards they are corners
+    at worst.
     """
 
     changed_share: float

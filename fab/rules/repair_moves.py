@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 class RepairTask(NamedTuple):
     """A level map in work, on maps that are padded by `pad` pixels of blank glass.
 
-    `etched` and `wanted` hold by which masks each pixel is etched now and should be, `free` what may change,
-    `error[a, b]` what depth a costs where b is wanted; `line` and `space` are the narrowest ones in pixels, and
-    `gravity` how many kissing corners one missing pixel of width is as bad as.
+    By which masks each pixel is `etched` and `wanted` to be, which are `free` to change, what depth a costs where b is
+    wanted (`error[a, b]`), the narrowest `line` and `space` in pixels, and how many kissing corners one missing pixel
+    of width is as bad as (`gravity`).
     """
 
     etched: NDArray[np.uint8]

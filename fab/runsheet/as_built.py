@@ -40,13 +40,7 @@ class MaskMeasured(NamedTuple):
 
 
 class ChromeMeasured(NamedTuple):
-    """Measurements of the chrome; metres, None where there is none.
-
-    Attributes:
-        overlay_x_m: how far its opening lies toward +x.
-        overlay_y_m: the same toward +y.
-        wider_m: how much wider than drawn the opening is, from its diameter, or else from the chrome's CD bars.
-    """
+    """Shift of the chrome's opening toward +x and +y, and how much wider than drawn it is; metres, None if unknown."""
 
     overlay_x_m: float | None = None
     overlay_y_m: float | None = None
@@ -221,11 +215,7 @@ def _edge_moves_m(path: Path, data: Mapping[str, Any]) -> dict[str, float]:
 
 
 def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
-    """Read a run sheet of a design that was filled in.
-
-    Raises:
-        InputError: no run sheet, one of another design, or an impossible value, named by its key.
-    """
+    """Read a filled run sheet; InputError for none, one of another design, or an impossible value, named by key."""
     data = read_json(path)
     if data.get("format") != FORMAT:
         cure = "Give the filled JSON of the run sheet of this order."

@@ -37,14 +37,7 @@ class Action(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Actions with one photomask.
-
-    Attributes:
-        plate: the photomask.
-        before: actions up to the developed resist, in order.
-        after: actions from there to the sign-off.
-        deepest_m: depth of the deepest floor once this step is done, metres.
-    """
+    """Actions with one photomask up to the developed resist and after it, and the deepest floor (metres) then."""
 
     plate: Photomask
     before: tuple[Action, ...]
@@ -68,8 +61,8 @@ def etch_time_s(depth_m: float, rate_m_per_s: float) -> float:
 def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
     """Return the next etch's target that keeps the sum of all depths right, metres.
 
-    It is ``next_m - (measured_m - target_m)``. Areas that both masks etch come out right, areas that neither etches
-    stay right, and areas of the next mask alone become wrong by as much as those of this one are.
+    Areas that both masks etch come out right, areas that neither etches stay right, and areas of the next mask alone
+    become wrong by as much as those of this one are.
     """
     return next_m - (measured_m - target_m)
 
@@ -190,16 +183,7 @@ def steps_of(
     chrome_m: float,
     deposition: Deposition,
 ) -> tuple[Step, ...]:
-    """List the steps of a job, one per photomask.
-
-    Args:
-        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
-        process: how far depths stray.
-        files: the file of every photomask, by its name.
-        notes: how each one is aligned (`fab.layout.marks.alignment_notes`), in the same order.
-        chrome_m: thickness of the chrome, metres.
-        deposition: how it is laid down.
-    """
+    """List the steps of a job, one per photomask in order of use, each aligned as its note says (`alignment_notes`)."""
     steps, deepest_m = [], 0.0
     for number, (plate, note) in enumerate(zip(plates, notes, strict=True)):
         deepest_m += plate.depth_m

@@ -18,8 +18,7 @@ from fab.units import NM
 class PhotomaskFile(NamedTuple):
     """The file of one photomask: its name, digest and top cell.
 
-    `edge_move_m` is how far every edge of the DOE was moved outward on the mask to make up for what the process does;
-    test structures and marks are drawn without it.
+    Every edge of the DOE, not those of test structures and marks, was moved `edge_move_m` outward on the mask.
     """
 
     file: str
@@ -130,7 +129,6 @@ class RunSheet:
     predictions: Predictions | None = None
 
     def __post_init__(self) -> None:
-        """Check that every photomask has its file, and every etch its photomask."""
         if missing := [plate.name for plate in self.plates if plate.name not in self.files]:
             cure = "Give the file of every plate."
             raise InputError("run sheet", "every plate must have a file", f"none for {missing[0]}", cure)

@@ -229,10 +229,7 @@ def _blanks(sheet: RunSheet) -> dict[str, Any]:
 
 
 def record(sheet: RunSheet) -> dict[str, Any]:
-    """Return the run sheet as JSON values, with the unit of every length in its key.
-
-    Everything under "measured" is null, to be filled in.
-    """
+    """Return the run sheet as JSON values, the unit of every length in its key, all under "measured" null."""
     files = {name: one.file for name, one in sheet.files.items()}
     notes = alignment_notes(sheet.plates)
     steps = steps_of(sheet.plates, sheet.process, files, notes, sheet.chrome_m, sheet.deposition)
@@ -273,12 +270,9 @@ def record(sheet: RunSheet) -> dict[str, Any]:
 
 
 def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None = None) -> str:
-    """Return the run sheet as one page of HTML that needs nothing else, for A4 and for the screen.
+    """Return what `record` returned as one page of HTML that needs nothing else, for A4 and for the screen.
 
-    Args:
-        content: what `record` returned.
-        json_name: name of the JSON file, which the page tells the reader to fill in.
-        picture: PNG of the PSFs, if there is one.
+    The page tells the reader to fill in the JSON file, and shows the PNG of the PSFs if there is one.
     """
     import jinja2
 
@@ -308,10 +302,7 @@ def _clock(seconds: float) -> str:
 
 
 def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:
-    """Write the run sheet as a page and as JSON; return the names "<stem>_RUNSHEET.html" and "<stem>_RUNSHEET.json".
-
-    `picture` is a PNG of the PSFs that the finished DOE should show, if there is one.
-    """
+    """Write "<stem>_RUNSHEET.html" and ".json", with a PNG of the PSFs if there is one; return both names."""
     names = tuple(f"{sheet.stem}_RUNSHEET.{suffix}" for suffix in ("html", "json"))
     content = record(sheet)
     write_atomic(folder / names[0], html_page(content, names[1], picture).encode())

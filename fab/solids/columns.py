@@ -65,14 +65,10 @@ def whole(grid: Grid) -> PixelWindow:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """A relief of columns on a rectangular raster.
+    """A relief of columns on a rectangular raster, its edges increasing, ``(nx + 1,)`` and ``(ny + 1,)``.
 
-    Attributes:
-        height_m: height of every column above the deepest floor, metres, ``[y, x]`` float64.
-        x_edges_m: edges of the columns along x, metres, increasing, ``(nx + 1,)``.
-        y_edges_m: the same along y.
-        blank_m: height of the blank surface above the deepest floor, metres; z = 0 lies there.
-        block: pixels along the side of a column; 1 is full resolution.
+    Heights ``[y, x]`` and that of the blank surface, where z = 0 lies, are above the deepest floor; all in metres. A
+    column has `block` pixels along its side; 1 is full resolution.
     """
 
     height_m: NDArray[np.float64]
@@ -134,9 +130,9 @@ def window_cells(level_map: LevelMap, window: PixelWindow) -> Columns:
 def reduced_cells(level_map: LevelMap, most: int = 1000) -> Columns:
     """Reduce a map to columns of the mean height of square blocks of pixels; the volume stays.
 
-    The block is the smallest that leaves at most `most` columns (1 to 2000) along the longer side. Blocks at the high
-    end of an axis are cut where the map ends. A mean across a jump of one wave stands between its two sides: a reduced
-    map is for looking at and for weighing, not for optics.
+    The block is the smallest that leaves at most `most` columns along the longer side; at the high end of an axis
+    blocks are cut. A mean across a jump of one wave stands between its two sides: fit for looking and weighing, not for
+    optics.
     """
     grid = level_map.grid
     if not 1 <= most <= math.isqrt(_MOST_CELLS):

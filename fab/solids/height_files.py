@@ -1,15 +1,13 @@
 """The relief in the files of other tools: pictures, arrays, and the sag of an optics program.
 
-Pictures (.tif, .png) are stored from the top row down, so what is up in the picture is +y; `fab.height`
-turns them back. Arrays (.npy) are metres, ``[y, x]``, row 0 at the lowest y. Every file comes from a level
-map, so that a height is one of the levels and never a rounded neighbour of it. In an order every single height of each
-is read back.
+Pictures (.tif, .png) are stored from the top row down, so what is up in the picture is +y. Arrays (.npy) are metres,
+``[y, x]``, row 0 at the lowest y. Every file comes from a level map, so that a height is one of the levels and never a
+rounded neighbour of it. In an order every single height of each is read back.
 
-The grid sag of Zemax OpticStudio is the text that its manual describes: one line ``nx ny delx dely unitflag
-xdec ydec`` (unit flag 0: millimetres), then one line ``z dz/dx dz/dy d2z/dxdy nodata`` per point, from the
-corner at -x, +y along x and then down row by row, at least 5 points along either axis. Points are pixel
-centres. The derivatives are left 0; choose linear interpolation there, which does not use them, and know
-that it turns a vertical wall into a slope one pixel wide.
+The grid sag of Zemax OpticStudio is the text that its manual describes: one line ``nx ny delx dely unitflag xdec ydec``
+(unit flag 0: millimetres), then one line ``z dz/dx dz/dy d2z/dxdy nodata`` per point, from the corner at -x, +y along x
+and then down row by row. Points are pixel centres. The derivatives are left 0; choose linear interpolation there, which
+does not use them, and know that it turns a vertical wall into a slope one pixel wide.
 """
 
 import io
@@ -70,9 +68,8 @@ def _exact_scale(levels: Levels) -> tuple[NDArray[np.int64], float]:
 def write_tiff(path: str | Path, level_map: LevelMap) -> float:
     """Write the heights as a 16-bit grey TIFF, first row at the highest y; return the metres per count.
 
-    Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Other levels are rounded to the
-    nearest of 65535 counts. Count times metres per count is the height above the deepest floor. The description in the
-    file says metres per count, rounding, pitch and orientation; the resolution tags hold the pitch too.
+    Even levels are exact: a step is a whole number of counts (4369 for 16 levels). Others are rounded to the nearest of
+    65535 counts. The description in the file says scale, rounding, pitch and orientation.
     """
     counts, scale_m = _exact_scale(level_map.levels)
     about = _description(level_map, scale_m, counts)
@@ -88,11 +85,10 @@ def write_npy(path: str | Path, level_map: LevelMap) -> None:
 
 
 def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
-    """Write a grey PNG for greyscale and two-photon writers, white highest; return the metres per count.
+    """Write a grey PNG for greyscale and two-photon writers, first row at the highest y; return the metres per count.
 
-    Black is the deepest floor and white (255 or 65535) the blank surface; what lies between is linear in height,
-    rounded to the nearest count, and exact for 2, 4 and 16 even levels. The first row is at the highest y. The text
-    chunk "Description" says metres per count, rounding, pitch and orientation.
+    Black is the deepest floor and white the blank surface; between them counts are linear in height, rounded, and exact
+    for 2, 4 and 16 even levels. The text chunk "Description" says so.
     """
     counts, scale_m = _full_scale(level_map.levels, 2**bits - 1)
     pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level]
@@ -105,13 +101,10 @@ def write_zemax_sag(
 ) -> None:
     """Write the relief as a grid sag of Zemax OpticStudio (millimetres, file suffix .DAT).
 
-    The blank surface is the vertex plane, sag 0, as outside the grid. Light runs toward +z. If the relief is on the
-    exit side (glass before the surface), etched glass is missing toward -z and the sag is minus the etch depth. On the
-    entry side (glass after the surface) it is plus the etch depth. x and y are those of the map in both cases; a plate
-    that is turned over must be mirrored in the optics program.
-
-    Sags are written to a picometre, 22 bytes a point: a 4400 x 4400 map makes 426 MB, so choose a window of pixels (at
-    least 5 either way); the decentre in the header puts them where they are.
+    The blank surface is the vertex plane, sag 0. Light runs toward +z. On the exit side (glass before the surface) the
+    sag is minus the etch depth, on the entry side plus. x and y are those of the map in both cases; a plate that is
+    turned over must be mirrored in the optics program. A point takes 22 bytes: a 4400 x 4400 map makes 426 MB, so
+    choose a window (at least 5 pixels either way); the decentre in the header puts it where it is.
     """
     if Path(path).suffix.upper() != ".DAT":
         raise InputError(str(path), "OpticStudio reads grid sags from .DAT files", Path(path).suffix, "Use .DAT.")

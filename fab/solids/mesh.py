@@ -24,12 +24,9 @@ from fab.units import UM, format_length
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in space, counter-clockwise seen from outside.
+    """Triangles ``(m, 3)`` of vertices ``(n, 3)`` x, y, z in metres, counter-clockwise seen from outside.
 
-    Attributes:
-        vertices_m: ``(n, 3)`` float64, x, y, z in metres.
-        triangles: ``(m, 3)`` int32, numbers of vertices.
-        about: one line of ASCII about what it shows; it goes into the files.
+    `about` is one line of ASCII about what it shows; it goes into the files.
     """
 
     vertices_m: NDArray[np.float64]
@@ -129,10 +126,10 @@ def _named(twin, vertex, north):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def _wall(z, twin, p, q, north_p, north_q, low, high, flip, out, used):  # pragma: no cover - compiled
-    """Cover a wall between two corners with triangles, all the vertices on either side taken in; return the count.
+    """Cover a wall between two corners with triangles of all vertices on either side; return the count.
 
-    `p` and `q` are the first vertices of the corners. Unflipped triangles face the right of the way from p to q:
-    +x for a way toward +y. An empty `out` only counts.
+    `p` and `q` are the first vertices of the corners. Unflipped triangles face the right of the way from p to q: +x for
+    a way toward +y. An empty `out` only counts.
     """
     p, q = _seek(z, p, low), _seek(z, q, low)
     while z[p] != high or z[q] != high:
@@ -201,18 +198,9 @@ def _bottom(first: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0) -> Mesh:
-    """Build the closed mesh of a relief on a slab.
+    """Build the closed mesh of a relief, heights exaggerated, on a slab `base_m` (metres) below the deepest floor.
 
-    Args:
-        cells: the relief.
-        base_m: thickness of the slab below the deepest floor, metres; never exaggerated.
-        exaggeration: factor on the heights.
-
-    Returns:
-        The mesh; its volume is ``exaggeration * cells.volume_m3 + base_m * cells.area_m2``.
-
-    Raises:
-        InputError: the base or the factor is not positive and finite.
+    Its volume is ``exaggeration * cells.volume_m3 + base_m * cells.area_m2``.
     """
     for name, value in (("mesh base", base_m), ("height exaggeration", exaggeration)):
         if not 0 < value < math.inf:
@@ -234,13 +222,10 @@ def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0
 
 
 def closed_volume_m3(mesh: Mesh) -> float:
-    """Return the volume of a mesh that manifold3d finds to be closed, cubic metres.
+    """Return the volume of a mesh, cubic metres; CheckFailed unless manifold3d finds it to be the skin of a solid.
 
     The library works in float32 here, on micrometres, as the files do. Triangles without common vertices, as in an STL
     file, are joined where they touch.
-
-    Raises:
-        CheckFailed: the mesh is open, turned inside out or otherwise not the skin of a solid.
     """
     import manifold3d
 

@@ -133,10 +133,7 @@ def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
 
 
 def write_glb(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as binary glTF for viewers: metres, as the format demands, float32.
-
-    A viewer's up is +y, so the one node turns z up; what was +y points away from the viewer.
-    """
+    """Write a mesh as binary glTF, metres and float32; the node turns z up to glTF's +y."""
     positions = mesh.vertices_m.astype(np.float32)
     indices = mesh.triangles.astype(np.uint32)
     body = indices.tobytes() + positions.tobytes()
@@ -175,10 +172,7 @@ def write_glb(path: str | Path, mesh: Mesh) -> None:
 
 
 def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
-    """Write a mesh as binary STL, float32, in ``"mm"`` or ``"um"``.
-
-    The format knows no unit, so the header says it in words; let the name of the file say it too.
-    """
+    """Write a mesh as binary STL, float32; the format knows no unit, so the header says it."""
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets = np.zeros(len(mesh.triangles), dtype=kind)
     corners = mesh.vertices_m[mesh.triangles] / _UNIT_M[unit]
@@ -217,14 +211,9 @@ def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float
 
 
 def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
-    """Read a mesh file with a parser that had no part in writing it: trimesh, and for 3MF Python's own for XML.
+    """Read a one-mesh file with a parser that did not write it: trimesh, and for 3MF Python's own for XML.
 
-    Args:
-        path: a ``.3mf``, ``.glb`` or ``.stl`` file that holds one mesh.
-        unit: what the numbers of an STL file mean; the other kinds say it themselves.
-
-    Returns:
-        The triangles in metres, z up (the axes of a glTF file are turned back).
+    `unit` says what the numbers of an STL file mean. The triangles come back in metres, z up, also from glTF.
     """
     path = Path(path)
     kind = path.suffix.lower()

@@ -31,15 +31,9 @@ class MeshedRelief(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DoeModel:
-    """A DOE on its glass, as all models show it.
+    """A DOE on its glass, as all models show it: chrome, edge of its die and middles of the dies on the wafer, metres.
 
-    Attributes:
-        level_map: the DOE.
-        chrome: how the chrome is drawn.
-        wafer: the glass.
-        die_m: edge of the die, metres.
-        dies: middles of the dies on the wafer x, y, metres.
-        patch: the window that is wanted at full resolution, if any.
+    A `patch` is the window that is wanted at full resolution, if any.
     """
 
     level_map: LevelMap
@@ -103,13 +97,10 @@ class Stated:
 
 @dataclass(frozen=True)
 class ModelKind:
-    """One kind of file that an order holds besides its masks: how it is written, and how it is proved.
+    """One kind of file that an order holds besides its masks, whose names end with `ending`, such as "_HEIGHT.tif".
 
-    Attributes:
-        ending: what its name ends with after that of the order, such as "_HEIGHT.tif".
-        write: writes the file and says what the manifest states of it; None if this DOE has no such file.
-        problems: reads a file back, whose bytes are known to be those of the manifest, and returns one sentence per
-            difference from its entry and from the level map.
+    `write` says what the manifest states of the file, None if this DOE has no such file. `problems` reads it back, its
+    bytes known to be those of the manifest, and returns one sentence per difference from its entry and the level map.
     """
 
     ending: str

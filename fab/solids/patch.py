@@ -103,11 +103,7 @@ def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M
 def patch_step(
     path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
 ) -> None:
-    """Write a window of a map as STEP, in boxes on `base_m` (metres) of glass below the deepest floor.
-
-    The part is named PATCH and lies where the window does. `most_boxes` may be up to 20000, which make a file of about
-    140 MB.
-    """
+    """Write a window of a map as STEP: part PATCH, boxes on `base_m` (metres) of glass, 7 kB of file each."""
     window.require(level_map.grid)
     if not 0 < base_m < math.inf:
         raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")

@@ -26,8 +26,8 @@ _GOLDEN_RAD = math.pi * (3 - math.sqrt(5))
 def _ring_levels(level_map, inside, out):  # pragma: no cover - compiled
     """Write the level of every ring into `out` (-1 where no centre lies); return whether all pixels agree.
 
-    Squared radii in pixels are multiples of a quarter and so exact. A centre exactly on a circle between two rings
-    may have the level of either.
+    Squared radii in pixels are multiples of a quarter and so exact. A centre on a circle may have the level of either
+    ring.
     """
     ny, nx = level_map.shape
     last = out.size - 1
@@ -54,9 +54,9 @@ def _ring_levels(level_map, inside, out):  # pragma: no cover - compiled
 
 
 def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
-    """Return the level of every ring that a map is the raster of, from the axis to the edge of the aperture, ``(n,)``.
+    """Return the level of every ring ``(n,)`` from the axis on if a map is a raster of rings, otherwise None.
 
-    None if the map is no raster of rings. Rings in which no pixel's centre lies are not etched.
+    Rings in which no pixel's centre lies are not etched.
     """
     grid, aperture_m = level_map.grid, level_map.aperture_m
     count = max(1, math.ceil((aperture_m / 2 - _REST_M) / grid.pitch_m))
@@ -80,10 +80,7 @@ def rings_from_levels(ring_level: NDArray[np.uint8], level_map: LevelMap) -> Rin
 
 
 def pixel_share(level_map: LevelMap, ring_level: NDArray[np.uint8]) -> float:
-    """Return the share of the clear aperture in which the pixels of a map have another level than its rings.
-
-    It is counted at a million points that cover the aperture evenly, so it is right to about 0.1 %.
-    """
+    """Return the share of the clear aperture, at a million even points (0.1 %), where pixels and rings differ."""
     grid, aperture_m = level_map.grid, level_map.aperture_m
     number = np.arange(_SAMPLES)
     radius_m = aperture_m / 2 * np.sqrt((number + 0.5) / _SAMPLES)

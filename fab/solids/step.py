@@ -160,12 +160,9 @@ def _rim(shell: Any, radius_m: float) -> Any:
 
 
 def plate(surface: Any, thickness_m: float, profile_m: list[tuple[float, float]]) -> Any:
-    """Return a plate below a face at z = 0, with a revolved relief set into the face, as one solid.
+    """Return a plate below a face at z = 0 with a revolved relief set into it, as one solid.
 
-    Args:
-        surface: the face of the plate's outline.
-        thickness_m: thickness, metres.
-        profile_m: corners r, z of the relief from the axis to its rim at z = 0, metres.
+    The relief is given by its corners r, z from the axis to its rim at z = 0, metres.
     """
     from OCP.BRep import BRep_Builder
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace, BRepBuilderAPI_MakeSolid, BRepBuilderAPI_MakeWire

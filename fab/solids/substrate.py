@@ -29,13 +29,7 @@ _SAME_M = 1e-3 * NM
 
 @dataclass(frozen=True)
 class Substrate:
-    """The glass.
-
-    Attributes:
-        outline: ``"die"`` is a square, ``"wafer"`` a disc with a flat at -y.
-        width_m: side of the square or diameter of the disc, metres.
-        thickness_m: thickness, metres.
-        flat_m: length of the wafer's flat, metres; 0 for none.
+    """The glass, metres: a square "die", or a "wafer", a disc with a flat (0 for none) at -y.
 
     Raises:
         InputError: a length is not positive, or the flat does not fit the outline.
@@ -47,7 +41,6 @@ class Substrate:
     flat_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name, value in (("width", self.width_m), ("thickness", self.thickness_m)):
             if not 0 < value < math.inf:
                 raise InputError(
@@ -85,18 +78,13 @@ class Substrate:
 
 @dataclass(frozen=True)
 class ChromeRing:
-    """The chrome around the clear aperture: radius of the opening, outer radius and thickness of the film, metres.
-
-    Raises:
-        InputError: the radii leave no ring, or the film has no thickness.
-    """
+    """Chrome around the clear aperture: radius of the opening, outer radius and thickness of the film, metres."""
 
     inner_m: float
     outer_m: float
     thickness_m: float = 100 * NM
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not (0 < self.inner_m < self.outer_m < math.inf and _SHORTEST_M <= self.thickness_m < math.inf):
             got = ", ".join(format_length(v) for v in (self.inner_m, self.outer_m, self.thickness_m))
             rule = "inner radius, outer radius and thickness must be positive and make a ring"
@@ -117,12 +105,9 @@ class ChromeRing:
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """A radial relief: flat rings around the axis, the first one a disc.
+    """A radial relief: flat rings around the axis, the first one a disc; metres.
 
-    Attributes:
-        outer_m: outer radius of every ring, metres, increasing, ``(n,)``.
-        height_m: height of every ring above the deepest floor, metres, ``(n,)``.
-        blank_m: height of the blank surface above the deepest floor, metres.
+    Outer radii increase; heights, and that of the blank surface, are above the deepest floor.
 
     Raises:
         InputError: other shapes, radii that do not increase, heights off the glass, or a ring or a step too small for
@@ -134,7 +119,6 @@ class Rings:
     blank_m: float
 
     def __post_init__(self) -> None:
-        """Check the values."""
         radii, heights = self.outer_m, self.height_m
         if radii.ndim != 1 or radii.shape != heights.shape or not radii.size:
             got = f"{radii.shape} and {heights.shape}"
@@ -244,10 +228,7 @@ def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[
 def wafer_step(
     path: str | Path, wafer: Substrate, aperture_m: float, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
 ) -> None:
-    """Write a wafer as STEP before it is diced: flat glass, and chrome and clear aperture of every die.
-
-    `aperture_m` is the diameter of the clear apertures, `places_m` the middles of the dies x, y, metres.
-    """
+    """Write a wafer as STEP: flat glass, and chrome and clear aperture of every die about its middle x, y, metres."""
     for x, y in places_m:
         if not wafer.holds(x, y, chrome.outer_m):
             got = f"a chrome of {format_length(2 * chrome.outer_m)} at {format_length(x)}, {format_length(y)}"

@@ -27,11 +27,8 @@ Drawn = MaskEntry | DrawnEntry
 class Expected:
     """Content that the files of an order should have.
 
-    Attributes:
-        manifest: the manifest of the order.
-        level_map: the DOE that they draw.
-        planes: ``[bit, y, x]`` the pixels each etch mask should open.
-        edges: where the pixel edges fall in the drawing.
+    The DOE that they draw, the pixels that each etch mask should open ``[bit, y, x]``, and its pixel edges in the
+    drawing.
     """
 
     manifest: Manifest

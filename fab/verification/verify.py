@@ -122,14 +122,9 @@ def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None
 def read_drawn_levels(
     path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
 ) -> NDArray[np.uint8]:
-    """Rebuild the level numbers ``[y, x]`` that a combined GDSII file draws, with this package's own reader.
+    """Rebuild the level numbers ``[y, x]`` that a cell of a combined GDSII file draws, bit k on layer k + 1.
 
-    Args:
-        path: the combined file, bit k on layer k + 1.
-        levels: the staircase.
-        edges: where the pixel edges fall in the drawing.
-        cell: name of the cell with the planes.
-        moves: how far the edges of every mask were moved outward, database units (`Manifest.edge_moves`).
+    Edges of the masks were moved outward by `moves`, database units (`Manifest.edge_moves`).
 
     Raises:
         InputError: the file is missing or corrupt, or draws something else than a plane of pixels.
@@ -154,10 +149,9 @@ def read_drawn_levels(
 
 
 def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdges) -> tuple[NDArray[np.uint8], Check]:
-    """Return the level numbers to compare with, and whether the stored one is that of the manifest.
+    """Return the level numbers to compare with, and whether the stored ones are those of the manifest.
 
-    A damaged copy of the level map must not put the blame on the masks: if the stored one is not that of the
-    manifest but the one drawn in the combined file is, that one is taken.
+    A damaged copy must not put the blame on the masks: the map drawn in the combined file may be the right one.
     """
     stored = _stored_levels(folder, manifest)
     question = "the level map as in the manifest"
