@@ -7,7 +7,8 @@ the field. Errors are physical numbers in SI units, and the unit ends the name.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -82,21 +83,22 @@ class Deviation(NamedTuple):
     stock: Typical | None
 
 
-def _error(
-    source: str,
-    unit: Unit,
-    meaning: str,
-    *,
-    per_mask: bool = False,
-    one_sided: bool = False,
-    largest: float | None = None,
-    prior_sigma: float = 0.0,
-    stock: Typical | None = None,
-) -> Any:
+def _error(source: str, meaning: str, default: float | tuple[float, ...] = 0.0, **rest: Any) -> Any:
     """A field of `Variation` that is an error; see `Deviation`."""
-    largest, measured = largest or _LARGEST[unit], _MEASURED.get(source, "")
-    deviation = Deviation(source, unit, per_mask, meaning, one_sided, largest, prior_sigma, measured, stock)
-    return field(default=() if per_mask else 0.0, metadata={"deviation": deviation})
+    return field(default=default, metadata={"source": source, "meaning": meaning, **rest})
+
+
+_per_mask, _one_sided = partial(_error, default=()), partial(_error, one_sided=True)
+
+
+def _deviation(error: Field[Any]) -> Deviation:
+    """The kind of an error; its name ends with the unit."""
+    unit: Unit = "m" if error.name.endswith("_m") else "rad" if error.name.endswith("_rad") else "1"
+    given = dict(error.metadata)
+    stock = Typical(*given.pop("stock")) if "stock" in given else None
+    usual = {"one_sided": False, "largest": _LARGEST[unit], "prior_sigma": 0.0}
+    measured = _MEASURED.get(given["source"], "")
+    return Deviation(unit=unit, per_mask=error.default == (), measured=measured, stock=stock, **{**usual, **given})
 
 
 def _degrees(angle: float) -> float:
@@ -151,88 +153,52 @@ class Variation:
     """
 
     common_depth_scale: float = _error(
-        "depth", "1", "all etches too deep by this share", prior_sigma=0.05, stock=Typical(0.0, 0.02, _RATE)
+        "depth", "all etches too deep by this share", prior_sigma=0.05, stock=(0.0, 0.02, _RATE)
     )
-    depth_scale: tuple[float, ...] = _error(
+    depth_scale: tuple[float, ...] = _per_mask(
         "depth",
-        "1",
         "this etch too deep by this share, besides the common one",
-        per_mask=True,
         prior_sigma=0.03,
-        stock=Typical(0.0, 0.01, _SCATTER),
+        stock=(0.0, 0.01, _SCATTER),
     )
     radial_nonuniformity: float = _error(
-        "uniformity",
-        "1",
-        "depth gained from wafer centre to edge (r^2)",
-        prior_sigma=0.05,
-        stock=Typical(0.0, 0.02, _UNIFORMITY),
+        "uniformity", "depth gained from wafer centre to edge (r^2)", prior_sigma=0.05, stock=(0.0, 0.02, _UNIFORMITY)
     )
     linear_nonuniformity_y: float = _error(
-        "uniformity", "1", "depth gained along y per wafer radius", prior_sigma=0.03, stock=Typical(0.0, 0.01, _TILT)
+        "uniformity", "depth gained along y per wafer radius", prior_sigma=0.03, stock=(0.0, 0.01, _TILT)
     )
     linear_nonuniformity_x: float = _error(
-        "uniformity", "1", "depth gained along x per wafer radius", prior_sigma=0.03, stock=Typical(0.0, 0.01, _TILT)
+        "uniformity", "depth gained along x per wafer radius", prior_sigma=0.03, stock=(0.0, 0.01, _TILT)
     )
-    overlay_y_m: tuple[float, ...] = _error("overlay", "m", "mask shifted toward +y", per_mask=True, prior_sigma=1e-6)
-    overlay_x_m: tuple[float, ...] = _error("overlay", "m", "mask shifted toward +x", per_mask=True, prior_sigma=1e-6)
-    rotation_rad: tuple[float, ...] = _error(
-        "overlay",
-        "rad",
-        "mask turned from +x toward +y about the wafer's centre",
-        per_mask=True,
-        largest=math.radians(1),
-        prior_sigma=3e-4,
+    overlay_y_m: tuple[float, ...] = _per_mask("overlay", "mask shifted toward +y", prior_sigma=1e-6)
+    overlay_x_m: tuple[float, ...] = _per_mask("overlay", "mask shifted toward +x", prior_sigma=1e-6)
+    rotation_rad: tuple[float, ...] = _per_mask(
+        "overlay", "mask turned from +x toward +y about the wafer's centre", largest=math.radians(1), prior_sigma=3e-4
     )
-    magnification: tuple[float, ...] = _error(
-        "overlay",
-        "1",
-        "mask too large by this share about the wafer's centre",
-        per_mask=True,
-        largest=0.01,
-        prior_sigma=3e-5,
+    magnification: tuple[float, ...] = _per_mask(
+        "overlay", "mask too large by this share about the wafer's centre", largest=0.01, prior_sigma=3e-5
     )
-    common_cd_bias_m: float = _error("cd", "m", "every etched area grows by this at every edge", prior_sigma=0.3e-6)
-    cd_bias_m: tuple[float, ...] = _error(
-        "cd", "m", "the same for one mask, besides the common one", per_mask=True, prior_sigma=0.2e-6
-    )
-    corner_radius_m: float = _error(
-        "corners", "m", "radius to which square corners are rounded", one_sided=True, prior_sigma=0.5e-6
-    )
-    sidewall_rad: float = _error(
+    common_cd_bias_m: float = _error("cd", "every etched area grows by this at every edge", prior_sigma=0.3e-6)
+    cd_bias_m: tuple[float, ...] = _per_mask("cd", "the same for one mask, besides the common one", prior_sigma=0.2e-6)
+    corner_radius_m: float = _one_sided("corners", "radius to which square corners are rounded", prior_sigma=0.5e-6)
+    sidewall_rad: float = _one_sided(
         "sidewalls",
-        "rad",
         "tilt of etched walls from the vertical, floors narrower",
-        one_sided=True,
         prior_sigma=0.1,
-        stock=Typical(_degrees(5), _degrees(2), _WALLS),
+        stock=(_degrees(5), _degrees(2), _WALLS),
     )
-    etch_lag: float = _error(
-        "lag",
-        "1",
-        "share of depth lost per unit of depth / opening width",
-        one_sided=True,
-        prior_sigma=0.05,
-        stock=Typical(0.05, 0.02, _LAG),
+    etch_lag: float = _one_sided(
+        "lag", "share of depth lost per unit of depth / opening width", prior_sigma=0.05, stock=(0.05, 0.02, _LAG)
     )
-    roughness_m: float = _error(
-        "roughness",
-        "m",
-        "rms height of the surface's roughness",
-        one_sided=True,
-        largest=1 * UM,
-        stock=Typical(2e-9, 0.5e-9, _ROUGHNESS),
+    roughness_m: float = _one_sided(
+        "roughness", "rms height of the surface's roughness", largest=1 * UM, stock=(2e-9, 0.5e-9, _ROUGHNESS)
     )
-    correlation_m: float = _error(
-        "roughness",
-        "m",
-        "its correlation length, exp(-r^2 / length^2)",
-        one_sided=True,
-        stock=Typical(200e-9, 50e-9, _CORRELATION),
+    correlation_m: float = _one_sided(
+        "roughness", "its correlation length, exp(-r^2 / length^2)", stock=(200e-9, 50e-9, _CORRELATION)
     )
-    chrome_y_m: float = _error("chrome", "m", "chrome opening shifted toward +y", prior_sigma=2e-6)
-    chrome_x_m: float = _error("chrome", "m", "chrome opening shifted toward +x", prior_sigma=2e-6)
-    chrome_diameter_m: float = _error("chrome", "m", "chrome opening too wide by this", prior_sigma=4e-6)
+    chrome_y_m: float = _error("chrome", "chrome opening shifted toward +y", prior_sigma=2e-6)
+    chrome_x_m: float = _error("chrome", "chrome opening shifted toward +x", prior_sigma=2e-6)
+    chrome_diameter_m: float = _error("chrome", "chrome opening too wide by this", prior_sigma=4e-6)
     repeats: tuple[int, ...] = ()
     particles: tuple[MaskDisc, ...] = ()
     pinholes: tuple[Disc, ...] = ()
@@ -253,9 +219,7 @@ class Variation:
         return float(value) if mask is None else float(value[mask]) if value else 0.0
 
 
-DEVIATIONS: Mapping[str, Deviation] = MappingProxyType(
-    {f.name: f.metadata["deviation"] for f in fields(Variation) if f.metadata}
-)
+DEVIATIONS: Mapping[str, Deviation] = MappingProxyType({f.name: _deviation(f) for f in fields(Variation) if f.metadata})
 """All kinds of error by their name in `Variation`."""
 
 

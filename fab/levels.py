@@ -71,11 +71,15 @@ class Levels:
         if twins.size:
             # The shallowest pair is made by the fewest masks.
             pair = slice(twins[-1], twins[-1] + 2)
-            lower, upper = (_masks_in_words(self.count - 1 - int(level)) for level in order[pair])
+            lower, upper = (self._masks_in_words(int(level)) for level in order[pair])
             depth = format_length(float(f"{self.total_m - heights[pair][0]:.6g}"))
             got = f"{depth} deep both by {lower} and by {upper}"
             cure = "Change one of the depths; otherwise a level is made in two ways and another is missing."
             raise InputError("etch depths", "no two levels may have the same height", got, cure)
+
+    def _masks_in_words(self, level: int) -> str:
+        masks = [str(bit) for bit in range(self.bits) if not level >> bit & 1]
+        return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
     @property
     def bits(self) -> int:
@@ -123,11 +127,6 @@ class Levels:
         if not 0 <= bit < self.bits:
             raise ValueError(f"`bit` must lie from 0 to {self.bits - 1}, but got {bit}")
         return self.depths_m[bit]
-
-
-def _masks_in_words(bits: int) -> str:
-    masks = [str(bit) for bit in range(bits.bit_length()) if bits >> bit & 1]
-    return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
 
 def require_levels(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:

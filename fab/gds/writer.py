@@ -54,11 +54,6 @@ def _real(value: float) -> bytes:
     return bytes([exponent]) + round(value * 2**56).to_bytes(7, "big")
 
 
-def _opening(dbu_m: float) -> bytes:
-    library = _record(HEADER, struct.pack(">H", _VERSION)) + _record(BGNLIB, _TIME) + _text(LIBNAME, _LIBRARY)
-    return library + _record(UNITS, _real(dbu_m / UM) + _real(dbu_m))
-
-
 def _reference(reference: Reference) -> bytes:
     x, y, columns, rows = reference.x, reference.y, reference.columns, reference.rows
     name = _text(SNAME, require_name(reference.cell))
@@ -86,21 +81,18 @@ def _write_rectangles(stream: BinaryIO, layer: Layer, rects: NDArray[np.int32]) 
         stream.write(words[: len(batch)].view(np.uint8).data)
 
 
-def _write_polygon(stream: BinaryIO, layer: Layer, polygon: NDArray[np.int32]) -> None:
-    closed = np.concatenate([polygon, polygon[:1]]).astype(">i4")
-    stream.write(_element_start(layer) + _record(XY, closed.tobytes()) + _record(ENDEL))
-
-
 def write_gds(path: str | Path, layout: Layout) -> None:
     """Write a layout as GDSII; the memory needed does not grow with the file. Not atomic: use `atomic_folder`."""
     with os_errors_explained(path), open(path, "wb", buffering=0) as stream:
-        stream.write(_opening(layout.dbu_m))
+        stream.write(_record(HEADER, struct.pack(">H", _VERSION)) + _record(BGNLIB, _TIME) + _text(LIBNAME, _LIBRARY))
+        stream.write(_record(UNITS, _real(layout.dbu_m / UM) + _real(layout.dbu_m)))
         for cell in layout.cells:
             stream.write(_record(BGNSTR, _TIME) + _text(STRNAME, require_name(cell.name)))
             for layer, shapes in cell.shapes.items():
                 _write_rectangles(stream, layer, shapes.rectangles)
                 for polygon in shapes.polygons:
-                    _write_polygon(stream, layer, polygon)
+                    closed = np.concatenate([polygon, polygon[:1]]).astype(">i4")
+                    stream.write(_element_start(layer) + _record(XY, closed.tobytes()) + _record(ENDEL))
             stream.write(b"".join(_reference(reference) for reference in cell.references) + _record(ENDSTR))
         stream.write(_record(ENDLIB))
 

@@ -11,7 +11,7 @@ it does; where none does, each edge is rounded once, so that neighbours still sh
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +29,16 @@ _FEMTO = 10**15
 _NANO_FM = 10**6
 _UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
 _LIMIT = 2**31 - 1
+
+
+# x0, y0, x1, y1
+Box = tuple[int, int, int, int]
+
+
+def box_around(boxes: Iterable[Box]) -> Box | None:
+    """Return the smallest box around some; None if there are none."""
+    x0, y0, x1, y1 = list(zip(*boxes, strict=True)) or [()] * 4
+    return (min(x0), min(y0), max(x1), max(y1)) if x0 else None
 
 
 @dataclass(frozen=True)
@@ -70,17 +80,18 @@ class Shapes:
         return total
 
     @property
-    def box(self) -> tuple[int, int, int, int] | None:
+    def box(self) -> Box | None:
         """The smallest x0, y0, x1, y1 around all shapes, or None if there are none."""
-        boxes = [(*polygon.min(axis=0), *polygon.max(axis=0)) for polygon in self.polygons]
+        corners = [(polygon, polygon) for polygon in self.polygons]
         if len(self.rectangles):
-            boxes.append((*self.rectangles[:, :2].min(axis=0), *self.rectangles[:, 2:].max(axis=0)))
-        if not boxes:
-            return None
-        corners = np.array(boxes)
-        x0, y0 = (int(v) for v in corners[:, :2].min(axis=0))
-        x1, y1 = (int(v) for v in corners[:, 2:].max(axis=0))
-        return x0, y0, x1, y1
+            corners.append((self.rectangles[:, :2], self.rectangles[:, 2:]))
+        return box_around((*low.min(axis=0).tolist(), *high.max(axis=0).tolist()) for low, high in corners)
+
+
+def merged(parts: Sequence[Shapes]) -> Shapes:
+    """Put shapes of one layer together."""
+    polygons = tuple(polygon for part in parts for polygon in part.polygons)
+    return Shapes(np.concatenate([part.rectangles for part in parts]), polygons)
 
 
 @dataclass(frozen=True)

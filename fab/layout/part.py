@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fab.layout.geometry import Layer, Shapes, chrome_layer
+from fab.layout.geometry import Box, Layer, Shapes, box_around, chrome_layer, merged
 from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.units import NM, UM
@@ -36,12 +36,9 @@ class Part:
     places: Mapping[str, tuple[float, float]]
 
     @property
-    def box(self) -> tuple[int, int, int, int]:
+    def box(self) -> Box:
         """The smallest x0, y0, x1, y1 around all shapes, database units; all 0 if there are none."""
-        boxes = np.array([shapes.box for shapes in self.shapes.values() if len(shapes)] or [(0, 0, 0, 0)])
-        x0, y0 = (int(v) for v in boxes[:, :2].min(axis=0))
-        x1, y1 = (int(v) for v in boxes[:, 2:].max(axis=0))
-        return x0, y0, x1, y1
+        return box_around(shapes.box for shapes in self.shapes.values() if shapes.box) or (0, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -159,9 +156,7 @@ def joined(parts: Iterable[Part]) -> Part:
     layers = sorted({layer for part in parts for layer in part.shapes}, key=lambda a: (a.number, a.datatype))
     shapes = {}
     for layer in layers:
-        drawn = [part.shapes[layer] for part in parts if layer in part.shapes]
-        boxes = np.concatenate([s.rectangles for s in drawn])
-        shapes[layer] = Shapes(boxes, tuple(polygon for s in drawn for polygon in s.polygons))
+        shapes[layer] = merged([part.shapes[layer] for part in parts if layer in part.shapes])
     return Part(parts[0].dbu_m, shapes, {name: place for part in parts for name, place in part.places.items()})
 
 

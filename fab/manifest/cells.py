@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.files import sha256_bytes
-from fab.layout.geometry import Cell, Layer, Shapes
+from fab.layout.geometry import Cell, Shapes
 from fab.layout.polygons import doubled_area
 from fab.manifest.records import CellEntry, LayerEntry
 from fab.units import UM
@@ -45,7 +45,7 @@ def cell_entry(cell: Cell, dbu_m: float) -> CellEntry:
     """Return the manifest's entry of a cell: layers and copies of placed cells sorted, empty layers left out."""
     layers = [
         LayerEntry(layer=str(layer), sha256=shapes_digest(shapes), **geometry(shapes, dbu_m))  # type: ignore[arg-type]
-        for layer, shapes in sorted(cell.shapes.items(), key=lambda pair: _numbers(pair[0]))
+        for layer, shapes in sorted(cell.shapes.items(), key=lambda pair: (pair[0].number, pair[0].datatype))
         if len(shapes)
     ]
     unit_um = dbu_m / UM
@@ -56,7 +56,3 @@ def cell_entry(cell: Cell, dbu_m: float) -> CellEntry:
         for row in range(r.rows)
     )
     return CellEntry(cell.name, layers, places)
-
-
-def _numbers(layer: Layer) -> tuple[int, int]:
-    return layer.number, layer.datatype

@@ -30,7 +30,7 @@ from fab.files import MANIFEST_NAME, atomic_folder, sha256_file
 from fab.gds.writer import write_gds, write_oasis
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
-from fab.layout.geometry import Cell, Chrome, Layer, Layout, Shapes, pixel_edges
+from fab.layout.geometry import Cell, Chrome, Layer, Layout, merged, pixel_edges
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry
@@ -55,48 +55,19 @@ _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
-def _merged(parts: list[Shapes]) -> Shapes:
-    if len(parts) == 1:
-        return parts[0]
-    polygons = tuple(polygon for part in parts for polygon in part.polygons)
-    return Shapes(np.concatenate([part.rectangles for part in parts]), polygons)
-
-
 def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
     """Return the drawing of one photomask: one layer number, every datatype of it merged onto datatype 0."""
     cells = []
     for cell in layout.cells:
         parts = [shapes for other, shapes in cell.shapes.items() if other.number == layer.number and len(shapes)]
         name = top if cell is layout.top else cell.name
-        cells.append(Cell(name, {layer: _merged(parts)} if parts else {}, cell.references))
+        cells.append(Cell(name, {layer: merged(parts)} if parts else {}, cell.references))
     return Layout(layout.dbu_m, tuple(cells))
-
-
-def _frame(order: Order, dbu_m: float) -> Frame:
-    return draw_frame(
-        order.wafer,
-        order.plates,
-        order.level_map,
-        splits=order.splits,
-        stem=order.stem,
-        minimum_line_m=order.process.minimum_line_m,
-        chrome_m=2 * order.chrome.radii_m(order.level_map)[1],
-        dbu_m=dbu_m,
-    )
 
 
 def _around(order: Order, layout: Layout) -> list[CellEntry]:
     """Return the manifest's entries of every cell but those of the DOE, which come first."""
     return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[len(order.splits) :]]
-
-
-def _drawn_does(order: Order) -> Layout:
-    """Draw the DOE in all the ways that the dies ask for, as ordered first."""
-    drawn = [
-        mask_layout(order.level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
-        for split in order.splits
-    ]
-    return Layout(drawn[0].dbu_m, tuple(one.top for one in drawn))
 
 
 def _file_entry(
@@ -132,8 +103,22 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     level_map = order.level_map
     levels, grid = level_map.levels, level_map.grid
     log.info("drawing the masks")
-    drawn = _drawn_does(order)
-    frame, dbu_m = _frame(order, drawn.dbu_m), drawn.dbu_m
+    does = [
+        mask_layout(level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
+        for split in order.splits
+    ]
+    drawn = Layout(does[0].dbu_m, tuple(one.top for one in does))
+    dbu_m = drawn.dbu_m
+    frame = draw_frame(
+        order.wafer,
+        order.plates,
+        level_map,
+        splits=order.splits,
+        stem=order.stem,
+        minimum_line_m=order.process.minimum_line_m,
+        chrome_m=2 * order.chrome.radii_m(level_map)[1],
+        dbu_m=dbu_m,
+    )
     splits = split_entries(order, drawn, frame)
     layout = Layout(dbu_m, (*drawn.cells, *frame.cells))
     doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
@@ -142,7 +127,7 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     endings = ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
     gds, oasis, levels_file, preview = (f"{order.stem}_{end}" for end in endings)
     files = _write_masks(folder, order, layout, doe_layers, gds, oasis)
-    del drawn, layout
+    del does, drawn, layout
     log.info("drawing the preview")
     np.save(folder / levels_file, level_map.level, allow_pickle=False)
     save(order.plot(), folder / preview)

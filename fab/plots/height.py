@@ -30,11 +30,13 @@ def plot_height(
     Outside the clear aperture, where chrome covers the glass, all is grey. With `levels` the axis names their heights,
     and a map that stands on them is counted per level. The picture takes the place of `ax`; a new figure by default.
     """
+    from matplotlib import colormaps
+
     grid = height.grid
     inside = grid.inside_circle(height.aperture_m)
     heights = height.height_m[inside]
     ends = _range_m(heights, levels)
-    style = {"cmap": _palette(), "vmin": ends[0] / NM, "vmax": ends[1] / NM}
+    style = {"cmap": colormaps[HEIGHTS].with_extremes(bad=CHROME), "vmin": ends[0] / NM, "vmax": ends[1] / NM}
     with panels(ax, (10.1, 5.35), title) as figure:
         at = figure.subplot_mosaic(
             [["whole", "centre", "scale", "shares"], ["whole", "edge", "scale", "shares"]],
@@ -49,12 +51,6 @@ def plot_height(
             frame_window(at["whole"], grid, window, name)
         _draw_shares(figure, at["scale"], at["shares"], heights, levels, ends, style)
     return figure
-
-
-def _palette() -> Any:
-    from matplotlib import colormaps
-
-    return colormaps[HEIGHTS].with_extremes(bad=CHROME)
 
 
 def _range_m(heights: NDArray[np.floating], levels: "Levels | None") -> tuple[float, float]:

@@ -77,11 +77,12 @@ def write_tiff(path: str | Path, level_map: LevelMap) -> float:
     return scale_m
 
 
-def write_npy(path: str | Path, level_map: LevelMap) -> None:
-    """Write the heights as a bare array: float64 metres, ``[y, x]``, row 0 at the lowest y."""
+def write_npy(path: str | Path, level_map: LevelMap) -> float:
+    """Write the heights as a bare array: float64 metres (hence 1.0), ``[y, x]``, row 0 at the lowest y."""
     stream = io.BytesIO()
     np.save(stream, level_map.levels.heights_m()[level_map.level], allow_pickle=False)
     write_atomic(path, stream.getvalue())
+    return 1.0
 
 
 def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
@@ -129,19 +130,8 @@ def write_zemax_sag(
     write_atomic(path, b"".join([header.encode(), *body]))
 
 
-def _write_tif(path: Path, model: DoeModel) -> Stated:
-    per_count = write_tiff(path, model.level_map)
-    return Stated("height above the deepest floor, first row at the highest y", metres_per_count=per_count)
-
-
-def _write_npy(path: Path, model: DoeModel) -> Stated:
-    write_npy(path, model.level_map)
-    return Stated("height above the deepest floor, row 0 at the lowest y", metres_per_count=1.0)
-
-
-def _write_png(path: Path, model: DoeModel) -> Stated:
-    per_count = write_greymap(path, model.level_map)
-    return Stated("white is the blank surface, first row at the highest y", metres_per_count=per_count)
+def _write(path: Path, model: DoeModel, content: str, write: Callable[[Path, LevelMap], float]) -> Stated:
+    return Stated(content, metres_per_count=write(path, model.level_map))
 
 
 def _write_sag(path: Path, model: DoeModel) -> Stated | None:
@@ -187,10 +177,6 @@ def _header_problems(path: Path, level_map: LevelMap, window: PixelWindow) -> li
     return []
 
 
-def _read_npy(path: Path) -> NDArray[np.float64]:
-    return np.load(path, allow_pickle=False)
-
-
 def _read_sag(path: Path) -> NDArray[np.float64]:
     with open(path) as lines:
         columns, rows = (int(word) for word in lines.readline().split()[:2])
@@ -199,12 +185,18 @@ def _read_sag(path: Path) -> NDArray[np.float64]:
     return sag.reshape(rows, columns)[::-1]
 
 
+_FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
+_TOP_ROW = "first row at the highest y"
 KINDS = tuple(
     ModelKind(ending, write, partial(_problems, read=read))
     for ending, write, read in (
-        ("_HEIGHT.tif", _write_tif, read_pixels),
-        ("_HEIGHT.npy", _write_npy, _read_npy),
-        ("_GREY.png", _write_png, read_pixels),
+        ("_HEIGHT.tif", partial(_write, content=f"{_FLOOR}, {_TOP_ROW}", write=write_tiff), read_pixels),
+        ("_HEIGHT.npy", partial(_write, content=f"{_FLOOR}, row 0 at the lowest y", write=write_npy), np.load),
+        (
+            "_GREY.png",
+            partial(_write, content=f"white is the blank surface, {_TOP_ROW}", write=write_greymap),
+            read_pixels,
+        ),
         ("_SAG.DAT", _write_sag, _read_sag),
     )
 )

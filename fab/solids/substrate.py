@@ -190,13 +190,6 @@ def substrate_bodies(
     return {"SUBSTRATE": glass, **({"CHROME": chrome.body} if chrome is not None else {})}
 
 
-def substrate_volumes_m3(
-    substrate: Substrate, chrome: ChromeRing | None = None, rings: Rings | None = None
-) -> dict[str, float]:
-    """Return the volume of every solid that `substrate_step` writes, by closed form, cubic metres by name."""
-    return {name: body.volume_m3 for name, body in substrate_bodies(substrate, chrome, rings).items()}
-
-
 def substrate_step(
     path: str | Path,
     substrate: Substrate,

@@ -7,14 +7,14 @@ space, density) are taken again from the drawing and from the level map.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.files import canonical_json
-from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, require_name
+from fab.layout.geometry import Box, Cell, Layer, Layout, Shapes, box_around, require_name
 from fab.layout.polygons import MAX_VERTICES, doubled_area, smallest_runs
 from fab.manifest.cells import geometry
 from fab.manifest.records import FileEntry
@@ -89,36 +89,22 @@ def _crosses(points: NDArray[np.int64]) -> bool:
     return bool(np.any((_side(a, b, c) * _side(a, b, d) <= 0) & (_side(c, d, a) * _side(c, d, b) <= 0)))
 
 
-Box = tuple[int, int, int, int]
-
-
-def _around(boxes: list[Box]) -> Box:
-    low_x, low_y, high_x, high_y = zip(*boxes, strict=True)
-    return min(low_x), min(low_y), max(high_x), max(high_y)
-
-
-def _boxes(cell: Cell, done: Mapping[str, dict[Layer, Box]]) -> dict[Layer, Box]:
-    """Return the box of each layer of a cell, with all that it places."""
-    found: dict[Layer, list[Box]] = {}
-    for layer, shapes in cell.shapes.items():
-        box = shapes.box
-        if box is not None:
-            found.setdefault(layer, []).append(box)
-    for reference in cell.references:
-        for layer, box in done[reference.cell].items():
-            found.setdefault(layer, []).append(_placed(box, reference))
-    return {layer: _around(boxes) for layer, boxes in found.items()}
-
-
-def _placed(box: Box, at: Reference) -> Box:
-    far_x, far_y = at.x + (at.columns - 1) * at.step_x, at.y + (at.rows - 1) * at.step_y
-    return (box[0] + min(at.x, far_x), box[1] + min(at.y, far_y), box[2] + max(at.x, far_x), box[3] + max(at.y, far_y))
-
-
 def _place_problems(layout: Layout, blank_m: float) -> list[str]:
+    """Check that all of every layer, with what its cell places, lies on the blank."""
     done: dict[str, dict[Layer, Box]] = {}
     for cell in layout.cells:
-        done[cell.name] = _boxes(cell, done)
+        boxes = [(layer, box) for layer, shapes in cell.shapes.items() if (box := shapes.box) is not None]
+        for at in cell.references:
+            (left, right), (low, high) = (
+                sorted((start, start + (count - 1) * step))
+                for start, count, step in ((at.x, at.columns, at.step_x), (at.y, at.rows, at.step_y))
+            )
+            for layer, (x0, y0, x1, y1) in done[at.cell].items():
+                boxes.append((layer, (x0 + left, y0 + low, x1 + right, y1 + high)))
+        found: dict[Layer, Box] = {}
+        for layer, box in boxes:
+            found[layer] = box_around([box, found.get(layer, box)]) or box
+        done[cell.name] = found
     most = round(blank_m / 2 / layout.dbu_m)
     return [
         f"layer {layer} reaches {format_length(reach * layout.dbu_m)} from the middle, beyond the blank of "
@@ -136,9 +122,7 @@ def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> li
     for name, drawn in expected.etch_layers(entry).items():
         cell = layout.cell(name)
         stated = {**drawn, **({chrome: expected.manifest.chrome} if chrome is not None else {})}
-        for layer, one in stated.items():
-            if cell is None:
-                break
+        for layer, one in stated.items() if cell is not None else ():
             found = geometry(cell.shapes.get(layer, none), layout.dbu_m)
             wanted = {"polygons": one.polygons, "area_um2": one.area_um2, "box_um": one.box_um}
             problems += [

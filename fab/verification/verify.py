@@ -87,26 +87,21 @@ class VerificationReport:
 
 
 def _check_bytes(folder: Path, entry: FileEntry) -> Check:
-    path = folder / entry.file
+    path, problems = folder / entry.file, ()
     if not path.is_file():
-        problems = ["the file is missing"]
+        problems = ("the file is missing",)
     elif path.stat().st_size != entry.bytes:
-        problems = [f"{path.stat().st_size} bytes instead of {entry.bytes}"]
+        problems = (f"{path.stat().st_size} bytes instead of {entry.bytes}",)
     elif sha256_file(path) != entry.sha256:
-        problems = ["the SHA-256 differs"]
-    else:
-        problems = []
-    return Check(entry.file, "bytes as in the manifest", tuple(problems))
+        problems = ("the SHA-256 differs",)
+    return Check(entry.file, "bytes as in the manifest", problems)
 
 
 def _check_nothing_else(folder: Path, manifest: Manifest) -> list[Check]:
-    listed = {entry.file for entry in manifest.files}
-    found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas"))
-    return [
-        Check(name, "listed in the manifest", ("a mask file that the manifest does not know",))
-        for name in found
-        if name not in listed
-    ]
+    masks = {path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas")}
+    unknown = sorted(masks - {entry.file for entry in manifest.files})
+    problems = ("a mask file that the manifest does not know",)
+    return [Check(name, "listed in the manifest", problems) for name in unknown]
 
 
 def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
@@ -168,19 +163,6 @@ def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdg
     if stored is not None:
         return stored, failed
     raise CheckFailed([f"{failed.file}: {problem}; no other file holds that map" for problem in failed.problems])
-
-
-def _check_plane_digests(expected: Expected) -> list[Check]:
-    return [
-        Check(mask.file, "digest of the plane in the manifest", ("it is not that of the level map",))
-        for mask in expected.manifest.masks
-        if plane_digest(expected.planes[mask.bit]) != mask.plane_sha256
-    ]
-
-
-def _check_numbers(expected: Expected) -> list[Check]:
-    found = number_problems(expected)
-    return [Check(file, "numbers of the order form", tuple(problems)) for file, problems in found.items()]
 
 
 def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check, bool]:
@@ -255,7 +237,13 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         reference, map_check = _reference(folder, manifest, levels, edges)
         level_map = manifest.level_map(reference)
         expected = Expected(manifest, level_map, level_map.planes(), edges)
-        checks += [map_check, *_check_plane_digests(expected), *_check_numbers(expected)]
+        checks.append(map_check)
+        for mask in manifest.masks:
+            if plane_digest(expected.planes[mask.bit]) != mask.plane_sha256:
+                question = "digest of the plane in the manifest"
+                checks.append(Check(mask.file, question, ("it is not that of the level map",)))
+        for file, problems in number_problems(expected).items():
+            checks.append(Check(file, "numbers of the order form", tuple(problems)))
         for entry in manifest.files:
             if entry.format in (_GDS, _OASIS):
                 checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)

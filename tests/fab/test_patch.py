@@ -7,7 +7,7 @@ from fab.grid import Grid
 from fab.levels import Levels, height_of
 from fab.solids.columns import PixelWindow
 from fab.solids.patch import Patch, patch_body, patch_step
-from fab.solids.step import step_bodies, step_volumes_m3
+from fab.solids.step import step_bodies
 from fab.units import NM, UM
 from tests.fab.maps import level_map_from
 
@@ -30,7 +30,11 @@ def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
     want = (height_of(level_map.level, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
     assert patch_body(level_map, window, UM).volume_m3 == pytest.approx(want, rel=1e-14)
     # Edges of 1e-3 mm are written with 15 digits.
-    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx({"PATCH": want}, rel=1e-11)
+    assert volumes(step_bodies(tmp_path / "p.step")) == pytest.approx({"PATCH": want}, rel=1e-11)
+
+
+def volumes(bodies):
+    return {name: body.volume_m3 for name, body in bodies.items()}
 
 
 def test_a_patch_lies_where_its_window_does(tmp_path):

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from fab.solids.step import step_bodies, step_volumes_m3
+from fab.solids.step import step_bodies
 from fab.solids.substrate import (
     ChromeRing,
     Rings,
     Substrate,
     substrate_bodies,
     substrate_step,
-    substrate_volumes_m3,
     wafer_bodies,
     wafer_step,
 )
@@ -25,6 +24,10 @@ CHROME = ChromeRing(2.195 * MM, 3.7 * MM)
 APERTURE = 4.4 * MM
 # The kernel integrates planes and cylinders in closed form; what is left is float64 of millimetres in text.
 CLOSE = 1e-12
+
+
+def volumes(bodies):
+    return {name: body.volume_m3 for name, body in bodies.items()}
 
 
 def some_rings(count=60, aperture_m=APERTURE):
@@ -45,8 +48,8 @@ def sizes(shape):
 @pytest.mark.parametrize("rings", [None, some_rings()], ids=["flat", "radial"])
 def test_a_plate_reads_back_with_the_volumes_of_closed_form(tmp_path, substrate, rings):
     substrate_step(tmp_path / "p.step", substrate, APERTURE, CHROME, rings)
-    want = substrate_volumes_m3(substrate, CHROME, rings)
-    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx(want, rel=CLOSE)
+    want = volumes(substrate_bodies(substrate, CHROME, rings))
+    assert volumes(step_bodies(tmp_path / "p.step")) == pytest.approx(want, rel=CLOSE)
     assert want["CHROME"] == pytest.approx(math.pi * (3.7**2 - 2.195**2) * 1e-4 * 1e-9, rel=1e-14)
 
 
@@ -54,7 +57,7 @@ def test_volumes_of_closed_form_by_hand():
     # Two rings of 1 and 2 mm, 1 um and 0.5 um deep.
     rings = Rings(np.array([1 * MM, 2 * MM]), np.array([0.0, 0.5 * UM]), 1 * UM)
     assert rings.removed.volume_m3 == pytest.approx(math.pi * (1 * 1e-3 + 3 * 0.5e-3) * 1e-9, rel=1e-14)
-    assert substrate_volumes_m3(DIE, None, rings) == pytest.approx(
+    assert volumes(substrate_bodies(DIE, None, rings)) == pytest.approx(
         {"SUBSTRATE": 50e-9 - rings.removed.volume_m3}, rel=1e-14
     )
     # The cut-off segment by its chord: half of the wafer if the flat is the diameter, almost.
@@ -63,9 +66,9 @@ def test_volumes_of_closed_form_by_hand():
 
 
 def test_the_relief_is_measured_and_not_only_the_bulk(tmp_path):
-    rings, bare = some_rings(), substrate_volumes_m3(DIE)["SUBSTRATE"]
+    rings, bare = some_rings(), volumes(substrate_bodies(DIE))["SUBSTRATE"]
     substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
-    removed = bare - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
+    removed = bare - volumes(step_bodies(tmp_path / "p.step"))["SUBSTRATE"]
     # The relief is 2e-4 of the glass, so it comes out with four digits less.
     assert removed == pytest.approx(rings.removed.volume_m3, rel=1e-8)
 
@@ -156,14 +159,16 @@ def test_awkward_profiles(tmp_path, heights):
     count = len(heights)
     rings = Rings(np.arange(1, count + 1) * 2.2 * MM / count, np.array(heights) * 75 * NM, 1125 * NM)
     substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
-    assert step_volumes_m3(tmp_path / "p.step") == pytest.approx(substrate_volumes_m3(DIE, None, rings), rel=CLOSE)
+    assert volumes(step_bodies(tmp_path / "p.step")) == pytest.approx(
+        volumes(substrate_bodies(DIE, None, rings)), rel=CLOSE
+    )
 
 
 def test_nanometre_rings_and_steps_survive(tmp_path):
     # Ten thousand times finer than the die is wide, and steps of 1 nm.
     rings = Rings(np.arange(1, 200) * 20 * NM, np.arange(1, 200) % 2 * NM, 1 * NM)
     substrate_step(tmp_path / "p.step", DIE, APERTURE, None, rings)
-    removed = substrate_volumes_m3(DIE)["SUBSTRATE"] - step_volumes_m3(tmp_path / "p.step")["SUBSTRATE"]
+    removed = volumes(substrate_bodies(DIE))["SUBSTRATE"] - volumes(step_bodies(tmp_path / "p.step"))["SUBSTRATE"]
     # 2.5e-20 m3 of 5e-8 m3: less than the last digit of the volume of the glass.
     assert removed == pytest.approx(rings.removed.volume_m3, abs=5e-8 * 1e-14)
     planes = [f for f in shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces() if f.geomType() == "PLANE"]
@@ -186,7 +191,7 @@ def test_the_same_plate_gives_the_same_bytes_whatever_was_written_before(tmp_pat
 
 def test_writing_prints_nothing(tmp_path, capfd):
     substrate_step(tmp_path / "p.step", DIE, APERTURE)
-    step_volumes_m3(tmp_path / "p.step")
+    volumes(step_bodies(tmp_path / "p.step"))
     assert capfd.readouterr() == ("", "")
 
 
@@ -230,10 +235,10 @@ def test_what_does_not_fit_is_refused(tmp_path, substrate, aperture_m, chrome, r
 def test_damaged_and_missing_step_files_are_refused(tmp_path, capfd):
     path = tmp_path / "p.step"
     with pytest.raises(InputError, match="must exist"):
-        step_volumes_m3(path)
+        volumes(step_bodies(path))
     path.write_bytes(b"ISO-10303-21;\nnothing of the kind\n")
     with pytest.raises(InputError, match="must be STEP"):
-        step_volumes_m3(path)
+        volumes(step_bodies(path))
     assert capfd.readouterr() == ("", "")
 
 
@@ -241,5 +246,5 @@ def test_a_wrong_unit_in_the_file_is_found(tmp_path):
     path = tmp_path / "p.step"
     substrate_step(path, DIE, APERTURE, CHROME)
     path.write_bytes(path.read_bytes().replace(b"SI_UNIT(.MILLI.,.METRE.)", b"SI_UNIT(.CENTI.,.METRE.)"))
-    want = {name: 1000 * volume for name, volume in substrate_volumes_m3(DIE, CHROME).items()}
-    assert step_volumes_m3(path) == pytest.approx(want, rel=CLOSE)
+    want = {name: 1000 * volume for name, volume in volumes(substrate_bodies(DIE, CHROME)).items()}
+    assert volumes(step_bodies(path)) == pytest.approx(want, rel=CLOSE)
