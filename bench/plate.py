@@ -21,10 +21,10 @@ from doedesign.design.design import Design
 from doedesign.prediction import predict
 from doedesign.spec import load_spec
 from doedesign.tolerancing.pool import DrawModel, evaluate_here, predicted_rows
+from fab.draws import normal_draw
 from fab.level_map import LevelMap
 from fab.levels import Levels, height_of, quantise
 from fab.process import Process
-from fab.sampling import normal_draw
 from sim.psf_bank import psf
 
 SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"

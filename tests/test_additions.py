@@ -47,7 +47,7 @@ from doedesign.spec import load_process, load_variation, variation_to_toml
 from fab.draws import chosen_errors, normal_keys, one_at_a_time_keys, sources_of, variation_at
 from fab.errors import InputError
 from fab.process import Normal, Variation
-from fab.sampling import normal_draw
+from fab.draws import normal_draw
 from fab.stock import STOCK
 from sim.surface.relief import relief_of
 

@@ -21,13 +21,12 @@ from doedesign.design.design import Design
 from doedesign.prediction import Prediction, plate_rows, predict
 from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
-from fab.draws import EXPECTED, one_at_a_time_keys, variation_at
+from fab.draws import EXPECTED, one_at_a_time_keys, variation_at, varying
 from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.process import Normal, Process, Variation, deviation_of
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
-from fab.sampling import varying
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.material import full_wave_wavelength_m, refractive_index

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.tolerancing.analysis import CONFIDENCE, Sample
-from fab.draws import EXPECTED, one_at_a_time_keys, sobol_keys, sources_of
+from fab.draws import EXPECTED, one_at_a_time_keys, sobol_keys, source_of, sources_of, varying
 from fab.process import DEVIATIONS, Process
-from fab.sampling import source_of, varying
 
 _FOLDED = 1 - 2 / np.pi  # variance of a normal deviate's absolute value
 _RESAMPLES = 500

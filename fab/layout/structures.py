@@ -127,15 +127,6 @@ def _stripe(pitch_m: float, dbu_m: float, minimum_line_m: float) -> int:
     return pixel * fewest_pixels(minimum_line_m, pixel * dbu_m)
 
 
-def grating_periods_m(levels: Levels, pitch_m: float, dbu_m: float, minimum_line_m: float) -> tuple[float, float]:
-    """Return the periods of the binary and of the blazed grating as they are drawn, metres.
-
-    They are four stripes and as many stripes as levels; a stripe is the fewest whole pixels that can be printed.
-    """
-    stripe_m = _stripe(pitch_m, dbu_m, minimum_line_m) * dbu_m
-    return 4 * stripe_m, levels.count * stripe_m
-
-
 def _framed(
     name: str, grating: Part, size: tuple[int, int], chrome: Photomask | None, words: Photomask, dbu_m: float
 ) -> Part:

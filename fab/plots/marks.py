@@ -43,31 +43,6 @@ def plot_part(
     return axes
 
 
-def plot_through_mask(
-    part: "Part", first: "Photomask", mask: "Photomask", title: str = "", name: str = "finder", ax: "Axes | None" = None
-) -> "Axes":
-    """Draw what a microscope shows through a photomask on the wafer, around its own mark of a name in a part.
-
-    The photomask `first` made the marks on the wafer, which are coloured; the chrome of `mask` hides the wafer.
-    """
-    from matplotlib.patches import Patch
-
-    x, y = part.places[f"{name}, {mask.name}"]
-    window = (x / UM - 340, y / UM - 740, x / UM + 640, y / UM + 340)
-    with single(ax, (6.4, 7.3), title) as axes:
-        wafer, drawn = (_cut(part, [a for a in part.shapes if a.number == p.layer], window) for p in (first, mask))
-        colour = _colour(first.on(1), (first,))
-        _fill(axes, wafer, part.dbu_m, colour)
-        chrome = drawn if mask.tone == "dark" else _everything(part, window) - drawn
-        _fill(axes, chrome, part.dbu_m, _MASK, alpha=0.88)
-        keys = [
-            Patch(color=_MASK, alpha=0.88, label=f"chrome of {mask.name}"),
-            Patch(color=colour, label=f"wafer, {first.name}"),
-        ]
-        _finish(axes, window, keys)
-    return axes
-
-
 def _colour(layer: "Layer", masks: "Sequence[Photomask]") -> str:
     mask = next(mask for mask in masks if mask.layer == layer.number)
     if mask.bit is not None:

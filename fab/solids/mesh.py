@@ -197,16 +197,15 @@ def _bottom(first: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate(parts)
 
 
-def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0) -> Mesh:
-    """Build the closed mesh of a relief, heights exaggerated, on a slab `base_m` (metres) below the deepest floor.
+def relief_mesh(cells: Columns, base_m: float) -> Mesh:
+    """Build the closed mesh of a relief on a slab `base_m` (metres) below the deepest floor.
 
-    Its volume is ``exaggeration * cells.volume_m3 + base_m * cells.area_m2``.
+    Its volume is ``cells.volume_m3 + base_m * cells.area_m2``.
     """
-    for name, value in (("mesh base", base_m), ("height exaggeration", exaggeration)):
-        if not 0 < value < math.inf:
-            raise InputError(name, "must be positive and finite", value, "Choose a positive number.")
-    height = exaggeration * (cells.height_m - cells.blank_m)
-    base = -exaggeration * cells.blank_m - base_m
+    if not 0 < base_m < math.inf:
+        raise InputError("mesh base", "must be positive and finite", base_m, "Choose a positive number.")
+    height = cells.height_m - cells.blank_m
+    base = -cells.blank_m - base_m
     first, z, twin = _corners(height, base)
     sides = np.empty((_triangles(height, base, first, z, twin, np.empty((0, 3), np.int32)), 3), dtype=np.int32)
     _triangles(height, base, first, z, twin, sides)
@@ -215,7 +214,7 @@ def relief_mesh(cells: Columns, base_m: float = 10e-6, exaggeration: float = 1.0
     vertices = np.stack([np.repeat(corners_x.ravel(), counts), np.repeat(corners_y.ravel(), counts), z], axis=1)
     vertices = np.concatenate([vertices, vertices[twin >= 0]])
     about = (
-        f"DOE relief, heights x {exaggeration:g}, blocks of {cells.block} x {cells.block} pixels, "
+        f"DOE relief, heights x 1, blocks of {cells.block} x {cells.block} pixels, "
         f"base {format_length(base_m)}, z = 0 at the blank surface, origin at the centre of the clear aperture"
     )
     return Mesh(vertices, np.concatenate([_bottom(first), sides]), about)

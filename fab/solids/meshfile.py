@@ -14,7 +14,6 @@ from typing import Any, Literal
 from xml.parsers.expat import ParserCreate
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
@@ -42,73 +41,20 @@ _RELATIONS = (
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
-@njit(cache=True)
-def _put_integer(value, buffer, at):  # pragma: no cover - compiled
-    start = at
-    while True:
-        buffer[at] = 48 + value % 10
-        value //= 10
-        at += 1
-        if value == 0:
-            break
-    buffer[start:at] = buffer[start:at][::-1].copy()
-    return at
-
-
-@njit(cache=True)
-def _put_picometres(value, decimals, buffer, at):  # pragma: no cover - compiled
-    """Write a whole number of picometres as a decimal number of units that have so many decimals."""
-    if value < 0:
-        buffer[at] = 45
-        at += 1
-        value = -value
-    unit = 10**decimals
-    at = _put_integer(value // unit, buffer, at)
-    rest = value % unit
-    if rest:
-        buffer[at] = 46
-        at += 1
-        while rest:
-            unit //= 10
-            buffer[at] = 48 + rest // unit
-            rest %= unit
-            at += 1
-    return at
-
-
-@njit(cache=True)
-def _put_rows(values, decimals, words, ends, buffer):  # pragma: no cover - compiled
-    """Write rows of three numbers between four words; words are one byte string cut at `ends`."""
-    at = 0
-    for row in range(values.shape[0]):
-        start = 0
-        for column in range(4):
-            for k in range(start, ends[column]):
-                buffer[at] = words[k]
-                at += 1
-            start = ends[column]
-            if column < 3:
-                at = _put_picometres(values[row, column], decimals, buffer, at)
-    return at
-
-
-def _rows_of_xml(values: NDArray[np.int64], decimals: int, words: tuple[bytes, ...]) -> list[bytes]:
-    joined = np.frombuffer(b"".join(words), dtype=np.uint8)
-    ends = np.cumsum([len(word) for word in words])
-    step = 1 << 18
-    buffer = np.empty(step * (joined.size + 3 * 24), dtype=np.uint8)
-    return [
-        buffer[: _put_rows(values[start : start + step], decimals, joined, ends, buffer)].tobytes()
-        for start in range(0, len(values), step)
-    ]
+def _decimals(picometres: NDArray[np.int64], decimals: int) -> NDArray[Any]:
+    """Write whole picometres as decimal numbers of units that have so many decimals, without zeros at the end."""
+    different, where = np.unique(picometres, return_inverse=True)
+    texts = [f"{value / 10**decimals:.{decimals}f}".rstrip("0").rstrip(".") for value in different.tolist()]
+    return np.array(texts, dtype=object)[where]
 
 
 def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
     """Write a mesh as 3MF, which states its unit (``"mm"`` or ``"um"``); numbers are rounded to a picometre."""
     decimals = {"mm": 9, "um": 6}[unit]
     picometres = np.rint(mesh.vertices_m * 1e12).astype(np.int64)
-    vertices = _rows_of_xml(picometres, decimals, (b'<vertex x="', b'" y="', b'" z="', b'"/>\n'))
-    triangles = _rows_of_xml(mesh.triangles.astype(np.int64), 0, (b'<triangle v1="', b'" v2="', b'" v3="', b'"/>\n'))
+    corners = zip(*(_decimals(axis, decimals) for axis in picometres.T), strict=True)
+    vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>\n' for x, y, z in corners)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>\n' for a, b, c in mesh.triangles.tolist())
     head = (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         f'<model unit="{_3MF_UNITS[unit]}" xml:lang="en-US" xmlns="{_CORE}">\n'
@@ -116,19 +62,14 @@ def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
         '<resources><object id="1" type="model" name="DOE"><mesh>\n<vertices>\n'
     )
     tail = '</triangles>\n</mesh></object></resources>\n<build><item objectid="1"/></build>\n</model>\n'
-    model = [head.encode(), *vertices, b"</vertices>\n<triangles>\n", *triangles, tail.encode()]
+    model = f"{head}{vertices}</vertices>\n<triangles>\n{triangles}{tail}"
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, parts in (
-            ("[Content_Types].xml", [_TYPES.encode()]),
-            ("_rels/.rels", [_RELATIONS.encode()]),
-            ("3D/3dmodel.model", model),
-        ):
+        for name, part in (("[Content_Types].xml", _TYPES), ("_rels/.rels", _RELATIONS), ("3D/3dmodel.model", model)):
             info = zipfile.ZipInfo(name, _ZIP_TIME)
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w", force_zip64=True) as member:
-                for part in parts:
-                    member.write(part)
+                member.write(part.encode())
     write_atomic(path, stream.getvalue())
 
 

@@ -21,9 +21,7 @@ from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
 _MOST_BOXES = 2000
-_NO_MORE_BOXES = 20_000
 _MOST_PIXELS = 1000
-_BASE_M = 10e-6
 
 
 @dataclass(frozen=True)
@@ -66,26 +64,26 @@ class Patch:
             cure = f"Choose an edge of at most {format_length(_MOST_PIXELS * level_map.grid.pitch_m)}."
             raise InputError("patch", rule, f"{window.rows} x {window.columns}", cure)
         if self.step:
-            _tops(level_map, window, _MOST_BOXES)
+            _tops(level_map, window)
 
     def cells(self, level_map: LevelMap) -> Columns:
         """Return the columns of the patch."""
         return window_cells(level_map, self.window(level_map.grid))
 
 
-def _tops(level_map: LevelMap, window: PixelWindow, most_boxes: int) -> dict[int, NDArray[np.int32]]:
+def _tops(level_map: LevelMap, window: PixelWindow) -> dict[int, NDArray[np.int32]]:
     """Return the rectangles of every level in a window, or refuse too many."""
     cut = window.cut(level_map.level)
     tops = {int(level): rectangles((cut == level).astype(np.uint8)) for level in np.unique(cut)}
     count = sum(len(found) for found in tops.values())
-    if count > most_boxes:
-        rule = f"a STEP patch may have at most {most_boxes} boxes (a file of about 7 kB each)"
+    if count > _MOST_BOXES:
+        rule = f"a STEP patch may have at most {_MOST_BOXES} boxes (a file of about 7 kB each)"
         cure = "Choose a smaller window, or take the mesh alone."
         raise InputError("patch", rule, f"{count} in {window.rows} x {window.columns} pixels", cure)
     return tops
 
 
-def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M) -> Body:
+def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float) -> Body:
     """Return volume and centre of all the boxes that `patch_step` writes."""
     levels, grid = level_map.levels, level_map.grid
     heights_m = levels.heights_m()[window.cut(level_map.level)] + base_m
@@ -100,17 +98,12 @@ def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M
     return Body(total * grid.pitch_m**2, centre_m)
 
 
-def patch_step(
-    path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float = _BASE_M, most_boxes: int = _MOST_BOXES
-) -> None:
+def patch_step(path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float) -> None:
     """Write a window of a map as STEP: part PATCH, boxes on `base_m` (metres) of glass, 7 kB of file each."""
     window.require(level_map.grid)
     if not 0 < base_m < math.inf:
         raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")
-    if not 1 <= most_boxes <= _NO_MORE_BOXES:
-        rule = f"a STEP patch may be allowed 1 to {_NO_MORE_BOXES} boxes"
-        raise InputError("patch", rule, most_boxes, "Write a mesh (3MF, STL) of a larger window.")
-    tops = _tops(level_map, window, most_boxes)
+    tops = _tops(level_map, window)
     x_m, y_m = window.edges_m(level_map.grid)
     heights_m = level_map.levels.heights_m()
     z_m = heights_m - heights_m.max()

@@ -11,15 +11,16 @@ from fab.draws import (
     budget_keys,
     chosen_errors,
     corner_keys,
+    normal_draw,
     normal_keys,
     one_at_a_time_keys,
     sobol_keys,
     sources_of,
     variation_at,
+    varying,
 )
 from fab.errors import InputError
 from fab.process import Defects, Normal, Process, Variation
-from fab.sampling import normal_draw, varying
 
 SIDE = 1e-3
 

@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fab.levels import Levels
-from fab.process import DEVIATIONS, Defects, Normal, Process, Variation, error_names
-from fab.sampling import (
+from fab.draws import (
     corner_scores,
     draw_at,
     normal_draw,
@@ -21,6 +19,8 @@ from fab.sampling import (
     source_of,
     varying,
 )
+from fab.levels import Levels
+from fab.process import DEVIATIONS, Defects, Normal, Process, Variation, error_names
 
 SIXTEEN = Levels(16, 75e-9)
 PLATE_M = 4.44e-3
