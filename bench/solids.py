@@ -23,8 +23,8 @@ from bench.masks import bench_map
 from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solids.step import step_volumes_m3
-from fab.solids.substrate import ChromeRing, Rings, Substrate, substrate_step, substrate_volumes_m3
+from fab.solids.step import step_bodies
+from fab.solids.substrate import ChromeRing, Rings, Substrate, substrate_bodies, substrate_step
 from fab.units import MM, NM, UM
 
 BASE = 5 * UM
@@ -51,11 +51,11 @@ def bench_step(quick: bool, folder: Path) -> None:
     die, chrome, path = Substrate("die", 10 * MM, 0.5 * MM), ChromeRing(2.195 * MM, 3.7 * MM), folder / "r.step"
     # The kernel takes its time to load, and every process does that once.
     substrate_step(folder / "first.step", die, 4.4 * MM, chrome)
-    step_volumes_m3(folder / "first.step")
+    step_bodies(folder / "first.step")
     _, written = timed(lambda: substrate_step(path, die, 4.4 * MM, chrome, rings))
-    found, read = timed(lambda: step_volumes_m3(path))
-    want = substrate_volumes_m3(die, chrome, rings)
-    wrong = max(abs(found[name] / want[name] - 1) for name in want)
+    found, read = timed(lambda: step_bodies(path))
+    want = substrate_bodies(die, chrome, rings)
+    wrong = max(abs(found[name].volume_m3 / want[name].volume_m3 - 1) for name in want)
     print(f"  STEP, {count} steps      write {verdict(written, TARGET_STEP_S)}")
     print(f"    {path.stat().st_size / 1e6:.1f} MB, read back and measured in {read:.2f} s, volumes off by {wrong:.0e}")
 
@@ -88,7 +88,7 @@ def bench_case(case: str, quick: bool) -> None:
         if case == "step":
             bench_step(quick, folder)
         else:
-            tiny = relief_mesh(reduced_cells(bench_map("ring", 20), 5))
+            tiny = relief_mesh(reduced_cells(bench_map("ring", 20), 5), BASE)
             for write in (write_3mf, write_glb, write_stl):
                 write(folder / "first", tiny)
             closed_volume_m3(tiny)
