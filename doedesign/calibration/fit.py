@@ -44,8 +44,7 @@ def search(
 
     Args:
         objective: images and model.
-        evaluations: models that the global search may compute where steps from the prior leave the images unexplained;
-            0 to leave it out.
+        evaluations: models that the global search may compute; 0 to leave it out.
         polish: steps along the exact gradient at the end; 0 to leave it out.
         seed: seed of the global search.
         on_model: called after every model (a central difference counts as one) from several threads, with words on how

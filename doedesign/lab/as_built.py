@@ -38,13 +38,7 @@ _COMMON = ("common_depth_scale", "common_cd_bias_m")
 
 
 class ErrorValue(NamedTuple):
-    """One error of the DOE and where its value comes from.
-
-    Attributes:
-        error: flat name, as in `fab.process.error_names`.
-        value: SI.
-        source: "measured", "process mean", or "not measured, taken as 0".
-    """
+    """One error by flat name, SI, and its source: "measured", "process mean", or "not measured, taken as 0"."""
 
     error: str
     value: float
@@ -52,12 +46,9 @@ class ErrorValue(NamedTuple):
 
 
 class AsBuiltDoe(NamedTuple):
-    """Errors of a DOE as it was built.
+    """Errors of a DOE as it was built, each with its source.
 
-    Attributes:
-        variation: its errors.
-        taken: every error and where it comes from.
-        lag_per_nm: by how much the etch lag changes for 1 nm of error in one depth; None if it was not measured.
+    1 nm of error in one depth changes the etch lag by `lag_per_nm`; None if it was not measured.
     """
 
     variation: Variation
@@ -168,11 +159,7 @@ def _same(one: Any, other: float | None) -> bool:
 
 
 def compare_with_sheet(rows: Sequence[dict[str, Any]], predicted: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """Compare a DOE as built with the predictions of its run sheet.
-
-    Args:
-        rows: the prediction of the DOE as built (`doedesign.prediction.plate_rows`).
-        predicted: "predicted" of the run sheet.
+    """Compare the prediction of a DOE as built with those of its run sheet.
 
     Returns:
         A row per colour, depth and quantity: `as_drawn` and `expected` of the sheet (None if it has no such row) and
@@ -181,10 +168,11 @@ def compare_with_sheet(rows: Sequence[dict[str, Any]], predicted: Mapping[str, A
     out = []
     for now in predicted_metrics(rows):
         before = {kind: _of_sheet(predicted, kind, now) for kind in ("as_drawn", "expected")}
+        place = {"colour": now.colour, "depth_m": now.depth_m}
         for quantity in _COMPARED:
             if (value := getattr(now, quantity)) is not None:
-                place = {"colour": now.colour, "depth_m": now.depth_m, "quantity": quantity}
-                out.append({**place, **{kind: row.get(quantity) for kind, row in before.items()}, "as_built": value})
+                old = {kind: row.get(quantity) for kind, row in before.items()}
+                out.append({**place, "quantity": quantity, **old, "as_built": value})
     return out
 
 
@@ -220,7 +208,7 @@ class AsBuiltPrediction(NamedTuple):
     Attributes:
         doe: its errors, SI units, and where each comes from.
         prediction: DOE, PSFs and metrics.
-        comparison: a row per colour, depth and quantity with what the run sheet predicted (`compare_with_sheet`).
+        comparison: with what the run sheet predicted (`compare_with_sheet`).
     """
 
     doe: AsBuiltDoe

@@ -159,11 +159,10 @@ def predict_sheet(
 
     Args:
         design: the design.
-        process: what the lab does.
+        process: the lab's process.
         design_m: design wavelength, metres.
         probe_m: wavelength of the lab's test laser, metres.
-        edge_moves_m: how far the edges of each mask were moved outward to make up for the process, metres; empty for
-            none.
+        edge_moves_m: how far the edges of each mask were moved outward to make up for the process, metres.
 
     Raises:
         InputError: a probe wavelength at which the glass is not known, or errors beyond what the model describes.

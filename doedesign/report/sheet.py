@@ -19,15 +19,10 @@ _MOST_CONTACTS, _MOST_VALIDATIONS = 12, 4
 
 
 class ContactRow(NamedTuple):
-    """One simulated capture: linear light in red, green and blue, and its obstruction.
+    """One simulated capture under its caption: linear light in red, green and blue, and its obstruction.
 
-    Attributes:
-        label: its caption.
-        clean: light without an obstruction.
-        conventional: recorded by the camera without a DOE.
-        doe: recorded with it.
-        mask: sharp mask of the obstruction.
-        alpha: share of the background's light that is lost with the DOE.
+    Light without an obstruction, as the camera records it without a DOE, and with it; sharp mask of the obstruction,
+    and `alpha`, the share of the background's light that is lost with the DOE.
     """
 
     label: str

@@ -78,11 +78,7 @@ def _colour_keys(camera: "Camera", **style: Any) -> "list[Line2D]":
 def plot_histograms(sample: Sample, nominal: Sample, camera: "Camera", ax: "Axes | None" = None) -> "FigureBase":
     """Draw how every quantity is distributed over the DOEs: a line per colour, the worst depth of each DOE.
 
-    Args:
-        sample: the DOEs as fabricated; the side beyond their limits is shaded.
-        nominal: the DOE exactly as designed, dotted.
-        camera: the colours.
-        ax: see the head of this module.
+    The DOE exactly as designed, `nominal`, is dotted; the side beyond the limits of the sample is shaded.
     """
     hues, plates = _hues(camera), len(sample.keys)
     words = f"{plates} plates, the worst depth of each; dotted: the plate as drawn"
@@ -139,9 +135,6 @@ def plot_yield(sample: Sample, ax: "Axes | None" = None) -> "FigureBase":
     """Draw the yield over where the limit of each quantity lies: the share of DOEs whose worst row is as good.
 
     A limit that concerns a single colour or depth has a curve of its own.
-
-    Raises:
-        InputError: a limit that concerns no row.
     """
     limits = sample.limits
     chosen = list(dict.fromkeys(one.quantity for one in limits)) or list(sample.values)

@@ -37,14 +37,12 @@ class ToleranceResult:
 
     Attributes:
         study: design, process and evaluated draws, of which more can be asked.
-        plan: arguments of `tolerance` that say what was asked.
-        keys: all draws that the answers needed.
+        plan: arguments of `tolerance` that say what was asked; `keys` are all draws that the answers needed.
         nominal: the DOE exactly as designed.
         expected: the DOE with every error at its mean.
-        sample: the Monte-Carlo draws.
+        sample: the Monte-Carlo draws; `corners` those of the worst case.
         effects: effect of every error alone.
         variance_shares: Sobol indices of every source of error.
-        corners: worst-case corners.
         budget: how large some errors may be.
     """
 

@@ -94,13 +94,7 @@ class VarianceShare(NamedTuple):
 
 
 def sobol(process: Process, sample: Sample, count: int, seed: int = 0) -> list[VarianceShare]:
-    """Sobol indices of every source (estimators of Saltelli et al. 2010).
-
-    Args:
-        process: the process.
-        sample: draws of `sobol_keys(process, count)`.
-        count: rows of the samples, a power of two.
-        seed: seed of the bootstrap.
+    """Sobol indices of every source from draws of `sobol_keys(process, count)` (estimators of Saltelli et al. 2010).
 
     Returns:
         shares of every quantity that is finite and varies: of the worst row, and of the worst row of each colour.
