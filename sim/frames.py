@@ -1,9 +1,8 @@
 """Frames of a camera: one exposure as its file holds it, with what the file says about its pixels.
 
-OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit grey PNG, and camera RAW by way of rawpy (the
-extra `raw`). Eight bits are refused unless asked for: two of a PSF's five decades. Of a RAW mosaic the pixels of one
-colour are taken as they lie; the others are marked as not valid, nothing is interpolated. The first row of a picture is
-its top, so rows are turned over; arrays here have row 0 at the lowest y.
+OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit grey PNG, and camera RAW by way of rawpy (the extra
+`raw`). Eight bits, two of a PSF's five decades, are refused unless asked for. Of a RAW mosaic the pixels of one colour
+are taken as they lie, the others marked as not valid. Arrays have row 0 at the lowest y, a picture's last row.
 """
 
 from collections.abc import Iterator
@@ -56,8 +55,8 @@ def read_frame(
         allow_8bit: take files of 8 bits per pixel.
 
     Raises:
-        InputError: the file is missing, of another kind, broken, of too few bits, in colours where no channel is named,
-            or holds values that are not finite; or rawpy is not installed.
+        InputError: a file that cannot be read or measured from, colours without a channel named, or rawpy not
+            installed.
     """
     path = Path(path)
     suffix = path.suffix.lower()

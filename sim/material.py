@@ -43,12 +43,9 @@ class Material:
         """Refractive index n at a vacuum wavelength in metres; an InputError outside the range of the published fit."""
         low, high = self.range_m
         if not low <= wavelength_m <= high:
-            raise InputError(
-                f"material {self.name}",
-                f"the wavelength must lie in {low * 1e9:.0f}-{high * 1e9:.0f} nm, the range of its published fit",
-                f"{wavelength_m * 1e9:.6g} nm",
-                "Choose a wavelength inside the range or another material.",
-            )
+            rule = f"the wavelength must lie in {low * 1e9:.0f}-{high * 1e9:.0f} nm, the range of its published fit"
+            cure = "Choose a wavelength inside the range or another material."
+            raise InputError(f"material {self.name}", rule, f"{wavelength_m * 1e9:.6g} nm", cure)
         return self.formula(wavelength_m * 1e6, self.terms)
 
 
@@ -144,10 +141,7 @@ def full_wave_wavelength_m(name: str, height_m: float) -> float:
 
     if excess(low) > 0 or excess(high) < 0:
         least, most = full_wave_height_m(name, low), full_wave_height_m(name, high)
-        raise InputError(
-            f"material {name}",
-            f"a height of one wave must lie in {least:.3g}-{most:.3g} m",
-            f"{height_m:.4g} m",
-            "Change the number of levels or the height of one.",
-        )
+        rule = f"a height of one wave must lie in {least:.3g}-{most:.3g} m"
+        got = f"{height_m:.4g} m"
+        raise InputError(f"material {name}", rule, got, "Change the number of levels or the height of one.")
     return float(np.asarray(brentq(excess, low, high, xtol=1e-15)))

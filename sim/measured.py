@@ -74,8 +74,7 @@ def merge_exposures(
         names: what the frames are called in messages.
 
     Raises:
-        InputError: frames of different shapes, an exposure that is not positive, a dark frame brighter than its image,
-            or an image that is saturated everywhere.
+        InputError: frames or exposures that do not fit, or an image that is dark or saturated everywhere.
     """
     names = tuple(names) or tuple(f"image {i}" for i in range(len(frames)))
     shape = frames[0].counts.shape
@@ -83,9 +82,8 @@ def merge_exposures(
     for frame, exposure, dark, name in zip(frames, exposures, darks, names, strict=True):
         if frame.counts.shape != shape:
             got = f"{frame.counts.shape} against {shape}"
-            raise InputError(
-                name, "all exposures of an image must have the same size", got, "Give frames of one camera."
-            )
+            rule = "all exposures of an image must have the same size"
+            raise InputError(name, rule, got, "Give frames of one camera.")
         if not 0 < exposure < np.inf:
             raise InputError(name, "an exposure must be positive", exposure, "Give its length.")
         light, floor = _without_dark(frame, dark, noise, dark_count, name)
@@ -147,10 +145,9 @@ def _merged(
 
 
 def without_background(psf: MeasuredPsf) -> tuple[MeasuredPsf, float]:
-    """Take off the level of the frame's border, and return it.
+    """Take off the level of the frame's border, the mean of its outer twentieth without outliers, and return it.
 
-    A mean over the outer twentieth of the frame without outliers. Where the PSF reaches the border this takes light
-    away, too: a fit should leave an offset free.
+    Where the PSF reaches the border this takes light away, too: a fit should leave an offset free.
     """
     rows, columns = psf.rate.shape
     wide = max(2, round(_BORDER * min(rows, columns)))
@@ -225,13 +222,10 @@ def parabola_vertex(values: Float[np.ndarray, " n"], at: int) -> float:
 
 
 def cut_window(psf: MeasuredPsf, centre: tuple[float, float], window: int) -> tuple[MeasuredPsf, tuple[float, float]]:
-    """Cut a square of whole pixels whose middle is nearest to a point, in pixels (row, column).
+    """Cut a square of whole pixels whose middle is nearest to a point (row, column); an InputError for a smaller frame.
 
     Returns:
         the square, pixels beyond the frame not valid, and where in it the point lies: pixels from its middle (y, x).
-
-    Raises:
-        InputError: the frame is smaller than the window.
     """
     if min(psf.rate.shape) < window:
         rule = f"an image must have at least the window's {window} pixels per side"

@@ -92,7 +92,7 @@ class RingToDisc(NamedTuple):
 
 
 def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
-    """Ring:disc ratio of a near PSF (the paper's simulation gives 3:1, its prototype 1:1); infinite without a disc.
+    """Ring:disc ratio of a near PSF (3:1 in the paper's simulation, 1:1 in its prototype); infinite without a disc.
 
     The disc is the geometric defocus disc widened by one pixel, where light that the DOE does not diffract lands.
     """
@@ -192,8 +192,8 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
         depth_m: source depth, metres.
         colour: colour of this PSF.
 
-    The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), not
-    from the PSF, so `uncollected` near zero or below it would show a fault in either.
+    The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), so
+    `uncollected` near zero or below it would show a fault in either.
     """
     camera = optic.camera
     curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m

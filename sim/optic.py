@@ -10,7 +10,7 @@ and the source's phase (`plan`, `source`); `energy` turns both into pixel energi
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -78,15 +78,6 @@ class Optic(eqx.Module):
     def as_optic(self) -> "Optic":
         """Return it as it is."""
         return self
-
-
-@runtime_checkable
-class HasOptic(Protocol):
-    """Whatever carries an optic."""
-
-    def as_optic(self) -> Optic:
-        """Return the optic."""
-        ...
 
 
 class CameraOptic(Optic):

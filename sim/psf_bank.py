@@ -16,7 +16,7 @@ from fab.errors import InputError
 from fab.units import metres
 from sim.camera import Camera, SpectralLine
 from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
-from sim.optic import ON_AXIS, CellOptic, HasOptic, HeightOptic, Optic, Propagation
+from sim.optic import ON_AXIS, CellOptic, HeightOptic, Optic, Propagation
 from sim.tracing import on_host, stacked
 
 if TYPE_CHECKING:
@@ -185,8 +185,8 @@ def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
             substrate.
         TypeError: a camera for an optic that is not made of cells.
     """
-    if isinstance(optic, HasOptic):
-        found = optic.as_optic()
+    if hasattr(optic, "as_optic"):
+        found: Optic = optic.as_optic()
         if camera is None:
             return found
         if not isinstance(found, CellOptic):

@@ -4,9 +4,8 @@
 
 Light is relative to a white of the scene through a lossless lens of the same aperture (`sim.imaging.formation`); a
 plate that loses light makes a darker and noisier capture at the same exposure. Electrons are those behind the quantum
-efficiency: the full well holds `full_well_e` of them, and the exposure is such that white fills the share `exposure` of
-it in the colour that the sensor sees best; other colours fill it less, as their quantum efficiency is less. A raw
-number is the black level and a number of steps of full well / (2^bits - 1 - black level) electrons.
+efficiency: white fills the share `exposure` of the full well in the colour that the sensor sees best, and less in
+others. A raw number is the black level and a number of steps of full well / (2^bits - 1 - black level) electrons.
 
 Noise models by name:
 
@@ -17,10 +16,8 @@ Noise models by name:
 * "none": what "physical" is the mean of.
 
 With "tseng" and "release" white is full scale; exposure, full well, quantum efficiency, dark current and read noise
-play no part. Everything after the noise is the same.
-
-Gradients: through noise by reparametrisation (`sim.noise`); rounding passes them on; clipping passes them between its
-bounds and stops them beyond, so a saturated pixel says nothing.
+play no part. Gradients go through noise by reparametrisation (`sim.noise`), through rounding unchanged, and through
+clipping between its bounds only, so a saturated pixel has none.
 """
 
 from collections.abc import Callable
@@ -139,10 +136,7 @@ def expose(light: Float[Array, "*batch c y x"], sensor: Sensor, key: Key[Array, 
         key: random key.
 
     Returns:
-        `[c, y, x]`, or `[1, y, x]` for a mosaic.
-
-    Raises:
-        ValueError: a mosaic of other than three colours.
+        `[c, y, x]`, or `[1, y, x]` for a mosaic, which takes three colours.
     """
     light = jnp.maximum(light, 0.0)
     signal = light * sensor.white_e(light.shape[-3]) + sensor.dark_e if sensor.counts_photons else light

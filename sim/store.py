@@ -78,30 +78,19 @@ def write_height(
 
 
 def read_height(path: str | Path) -> StoredHeight:
-    """Read a height map.
-
-    Raises:
-        InputError: the file is missing, no whole EXR file, has no channel `height`, or holds a height that is
-            negative or not finite.
-    """
+    """Read a height map; an InputError for no whole EXR file with a channel `height` of finite heights, at least 0."""
     channels, texts = _read(Path(path))
     if "height" not in channels:
-        raise InputError(
-            str(path),
-            "a height map must have a channel named height, in metres",
-            f"the channels {', '.join(sorted(channels))}",
-            "Give a height map, or rename its channel.",
-        )
+        rule = "a height map must have a channel named height, in metres"
+        got = f"the channels {', '.join(sorted(channels))}"
+        raise InputError(str(path), rule, got, "Give a height map, or rename its channel.")
     height = channels["height"]
     if not (np.isfinite(height).all() and height.min() >= 0):
         bad = np.argwhere(~(np.isfinite(height) & (height >= 0)))
         y, x = (int(i) for i in bad[0])
-        raise InputError(
-            str(path),
-            "heights must be finite and at least 0",
-            f"{height[y, x]:.6g} m at row {y}, column {x} ({len(bad)} such pixels)",
-            "Measure heights from the deepest floor upward, or write the file again.",
-        )
+        rule = "heights must be finite and at least 0"
+        cure = "Measure heights from the deepest floor upward, or write the file again."
+        raise InputError(str(path), rule, f"{height[y, x]:.6g} m at row {y}, column {x} ({len(bad)} such pixels)", cure)
     pitch, aperture = (
         _length(path, key, texts.pop(key)) if key in texts else None for key in ("pitch_m", "aperture_m")
     )
@@ -147,17 +136,15 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         the bank; a measured PSF has the colours R, G, B or the name of its one channel, and its own scale.
 
     Raises:
-        InputError: the file is missing, no whole EXR file, holds neither a bank nor a PSF, or holds values
-            that are not finite; or a pixel pitch is missing or contradicts the file.
+        InputError: no whole EXR file with finite values, or a pixel pitch that is missing or contradicts the file.
     """
     from sim.psf_bank import PsfBank
 
     channels, texts = _read(Path(path))
     for name, pixels in channels.items():
         if not np.isfinite(pixels).all():
-            raise InputError(
-                f"{path}: channel {name}", "a PSF must be finite", "NaN or infinity", "Write the file again."
-            )
+            rule = "a PSF must be finite"
+            raise InputError(f"{path}: channel {name}", rule, "NaN or infinity", "Write the file again.")
     if _BANK not in texts:
         colours = _measured_colours(path, channels)
         if pixel_m is None:
@@ -168,18 +155,13 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         return PsfBank(energy, colours, (float(depth_m),), stored)
     colours, depths, stored, field = _bank_description(path, texts[_BANK])
     if pixel_m is not None and not np.isclose(pixel_m, stored, rtol=1e-6, atol=0):
-        raise InputError(
-            str(path),
-            "the pixel pitch given must be that of the file",
-            f"{pixel_m:.9g} m against {stored:.9g} m",
-            "Leave it out: the file knows it.",
-        )
+        rule = "the pixel pitch given must be that of the file"
+        raise InputError(str(path), rule, f"{pixel_m:.9g} m against {stored:.9g} m", "Leave it out: the file knows it.")
     names = [[_channel_name(depth, colour) for depth in depths] for colour in colours]
     missing = [name for row in names for name in row if name not in channels]
     if missing:
-        raise InputError(
-            str(path), "every PSF of the bank must be there", f"no channel {missing[0]}", "Write the file again."
-        )
+        rule = "every PSF of the bank must be there"
+        raise InputError(str(path), rule, f"no channel {missing[0]}", "Write the file again.")
     energy = np.stack([np.stack([channels[name] for name in row]) for row in names])
     return PsfBank(energy, colours, depths, stored, field)
 
@@ -237,12 +219,8 @@ def _measured_colours(path: str | Path, channels: Mapping[str, Any]) -> tuple[st
     without_alpha = sorted(names - {"A"})
     if len(without_alpha) == 1:
         return (without_alpha[0],)
-    raise InputError(
-        str(path),
-        "a measured PSF must have the channels R, G, B or a single one",
-        f"the channels {', '.join(sorted(names))}",
-        "Keep one layer of the picture.",
-    )
+    rule = "a measured PSF must have the channels R, G, B or a single one"
+    raise InputError(str(path), rule, f"the channels {', '.join(sorted(names))}", "Keep one layer of the picture.")
 
 
 def _length(path: str | Path, key: str, text: object) -> float:
@@ -308,12 +286,9 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
             raise _broken(path, f"channel {name} with {pixels.dtype} pixels of shape {pixels.shape} for {shape}")
     texts = {key: value for key, value in header.items() if isinstance(value, str)}
     if _DIGEST in texts and texts.pop(_DIGEST) != _digest(pictures, texts):
-        raise InputError(
-            str(path),
-            "pixels and lengths must match the digest written with them",
-            "a file that has changed since",
-            f"Restore the file; if it was edited on purpose, remove its attribute {_DIGEST}.",
-        )
+        rule = "pixels and lengths must match the digest written with them"
+        cure = f"Restore the file; if it was edited on purpose, remove its attribute {_DIGEST}."
+        raise InputError(str(path), rule, "a file that has changed since", cure)
     return {k: np.ascontiguousarray(v[::-1], np.float32) for k, v in pictures.items()}, texts
 
 
@@ -321,12 +296,8 @@ def _window_shape(path: Path, header: dict[str, Any]) -> tuple[int, int]:
     """Rows and columns of the picture; a cropped one has lost its centre and is refused."""
     data, display = (np.asarray(header[key]) for key in ("dataWindow", "displayWindow"))
     if not np.array_equal(data, display):
-        raise InputError(
-            str(path),
-            "the picture must fill its display window, whose centre is the optical axis",
-            f"data window {data.tolist()} in {display.tolist()}",
-            "Save it uncropped.",
-        )
+        rule = "the picture must fill its display window, whose centre is the optical axis"
+        raise InputError(str(path), rule, f"data window {data.tolist()} in {display.tolist()}", "Save it uncropped.")
     (x0, y0), (x1, y1) = data.tolist()
     return y1 - y0 + 1, x1 - x0 + 1
 

@@ -55,16 +55,12 @@ class FieldOptics(NamedTuple):
 
     @classmethod
     def of(cls, banks: Sequence[Sequence[PsfBank]], camera: Camera, depths_m: Sequence[float]) -> "FieldOptics":
-        """From banks at field angles: `banks[j][i]` has the angles (y_j, x_i), in increasing order.
+        """From banks at field angles, depths (background first, metres) mixed linearly in 1/z.
 
         Args:
-            banks: PSFs.
+            banks: `banks[j][i]` has the angles (y_j, x_i), an increasing grid (else a ValueError).
             camera: the camera they were made for.
-            depths_m: depth of every layer, background first, metres.
-
-        Raises:
-            ValueError: the angles are no increasing grid.
-            InputError: a depth beyond a bank's.
+            depths_m: depth of every layer; an InputError for one beyond a bank's.
         """
         angles = np.array([[bank.field_rad for bank in row] for row in banks])
         y, x = angles[:, 0, 0], angles[0, :, 1]
@@ -105,9 +101,6 @@ def capture_frame(
 
     Returns:
         `[c, y, x]` light, no noise.
-
-    Raises:
-        ValueError: as for `capture`, or a frame with its own margin.
     """
     check_names(model, outside)
     check_layers(scene, *optics.psf.shape[2:4])

@@ -53,19 +53,14 @@ class Optics(eqx.Module):
     otf: Otf | None = None
 
     @classmethod
-    def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float], shadow_px: int | None = None) -> "Optics":
+    def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float]) -> "Optics":
         """Optics for layers at given depths, background first, from a bank whose PSFs are mixed linearly in 1/z.
 
         Raises:
             InputError: a depth beyond the bank's.
         """
         psf = stacked([bank.at(depth) for depth in depths_m])
-        return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m, shadow_px)
-
-    @property
-    def window(self) -> Window:
-        """Samples (y, x) of a PSF."""
-        return self.psf.shape[-2], self.psf.shape[-1]
+        return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m)
 
     def disc_px(self, depth_m: Depth, behind_m: Depth) -> Float[Array, ""] | float:
         """Diameter in pixels of the shadow disc in the plane at `depth_m` of a point at `behind_m`, farther away."""
@@ -105,19 +100,18 @@ def capture(
     Args:
         scene: background and obstructions, linear light.
         optics: PSFs of every layer of the scene.
-        model: how layers are put together; see above.
+        model: how layers are put together (`sim.imaging.occlusion`).
         border: what lies beyond the scene (`sim.imaging.convolve`). With `own` the capture is smaller than the scene,
-            by the PSF's window and, where the model follows the light, that of the shadow discs (`shadow_px`), which
-            `reciprocal` needs twice.
+            by the PSF's window and, where the model follows the light, that of the shadow discs, which `reciprocal`
+            needs twice.
         outside: what I_obs holds where there is no obstruction; for the paper's models.
 
     Returns:
-        `[c, y, x]`, differentiable in PSFs and images. Where nothing lands, rounding of the transforms may leave
-        values of about -1e-7 of the brightest.
+        `[c, y, x]`, differentiable in PSFs and images. Where nothing lands, rounding may leave -1e-7 of the brightest.
 
     Raises:
-        ValueError: PSFs of another number of layers or colours, layers of another shape, an obstruction that is not
-            before the background, or an unknown name.
+        ValueError: PSFs or layers of another number or shape, an obstruction that is not before the background, or an
+            unknown name.
     """
     check_names(model, outside)
     check_layers(scene, *optics.psf.shape[:2])
@@ -150,10 +144,9 @@ def own_margin_px(psf_px: int, shadow_px: int, model: Model) -> int:
 
 
 def lost_share(scene: Scene, optics: Optics, model: Model) -> Float[Array, "c v u"]:
-    """Share of the background's light that a model takes away; the view is mirrored at its edges.
+    """Share of the background's light that a model takes away behind one obstruction; the view is mirrored beyond it.
 
-    The scene has one obstruction. `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10
-    otherwise, 0 to 1.
+    `[1, y, x]` d * M where the model follows the light, `[c, y, x]` alpha of eq. 10 otherwise, 0 to 1.
     """
     check_names(model, "scene")
     if len(scene.obstructions) != 1:

@@ -1,15 +1,13 @@
 """The reference for obstructed light: what an obstruction does to the wave of one scene point, by wave optics.
 
 The light of a point passes the plane of the obstruction, is cut there, spreads by Fresnel diffraction to the aperture,
-and makes the PSF of a pupil that is partly in shadow. Nothing is assumed of how PSFs and masks go together, so this
-judges the fast models of `sim.imaging.occlusion`. It takes one PSF per scene point: seconds for a point, hours for a
-picture.
+and makes the PSF of a pupil that is partly in shadow. It assumes nothing of how PSFs and masks go together, so it
+judges the fast models of `sim.imaging.occlusion`; one PSF per scene point takes seconds, a picture hours.
 
 For a point at distance b and an obstruction at distance z the ray to the aperture's point x crosses the obstruction at
 x (1 - z / b) from the chief ray. About that crossing the path differences are quadratic with the effective distance
-z (b - z) / b (J. W. Goodman, Introduction to Fourier Optics, ch. 4: Fresnel diffraction of a spherical wave), so the
-shadow of a rectangle is a product of two differences of Fresnel integrals, and a mask of pixels is a sum of rectangles:
-exact within the Fresnel approximation, whatever the fringes are, with no raster that they would have to fit.
+z (b - z) / b (J. W. Goodman, Introduction to Fourier Optics, ch. 4), so the shadow of a rectangle is a product of two
+differences of Fresnel integrals, and a mask of pixels is a sum of rectangles: exact within the Fresnel approximation.
 """
 
 from typing import Literal
@@ -42,16 +40,14 @@ def shadow(
         camera: lens, sensor and grid.
         mask: `[y, x]` blocked share of every pixel of the view, the middle of the view in the middle of the array.
         depth_m: distance of the obstruction, metres.
-        background_depth_m: distance of the scene point, metres, beyond the obstruction; `inf` allowed.
+        background_depth_m: distance of the scene point, metres, beyond the obstruction (else a ValueError); `inf`
+            allowed.
         wavelength_m: wavelength, metres.
         point: where in the view the scene point is, pixels (row, column), as indices of the mask.
         border: whether the outermost pixels of the mask go on for ever ("edge") or nothing lies beyond them ("zero").
 
     Returns:
         `[y, x]` complex ratio at the cell centres, 1 where nothing is in the way.
-
-    Raises:
-        ValueError: the obstruction is not nearer than the scene point.
     """
     if not 0 < depth_m < background_depth_m:
         raise ValueError(f"`depth_m` must lie from 0 to the background's {background_depth_m}, but got {depth_m}")
@@ -99,20 +95,10 @@ def shadowed_psf(
     point: Point,
     border: Border = "edge",
 ) -> Float[np.ndarray, "c window window"]:
-    """PSF `[colour, y, x]` of a scene point behind an obstruction; the DOE is taken as it is on the axis.
+    """PSF `[colour, y, x]` of a scene point behind an obstruction, of the DOE as it is on the axis; see `shadow`.
 
-    Args:
-        camera: lens, sensor, substrate and grid.
-        height_m: `[y, x]` DOE height, metres.
-        mask: see `shadow`, as for all that follows.
-        depth_m: distance of the obstruction, metres.
-        background_depth_m: distance of the scene point, metres.
-        point: pixels (row, column) of the scene point in the view.
-        border: what lies beyond the mask.
-
-    Returns:
-        energy per pixel per unit power that would reach the clear aperture without the obstruction, the chief ray in
-        the middle of the window.
+    Energy per pixel per unit power that would reach the clear aperture without the obstruction, the chief ray in the
+    middle of the window.
     """
     height = jnp.asarray(height_m, jnp.float32)
     fields = []

@@ -71,11 +71,7 @@ class MaskFolder(WithLimits):
     files: tuple[Path, ...] = field(init=False)
 
     name: ClassVar[str] = "folder"
-    limits: ClassVar[Mapping[str, Range]] = {
-        "depth_m": DEPTHS_M,
-        "light": (0.0, 1.0),
-        "width_m": (1e-5, 1e3),
-    }
+    limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "light": (0.0, 1.0), "width_m": (1e-5, 1e3)}
 
     def __post_init__(self) -> None:
         """Check the parameters and read every picture once.

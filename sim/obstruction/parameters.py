@@ -38,11 +38,9 @@ def draw_from(rng: np.random.Generator, given: Range) -> float:
 
 
 class WithLimits:
-    """Parameters of which every one is checked when it is given.
+    """Parameters that are checked when they are given.
 
-    Attributes:
-        name: the kind's name.
-        limits: smallest and largest value that can be meant, by parameter; a range lies within and runs upward.
+    `limits` are the smallest and largest value that can be meant, by parameter; a range lies within and runs upward.
     """
 
     name: ClassVar[str]

@@ -279,9 +279,7 @@ class DirtRaindrop(WithLimits):
     dirt_share: float = 0.5
 
     name: ClassVar[str] = "dirt_raindrop"
-    limits: ClassVar[Mapping[str, Range]] = {
-        "dirt_share": (0.0, 1.0),
-    }
+    limits: ClassVar[Mapping[str, Range]] = {"dirt_share": (0.0, 1.0)}
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Toss the coin and draw."""

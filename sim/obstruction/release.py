@@ -41,9 +41,7 @@ class ReleaseDirt(WithLimits):
     depth_m: Range = (0.05, 0.12)
 
     name: ClassVar[str] = "release_dirt"
-    limits: ClassVar[Mapping[str, Range]] = {
-        "depth_m": DEPTHS_M,
-    }
+    limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M}
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Draw one dirty glass."""
@@ -86,10 +84,7 @@ class ReleaseRaindrop(WithLimits):
     radius_m: Range = (1e-3, 3e-3)
 
     name: ClassVar[str] = "release_raindrop"
-    limits: ClassVar[Mapping[str, Range]] = {
-        "depth_m": DEPTHS_M,
-        "radius_m": (1e-5, 0.02),
-    }
+    limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "radius_m": (1e-5, 0.02)}
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Draw a glass with drops."""
@@ -143,10 +138,7 @@ class ReleaseFence(WithLimits):
     wire_m: Range = (5e-3, 15e-3)
 
     name: ClassVar[str] = "release_fence"
-    limits: ClassVar[Mapping[str, Range]] = {
-        "depth_m": DEPTHS_M,
-        "wire_m": (1e-5, 0.1),
-    }
+    limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "wire_m": (1e-5, 0.1)}
 
     def draw(self, rng: np.random.Generator, view: CameraView, background: Float[np.ndarray, "c y x"]) -> Obstruction:
         """Draw one fence."""

@@ -3,29 +3,24 @@
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from fab.figure import LINE, SERIES, evenly_spaced, length_text
 from sim.camera import Colour
+from sim.metrics import mean_wavelength_m
 
 _BLUE, _RED, _GREEN = SERIES[:3]
-
-
-def _mean_m(colour: Colour) -> float:
-    return float(np.dot(colour.wavelengths_m, colour.weights))
 
 
 def colour_label(colour: Colour) -> str:
     """Name and wavelength of a colour channel: "red, 656 nm"; only the wavelength where the name says no more."""
     mean = "mean " if len(colour.wavelengths_m) > 1 else ""
-    wavelength = length_text(_mean_m(colour))
+    wavelength = length_text(mean_wavelength_m(colour))
     same = colour.name == wavelength.replace(" ", "").replace(".", "p")
     return wavelength if same else f"{colour.name}, {mean}{wavelength}"
 
 
 def wavelength_order(colours: Sequence[Colour]) -> list[int]:
     """Positions of the colours from the longest mean wavelength to the shortest."""
-    return sorted(range(len(colours)), key=lambda i: -_mean_m(colours[i]))
+    return sorted(range(len(colours)), key=lambda i: -mean_wavelength_m(colours[i]))
 
 
 def line_colours(colours: Sequence[Colour]) -> list[str]:

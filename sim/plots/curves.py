@@ -19,7 +19,6 @@ from sim.plots.colours import colour_label, depth_positions, line_colours
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
-    from matplotlib.lines import Line2D
 
     import sim.psf_bank
     import sim.transfer
@@ -28,11 +27,6 @@ _MOST_DEPTHS = 3
 _MOST_COLOURS = 6
 _RADII = 96
 _LENS: dict[str, Any] = {"ls": "--", "lw": 0.9}
-
-# Values of every colour and depth, `[w, d, x]`, and the depths.
-_Curves = tuple[Any, Sequence[float]]  # `[w, d, x]`, and its depths
-# Draws the marks of (panel, position of a depth in the bank, "near" or "far").
-_Finish = Callable[["Axes", int, str], None]
 
 
 def plot_mtf(
@@ -107,14 +101,20 @@ def _shown(camera: Camera) -> list[int]:
 def _plot_curves(
     camera: Camera,
     x: Float[np.ndarray, " x"],
-    both: Sequence[_Curves],
+    both: Sequence[tuple[Any, Sequence[float]]],
     depths_m: tuple[Sequence[float], Sequence[float]],
-    finish: _Finish,
+    finish: Callable[["Axes", int, str], None],
     words: tuple[str, str],
     note: str,
     ax: "Axes | None",
 ) -> "FigureBase":
-    """Draw a row of panels per group of depths (near, far), the lens below the DOE; `words` name the axes."""
+    """Draw a row of panels per group of depths (near, far).
+
+    `both` are curves `[w, d, x]` and depths of the DOE and perhaps the lens; `finish` draws the marks of (panel,
+    position of a depth in the bank, "near" or "far"); `words` name the axes.
+    """
+    from matplotlib.lines import Line2D
+
     named = {"far": depths_m[1], "near": depths_m[0]}
     groups = {name: depth_positions(both[0][1], depths, _MOST_DEPTHS) for name, depths in named.items() if len(depths)}
     if not groups:
@@ -137,14 +137,8 @@ def _plot_curves(
                 spare.set_axis_off()
             panes[0].set_ylabel(words[1])
         grid[0, 0].set_ylim(0, 1.02)
-        keys = _keys(camera, len(both) > 1)
+        keys = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
+        if len(both) > 1:
+            keys.append(Line2D([], [], color=INK, **_LENS, label="lens alone"))
         figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), borderpad=0.0)
     return figure
-
-
-def _keys(camera: Camera, with_lens: bool) -> "list[Line2D]":
-    from matplotlib.lines import Line2D
-
-    hues = line_colours(camera.colours)
-    lines = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
-    return [*lines, *([Line2D([], [], color=INK, **_LENS, label="lens alone")] if with_lens else [])]

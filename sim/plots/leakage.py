@@ -29,13 +29,8 @@ def plot_split(
 ) -> "FigureBase":
     """Draw the PSF of one depth as designed, as fabricated, and its leaked and diffracted light; a row per colour.
 
-    Args:
-        nominal: PSFs of the DOE exactly as designed.
-        splits: PSFs of the DOE as fabricated by (colour, depth), positions in the bank.
-        camera: the camera.
-        depth: which depth of the bank is shown.
-        orders: per colour the 0th order (share of light) of the DOE as designed and as fabricated.
-        ax: axes whose place the picture takes; a new figure by default.
+    `splits` are PSFs of the DOE as fabricated by (colour, depth), positions in the bank; `orders` per colour the 0th
+    order of the DOE as designed and as fabricated.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm

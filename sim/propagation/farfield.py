@@ -250,7 +250,7 @@ def _uncentral(samples: Complex[Array, "row kept"], length: int) -> Complex[Arra
 def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> tuple[Array, Array]:
     """Pixel energies, and the sensor field at the samples of the intensity for the way back.
 
-    The field is `[real or imaginary, y, x]`, or `[block, x, y]` and complex where nothing is interpolated.
+    It is `[real or imaginary, y, x]`, or `[block, x, y]` and complex where nothing is interpolated.
     """
     pupil_block, sensor_block = plan.blocks
 

@@ -80,12 +80,9 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     width = camera.pixel_m * camera.fill / pitch
     kept = 2 * int(np.ceil(half + width + 8))
     if 2 * half > 3 * cells:
-        raise InputError(
-            "camera.window",
-            f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm",
-            f"{camera.window * camera.pixel_m * 1e3:.4g} mm",
-            "Use a smaller window or the far-field path.",
-        )
+        rule = f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm"
+        got = f"{camera.window * camera.pixel_m * 1e3:.4g} mm"
+        raise InputError("camera.window", rule, got, "Use a smaller window or the far-field path.")
     # Light from one rim of the aperture to the far edge of the window must pass the kernel's band untapered.
     padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
     middle = (cells - 1) / 2  # the axis, in samples of the propagated grid

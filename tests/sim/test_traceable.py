@@ -158,8 +158,8 @@ def test_image_formation(rng: np.random.Generator, model: Model):
 
     def image(given: Any) -> Any:
         energy, background, mask, radiance, curvature = given
-        optics = Optics.of(replace(bank, energy=energy), CAMERA, DEPTHS_M, shadow_px=17)
-        optics = replace(optics, aperture_m=1e-3, focal_m=4e-3)
+        optics = Optics.of(replace(bank, energy=energy), CAMERA, DEPTHS_M)
+        optics = replace(optics, aperture_m=1e-3, focal_m=4e-3, shadow_px=17)
         return capture(Scene(background, np.inf, (Obstruction(mask, radiance, 1 / curvature),)), optics, model)
 
     # The clamp of the release's alpha bends a few pixels, and a shadow disc is traced by straight lines in a pixel
