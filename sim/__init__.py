@@ -1,4 +1,4 @@
-"""What light does with what is made.
+"""The light behind the things that `fab` makes.
 
 Reading order, from the substance to the picture:
 

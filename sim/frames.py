@@ -26,21 +26,13 @@ _CURE = "Write the file again from its source."
 
 
 class CameraFrame(NamedTuple):
-    """One exposure as its file holds it.
+    """One exposure as its file holds it."""
 
-    Attributes:
-        counts: `[y, x]` values, row 0 at the lowest y.
-        valid: `[y, x]` pixels that carry the chosen colour.
-        clipped_at: value at which the file says its pixels are full, or None.
-        black: value that the file gives to no light at all.
-        step: smallest difference of two values; 0 for floats.
-    """
-
-    counts: Float[np.ndarray, "y x"]
-    valid: Bool[np.ndarray, "y x"]
-    clipped_at: float | None = None
-    black: float = 0.0
-    step: float = 0.0
+    counts: Float[np.ndarray, "y x"]  # `[y, x]` values, row 0 at the lowest y
+    valid: Bool[np.ndarray, "y x"]  # `[y, x]` pixels that carry the chosen colour
+    clipped_at: float | None = None  # value at which the file says its pixels are full, or None
+    black: float = 0.0  # value that the file gives to no light at all
+    step: float = 0.0  # smallest difference of two values; 0 for floats
 
 
 def read_frame(

@@ -28,7 +28,7 @@ def linear_from_srgb(display: Pixels) -> Pixels:
 
 
 def srgb_from_linear(light: Pixels) -> Pixels:
-    """Inverse of `linear_from_srgb`, with a finite gradient at black."""
+    """Display values of linear light: the inverse of `linear_from_srgb`, with a finite gradient at black."""
     xp: Any = jnp if isinstance(light, jax.Array) else np
     bright = xp.maximum(light, _BEND_LINEAR)
     curve = (1 + _OFFSET) * bright ** (1 / _EXPONENT) - _OFFSET

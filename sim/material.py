@@ -25,19 +25,14 @@ def _cauchy(wavelength_um: float, terms: tuple[tuple[float, float], ...]) -> flo
 
 @dataclass(frozen=True)
 class Material:
-    """A transparent material at room temperature.
-
-    Attributes:
-        range_m: shortest and longest vacuum wavelength the formula was fitted for, metres.
-        formula: index as a function of the wavelength in micrometres and `terms`.
-        citation: where the coefficients were published.
-    """
+    """A transparent material at room temperature."""
 
     name: str
-    range_m: tuple[float, float]
+    range_m: tuple[float, float]  # shortest and longest vacuum wavelength the formula was fitted for, metres
+    # Index as a function of the wavelength in micrometres and `terms`
     formula: Callable[[float, tuple[tuple[float, float], ...]], float]
     terms: tuple[tuple[float, float], ...]
-    citation: str
+    citation: str  # where the coefficients were published
 
     def index(self, wavelength_m: float) -> float:
         """Refractive index n at a vacuum wavelength in metres; an InputError outside the range of the published fit."""
@@ -106,12 +101,12 @@ def material(name: str) -> Material:
 
 
 def refractive_index(name: str, wavelength_m: float) -> float:
-    """Refractive index of the named material at a vacuum wavelength in metres."""
+    """Refractive index of the material `name` at a vacuum wavelength `wavelength_m`, metres."""
     return material(name).index(wavelength_m)
 
 
 def fresnel_transmission(index: float) -> float:
-    """Power that passes both uncoated faces of a plate at normal incidence, 0-1.
+    """Power that passes both uncoated faces of a plate of a refractive index at normal incidence, 0-1.
 
     One face passes T = 4n/(n+1)^2 (M. Born and E. Wolf, *Principles of Optics*, §1.5); for a substrate much thicker
     than the coherence length the two multiply, and light reflected twice or more counts as lost.
@@ -120,7 +115,7 @@ def fresnel_transmission(index: float) -> float:
 
 
 def full_wave_height_m(name: str, wavelength_m: float) -> float:
-    """Height whose optical path in air is one wave, lambda / (n - 1), in metres."""
+    """Height, metres, of the material `name` whose optical path in air is one wave: `wavelength_m` / (n - 1)."""
     return wavelength_m / (refractive_index(name, wavelength_m) - 1.0)
 
 

@@ -21,33 +21,27 @@ from scipy.ndimage import gaussian_filter, label
 from fab.errors import InputError
 from sim.frames import CameraFrame
 
+Image = Float[np.ndarray, "y x"]
 _BORDER = 0.05  # of the shorter side: where a frame should hold background alone
 _SEARCH = 1024  # samples per side on which the light is looked for
 
 
 class Noise(NamedTuple):
-    """What a pixel adds by itself: electrons per count, and the standard deviation of a reading in electrons."""
+    """Noise of a pixel itself: electrons per count, and the standard deviation of a reading in electrons."""
 
     gain_e: float
     read_e: float
 
 
 class MeasuredPsf(NamedTuple):
-    """A merged image.
+    """A merged image."""
 
-    Attributes:
-        rate: `[y, x]` counts per unit of exposure.
-        floor: variance of `rate` without light.
-        slope: variance of `rate` per unit of light.
-        valid: pixels that carry information.
-    """
+    rate: Image  # `[y, x]` counts per unit of exposure
+    floor: Image  # variance of `rate` without light
+    slope: Image  # variance of `rate` per unit of light
+    valid: Bool[np.ndarray, "y x"]  # pixels that carry information
 
-    rate: Float[np.ndarray, "y x"]
-    floor: Float[np.ndarray, "y x"]
-    slope: Float[np.ndarray, "y x"]
-    valid: Bool[np.ndarray, "y x"]
-
-    def variance(self, signal: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+    def variance(self, signal: Image) -> Image:
         """Variance of `rate` where the light is `signal`; what is below zero is no light."""
         return self.floor + self.slope * np.maximum(signal, 0.0)
 
@@ -104,7 +98,7 @@ _SHORTER = "Add a shorter exposure, or check `saturation`."
 
 def _without_dark(
     frame: CameraFrame, dark: CameraFrame | float, noise: Noise, dark_count: int, name: str
-) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
+) -> tuple[Image, Image]:
     """Counts above black, and their variance without light."""
     read = (noise.read_e / noise.gain_e) ** 2 + frame.step**2 / 12
     if isinstance(dark, float | int):
@@ -184,15 +178,13 @@ def centre_of_light(psf: MeasuredPsf) -> tuple[float, float]:
     return row, column
 
 
-def smoothed(psf: MeasuredPsf) -> Float[np.ndarray, "y x"]:
+def smoothed(psf: MeasuredPsf) -> Image:
     """The image a little blurred and without holes, for comparisons that need every pixel."""
     light, share = (np.where(psf.valid, values, 0.0).astype(np.float64) for values in (psf.rate, psf.valid))
     return _without_holes(light, share, 1)
 
 
-def _without_holes(
-    light: Float[np.ndarray, "y x"], share: Float[np.ndarray, "y x"], factor: int
-) -> Float[np.ndarray, "y x"]:
+def _without_holes(light: Image, share: Image, factor: int) -> Image:
     """Sums over bins, of which `share` counts the pixels that are there, as a blurred image.
 
     A missing region counts as the brightest of all or, if it reaches the border, as beyond the frame.
@@ -207,7 +199,7 @@ def _without_holes(
     return np.where(there, mean, np.where(full, mean[there].max() if there.any() else 0.0, 0.0))
 
 
-def _sums(values: Float[np.ndarray, "y x"], factor: int) -> Float[np.ndarray, "v u"]:
+def _sums(values: Image, factor: int) -> Float[np.ndarray, "v u"]:
     """Sums over squares of `factor` pixels; the last ones are filled up with zeros."""
     padded = np.pad(values, [(0, -size % factor) for size in values.shape])
     rows, columns = (size // factor for size in padded.shape)

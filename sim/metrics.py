@@ -62,7 +62,7 @@ def encircled_energy(
     pixel_m: float,
     radii_m: Sequence[float] | np.ndarray,
 ) -> Float[np.ndarray, "*bank r"] | Float[Array, "*bank r"]:
-    """Energy `[..., radius]` of PSFs `[..., y, x]` inside centred discs (radii and pitch in metres).
+    """Energy `[..., radius]` of `psfs` `[..., y, x]` of pitch `pixel_m` inside centred discs of `radii_m`, metres.
 
     Not divided by the total; partly covered pixels count by area.
     """
@@ -92,9 +92,10 @@ class RingToDisc(NamedTuple):
 
 
 def ring_to_disc(psf: Psf, camera: Camera, depth_m: float) -> RingToDisc:
-    """Ring:disc ratio of a near PSF (3:1 in the paper's simulation, 1:1 in its prototype); infinite without a disc.
+    """Ring:disc ratio of a near `psf` of a `camera` (3:1 in the paper's simulation, 1:1 in its prototype).
 
-    The disc is the geometric defocus disc widened by one pixel, where light that the DOE does not diffract lands.
+    The disc is the geometric defocus disc of `depth_m` widened by one pixel, where light that the DOE does not diffract
+    lands; without light in it the ratio is infinite.
     """
     radius = camera.defocus_radius_m(depth_m) + camera.pixel_m
     disc = energy_within(psf, camera.pixel_m, radius)
@@ -112,7 +113,7 @@ def far_spot(psf: Psf, camera: Camera, colour: Colour) -> Number:
 
 
 def participation(psf: Any) -> Array:
-    """Sum of squared pixel energies, the concentration of PSFs: 1 for one bright pixel, 1/n for n equal ones."""
+    """Sum of squared pixel energies, the concentration of a `psf`: 1 for one bright pixel, 1/n for n equal ones."""
     return jnp.sum(jnp.asarray(psf) ** 2, axis=(-2, -1))
 
 
@@ -145,21 +146,13 @@ def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Floa
 
 
 class EnergyBudget(NamedTuple):
-    """Where the power incident on the clear aperture goes; the five parts sum to 1.
+    """Where the power incident on the clear aperture goes; the five parts sum to 1."""
 
-    Attributes:
-        reflected: by the two faces of the substrate.
-        spot: inside the far-spot radius of the window.
-        window: elsewhere in the sensor window.
-        uncollected: within the DOE grid's band, but outside the window or between light-sensitive squares.
-        higher_orders: at angles beyond lambda / (2 pitch), scattered by the square cells and the aperture's edge.
-    """
-
-    reflected: float
-    spot: float
-    window: float
-    uncollected: float
-    higher_orders: float
+    reflected: float  # by the two faces of the substrate
+    spot: float  # inside the far-spot radius of the window
+    window: float  # elsewhere in the sensor window
+    uncollected: float  # within the DOE grid's band, but outside the window or between light-sensitive squares
+    higher_orders: float  # at angles beyond lambda / (2 pitch), scattered by the square cells and the aperture's edge
 
 
 def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
@@ -210,25 +203,15 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
 
 @dataclass(frozen=True)
 class MetricInputs:
-    """A DOE and its PSFs, from which metrics are computed.
+    """A DOE and its PSFs, from which metrics are computed."""
 
-    Attributes:
-        energy: `[colour, depth, y, x]` PSFs, as in a `PsfBank`.
-        depths_m: their depths, metres.
-        camera: lens, sensor and substrate.
-        near_m: which of the depths are obstructions, metres.
-        doe: the DOE.
-        nominal: the DOE exactly as drawn, to compare with.
-        lens: PSFs of the bare lens, to compare with.
-    """
-
-    energy: Any
-    depths_m: Sequence[float]
-    camera: Camera
-    near_m: Sequence[float] = ()
-    doe: CellOptic | None = None
-    nominal: CellOptic | None = None
-    lens: Any = None
+    energy: Any  # `[colour, depth, y, x]` PSFs, as in a `PsfBank`
+    depths_m: Sequence[float]  # their depths, metres
+    camera: Camera  # lens, sensor and substrate
+    near_m: Sequence[float] = ()  # which of the depths are obstructions, metres
+    doe: CellOptic | None = None  # the DOE
+    nominal: CellOptic | None = None  # the DOE exactly as drawn, to compare with
+    lens: Any = None  # PSFs of the bare lens, to compare with
 
     def of_colours(self, values: Any) -> list[Any]:
         """Values for `doe.wavelengths_m` as their weighted sums for every colour."""
@@ -286,23 +269,16 @@ class MetricInputs:
 
 @dataclass(frozen=True)
 class Metric:
-    """One number per colour and depth.
+    """One number per colour and depth."""
 
-    Attributes:
-        label: its name in pictures and tables.
-        of: value for (inputs, colour, depth), the latter two as positions in the bank.
-        tables: which tables list it.
-        depths: for which depths it is meant.
-        worse: on which side a DOE is bad, for limits and yield; None for a number without limits.
-        unit: "1", "m", or "%" for a share, which is shown in per cent.
-    """
-
-    label: str
+    label: str  # its name in pictures and tables
+    # Value for (inputs, colour, depth), the latter two as positions in the bank
     of: Callable[[MetricInputs, int, int], Any]
-    tables: tuple[Literal["design", "fabricated"], ...]
-    depths: Literal["all", "near", "far"] = "all"
+    tables: tuple[Literal["design", "fabricated"], ...]  # which tables list it
+    depths: Literal["all", "near", "far"] = "all"  # for which depths it is meant
+    # On which side a DOE is bad, for limits and yield; None for a number without limits
     worse: Literal["high", "low"] | None = None
-    unit: Literal["1", "%", "m"] = "1"
+    unit: Literal["1", "%", "m"] = "1"  # "1", "m", or "%" for a share, which is shown in per cent
 
     @property
     def share(self) -> bool:

@@ -74,15 +74,9 @@ def photon_noise(
 ) -> Float[Array, "*s"]:
     """Shot noise and Gaussian noise: `scale` Poisson(signal / scale), saturated, plus a normal of deviation `sigma`.
 
-    Args:
-        key: random key.
-        signal: expected signal; electrons where `scale` is 1.
-        sigma: standard deviation of the Gaussian part, in the signal's unit.
-        scale: signal of one count.
-        most: where the counted part saturates; what lies above has no gradient.
-
-    In the gradient the variance `scale` signal + sigma^2 counts as at least that of one count, so that a photon in the
-    dark does not weigh without bounds.
+    `signal` is in electrons where `scale`, the signal of one count, is 1. Counts above `most` saturate and have no
+    gradient. In the gradient the variance `scale` signal + sigma^2 counts as at least that of one count, so that a
+    photon in the dark does not weigh without bounds.
     """
     shot, read = jax.random.split(key)
     signal = jnp.maximum(signal, 0.0)

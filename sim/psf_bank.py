@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
+Table = Float[np.ndarray, "w d"] | Float[Array, "w d"]
 Length = float | str
 if TYPE_CHECKING:  # numpy and jax arrays serve alike
     Energies = Any
@@ -70,21 +71,21 @@ class PsfBank(eqx.Module):
             raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
         return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy)
 
-    def metric(self, name: str) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+    def metric(self, name: str) -> Table:
         """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`."""
         inputs, of = self.metric_inputs(), METRICS[name].of
         depths = range(len(self.depths_m))
         return stacked([stacked([of(inputs, c, d) for d in depths]) for c in range(len(self.colours))])
 
-    def throughput(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+    def throughput(self) -> Table:
         """Energy in the window, `[wavelength, depth]`."""
         return self.metric("throughput")
 
-    def far_spot(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+    def far_spot(self) -> Table:
         """Energy in the far spot (`sim.metrics.spot_radius_m`), `[wavelength, depth]`."""
         return self.metric("far_spot")
 
-    def ring_to_disc(self) -> Float[np.ndarray, "w d"] | Float[Array, "w d"]:
+    def ring_to_disc(self) -> Table:
         """Energy outside over energy inside the geometric defocus disc, `[wavelength, depth]`."""
         return self.metric("ring_to_disc")
 

@@ -41,7 +41,7 @@ _MOST_BITS = 24  # what single precision holds
 
 @dataclass(frozen=True)
 class Sensor:
-    """What turns light into numbers. Hashable: it may be a static argument of `jit`.
+    """A sensor, which turns light into numbers. Hashable: it may be a static argument of `jit`.
 
     Attributes:
         full_well_e: electrons that a pixel holds.

@@ -53,7 +53,7 @@ class SourceMap(eqx.Module):
         return cls(jnp.asarray(waves), jnp.float32(camera.waves_per_metre(wavelength_m, field_rad)))
 
     def over(self, grid: Grid) -> tuple[Array, MapColumns]:
-        """What `sim.propagation.pupil.doe_field` has to know: by row, and for all rows alike."""
+        """Arguments of `sim.propagation.pupil.doe_field`: by row, and for all rows alike."""
         return self.source_waves, MapColumns(self.waves_per_metre)
 
 
@@ -82,23 +82,14 @@ class SeparableColumns(NamedTuple):
 
 
 class SeparableSource(NamedTuple):
-    """A point source by a few numbers; all of them may be traced.
+    """A point source by a few numbers; all of them may be traced."""
 
-    Attributes:
-        curvature: inverse of the chief ray's length, 1/m; 0 for a star.
-        sines: direction sines (y, x) of the chief ray.
-        waves_y: `[y]` wrapped parabola along y, waves.
-        waves_x: `[x]` the same along x.
-        waves_per_metre: waves of delay per metre of DOE height for this chief ray.
-        inverse_wavelength: waves per metre of path.
-    """
-
-    curvature: Real
-    sines: Real
-    waves_y: Real
-    waves_x: Real
-    waves_per_metre: Real
-    inverse_wavelength: Real
+    curvature: Real  # inverse of the chief ray's length, 1/m; 0 for a star
+    sines: Real  # direction sines (y, x) of the chief ray
+    waves_y: Real  # `[y]` wrapped parabola along y, waves
+    waves_x: Real  # `[x]` the same along x
+    waves_per_metre: Real  # waves of delay per metre of DOE height for this chief ray
+    inverse_wavelength: Real  # waves per metre of path
 
     @classmethod
     def at(

@@ -39,19 +39,12 @@ _SILENT = threading.Lock()
 
 
 class StoredHeight(NamedTuple):
-    """A height map as its file holds it.
+    """A height map as its file holds it."""
 
-    Attributes:
-        height_m: `[y, x]` heights, metres, row 0 at the lowest y.
-        pitch_m: cell pitch, metres, or None.
-        aperture_m: diameter of the clear aperture, metres, or None.
-        metadata: the other text attributes.
-    """
-
-    height_m: Float[np.ndarray, "y x"]
-    pitch_m: float | None
-    aperture_m: float | None
-    metadata: dict[str, str]
+    height_m: Float[np.ndarray, "y x"]  # `[y, x]` heights, metres, row 0 at the lowest y
+    pitch_m: float | None  # cell pitch, metres, or None
+    aperture_m: float | None  # diameter of the clear aperture, metres, or None
+    metadata: dict[str, str]  # the other text attributes
 
 
 def write_height(
@@ -78,7 +71,7 @@ def write_height(
 
 
 def read_height(path: str | Path) -> StoredHeight:
-    """Read a height map; an InputError for no whole EXR file with a channel `height` of finite heights, at least 0."""
+    """Read the height map at a path; an InputError for no EXR file with a channel `height`, finite and at least 0."""
     channels, texts = _read(Path(path))
     if "height" not in channels:
         rule = "a height map must have a channel named height, in metres"

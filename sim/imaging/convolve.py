@@ -24,6 +24,7 @@ import numpy as np
 import scipy.fft
 from jaxtyping import Array, Complex, Float, Int
 
+Images = Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"]
 Border = Literal["reflect", "edge", "own"]
 Window = tuple[int, int]
 
@@ -52,18 +53,12 @@ def result_shape(shape: Window, window: Window, border: Border) -> Window:
 
 
 class Otf(eqx.Module):
-    """Transforms `[..., fx, fy]` of kernels, ready for images of one shape.
-
-    Attributes:
-        window: samples (y, x) of a kernel.
-        shape: samples (y, x) of an image.
-        border: what lies beyond it.
-    """
+    """Transforms `[..., fx, fy]` of kernels, ready for images of one shape."""
 
     transfer: Complex[Array, "*k fx fy"]
-    window: Window = eqx.field(static=True)
-    shape: Window = eqx.field(static=True)
-    border: Border = eqx.field(static=True)
+    window: Window = eqx.field(static=True)  # samples (y, x) of a kernel
+    shape: Window = eqx.field(static=True)  # samples (y, x) of an image
+    border: Border = eqx.field(static=True)  # what lies beyond it
 
     @property
     def length(self) -> Window:
@@ -87,14 +82,12 @@ def plan_otf(kernel: Float[Array, "*k y x"] | Float[np.ndarray, "*k y x"], shape
     return Otf(_transformed(jnp.asarray(kernel, jnp.float32), _length(shape, window, border)), window, shape, border)
 
 
-def convolve(image: Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"], otf: Otf) -> Float[Array, "*c v u"]:
+def convolve(image: Images, otf: Otf) -> Float[Array, "*c v u"]:
     """Convolve images `[..., y, x]` of the planned shape with kernels; leading axes are broadcast."""
     return landed(spectrum(image, otf) * otf.transfer, otf)
 
 
-def superpose(
-    images: Sequence[Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"]], otf: Otf
-) -> Float[Array, "*c v u"]:
+def superpose(images: Sequence[Images], otf: Otf) -> Float[Array, "*c v u"]:
     """Convolve each image with its own entry of the kernels' first axis, and add: one transform back for all.
 
     The images are transformed one by one, so that two cores can work on two of them.
@@ -103,7 +96,7 @@ def superpose(
     return landed(reduce(jnp.add, products), otf)
 
 
-def spectrum(image: Float[Array, "*b y x"] | Float[np.ndarray, "*b y x"], otf: Otf) -> Complex[Array, "*b fx fy"]:
+def spectrum(image: Images, otf: Otf) -> Complex[Array, "*b fx fy"]:
     """Transform of images of the planned shape with their borders, to be multiplied with `Otf.transfer`."""
     if image.shape[-2:] != otf.shape:
         raise ValueError(f"`image` must have the shape {otf.shape} of the plan, but got {image.shape[-2:]}")
@@ -131,19 +124,12 @@ def _transformed(image: Array, length: Window) -> Array:
 
 
 class Tile(NamedTuple):
-    """A piece of a large result, and the samples of the image it needs.
+    """A piece of a large result, and the samples of the image it needs."""
 
-    Attributes:
-        out: rows and columns of the result.
-        rows: index of every image row it needs, the border applied.
-        columns: likewise.
-        corner: (y, x) of the first needed sample in the image's coordinates; negative beyond the border.
-    """
-
-    out: tuple[slice, slice]
-    rows: Int[np.ndarray, " r"]
-    columns: Int[np.ndarray, " s"]
-    corner: tuple[int, int]
+    out: tuple[slice, slice]  # rows and columns of the result
+    rows: Int[np.ndarray, " r"]  # index of every image row it needs, the border applied
+    columns: Int[np.ndarray, " s"]  # likewise
+    corner: tuple[int, int]  # (y, x) of the first needed sample in the image's coordinates; negative beyond the border
 
 
 def tile_length(shape: Window, window: Window, border: Border, limit: int = 1536) -> Window:

@@ -21,13 +21,8 @@ def shadow_disc(
 ) -> Float[Array, "{window} {window}"] | Float[np.ndarray, "{window} {window}"]:
     """Disc `[y, x]` of unit sum in an odd window, every pixel weighted by the area of it that the disc covers.
 
-    Args:
-        diameter_px: diameter in pixels, above 0. If it is traced the result is differentiable in it: the circle counts
-            as straight within a pixel, and a disc larger than the window is NaN.
-        window: pixels per side.
-
-    Raises:
-        ValueError: an even window, or a disc known to be larger than the window.
+    A traced diameter (pixels, above 0) is differentiable: the circle counts as straight within a pixel, and a disc
+    larger than the window is NaN. A ValueError for an even window, or a disc known to be larger than the window.
     """
     if window % 2 == 0:
         raise ValueError(f"`window` must be odd, but got {window}")

@@ -32,7 +32,7 @@ from sim.tracing import stacked
 
 
 class Optics(eqx.Module):
-    """What a capture needs to know of a camera.
+    """PSFs and lengths of a camera, for captures.
 
     Attributes:
         psf: `[layer, c, y, x]` PSFs of the background and then of every obstruction, from the farthest to the nearest,

@@ -27,6 +27,7 @@ from sim.obstruction.noise import layered_noise
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
+Pixels = Float[np.ndarray, "y x"]
 Pattern = Literal["chain_link", "bars", "grid"]
 
 # Linear reflectances (estimates): zinc, twice as common as each of green plastic, black plastic and rust.
@@ -153,18 +154,18 @@ class _Plane(NamedTuple):
     `away` is the distance along the axis over that of the plane's middle, `pixel_m` a pixel's width there.
     """
 
-    u: Float[np.ndarray, "y x"]
-    v: Float[np.ndarray, "y x"]
-    away: Float[np.ndarray, "y x"]
+    u: Pixels
+    v: Pixels
+    away: Pixels
     pixel_m: float
 
 
 class _Wires(NamedTuple):
     """Wires that do not cross: every pixel's signed distance from the nearest (metres), and its gradient by u and v."""
 
-    off: Float[np.ndarray, "y x"]
+    off: Pixels
     normal_u: float
-    normal_v: float | Float[np.ndarray, "y x"]
+    normal_v: float | Pixels
 
 
 class _Lamp(NamedTuple):
@@ -180,14 +181,7 @@ class _Lamp(NamedTuple):
 def tilted_plane(view: CameraView, depth_m: float, tilt_rad: float, towards_rad: float) -> _Plane:
     """Meet every pixel's direction with a plane through the axis at `depth_m`; u runs along +x and v along +y.
 
-    Args:
-        view: the frame.
-        depth_m: distance of the plane on the axis.
-        tilt_rad: angle between its normal and the axis.
-        towards_rad: direction, from +x to +y, in which it comes nearer.
-
-    Raises:
-        InputError: so wide a view does not meet a plane so tilted everywhere.
+    It is tilted nearer in the direction `towards_rad`, from +x to +y; an InputError for a view too wide for that.
     """
     y, x = view.slopes()
     along, across = x * cos(towards_rad) + y * sin(towards_rad), y * cos(towards_rad) - x * sin(towards_rad)
@@ -209,7 +203,7 @@ def turned(plane: _Plane, angle_rad: float, *, mirrored: bool) -> _Plane:
     return plane._replace(u=-u if mirrored else u, v=v)
 
 
-def rods(across: Float[np.ndarray, "y x"], mesh_m: float, *, along_u: bool) -> _Wires:
+def rods(across: Pixels, mesh_m: float, *, along_u: bool) -> _Wires:
     """Straight wires at equal distances; `across` is the coordinate across them, metres."""
     off = across - np.float32(mesh_m) * np.round(across / np.float32(mesh_m))
     return _Wires(off, 0.0 if along_u else 1.0, 1.0 if along_u else 0.0)
@@ -228,9 +222,7 @@ def _piece(mesh_m: float, diamond_rad: float, wire_m: float) -> tuple[float, flo
     return mesh_m / (2 * sin(diamond_rad)), mesh_m / (2 * cos(diamond_rad)) + wire_m
 
 
-def zigzags(
-    u: Float[np.ndarray, "y x"], v: Float[np.ndarray, "y x"], mesh_m: float, diamond_rad: float, wire_m: float
-) -> tuple[_Wires, _Wires]:
+def zigzags(u: Pixels, v: Pixels, mesh_m: float, diamond_rad: float, wire_m: float) -> tuple[_Wires, _Wires]:
     """Wires of a chain-link fence, running along v: every other one, and those between.
 
     A zigzag is its own mirror image about every bend, so v is folded there and one straight piece is left. Folding
@@ -256,9 +248,7 @@ def zigzags(
     return found[0], found[1]
 
 
-def seen(
-    wires: _Wires, plane: _Plane, wire_m: float, view: CameraView, lamp: _Lamp
-) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
+def seen(wires: _Wires, plane: _Plane, wire_m: float, view: CameraView, lamp: _Lamp) -> tuple[Pixels, Pixels]:
     """Coverage and light of a family of wires.
 
     Distances are turned into pixels by the gradient of the distance over the frame, which is that of the plane's

@@ -33,17 +33,12 @@ _MOST_PIXELS = 1 << 26
 
 
 class MaskPicture(NamedTuple):
-    """One mask as its file holds it.
+    """One mask as its file holds it."""
 
-    Attributes:
-        mask: `[y, x]` 0 where the view is free, 1 where it is covered, float32; row 0 at the lowest y.
-        colour: `[c, y, x]` linear light of what covers, or None.
-        pitch_m: width of one pixel on the obstruction, metres, or None.
-    """
-
+    # `[y, x]` 0 where the view is free, 1 where it is covered, float32; row 0 at the lowest y
     mask: Float[np.ndarray, "y x"]
-    colour: Float[np.ndarray, "c y x"] | None
-    pitch_m: float | None
+    colour: Float[np.ndarray, "c y x"] | None  # `[c, y, x]` linear light of what covers, or None
+    pitch_m: float | None  # width of one pixel on the obstruction, metres, or None
 
 
 @dataclass(frozen=True)

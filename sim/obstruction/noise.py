@@ -68,15 +68,11 @@ def layered_noise(
     persistence: float = 0.5,
     blur: float = 0.0,
 ) -> Float[np.ndarray, "y x"]:
-    """Noise of several scales, each half as wide as the one before, low-pass filtered; float32.
+    """Noise of several scales (`octaves`), each half as wide as the one before, low-pass filtered; float32.
 
-    Args:
-        rng: randomness.
-        shape: (y, x) pixels.
-        cell: width of the widest cells, pixels; their scale has Perlin's amplitude.
-        octaves: number of scales; those with cells below two pixels are left out.
-        persistence: amplitude of a scale over that of the one before.
-        blur: sigma of the Gaussian, pixels.
+    Lengths are in pixels: `cell` the width of the widest cells, whose scale has Perlin's amplitude, and `blur` the
+    sigma of the Gaussian. Scales with cells below two pixels are left out. `persistence` is the amplitude of a scale
+    over that of the one before.
     """
     margin = int(np.ceil(_REACH * blur))
 

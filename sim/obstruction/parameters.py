@@ -1,4 +1,4 @@
-"""What kinds of obstruction share: ranges that a value is drawn from, their limits, and the way to draw."""
+"""Parameters of obstructions: ranges that a value is drawn from, their limits, and the way to draw."""
 
 import math
 from collections.abc import Mapping

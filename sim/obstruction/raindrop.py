@@ -31,6 +31,7 @@ from sim.obstruction.dirt import Dirt
 from sim.obstruction.parameters import DEPTHS_M, Range, WithLimits, draw_from
 from sim.obstruction.view import CameraView
 
+Pixels = Float[np.ndarray, "n m"]
 _WATER = 1.333
 _MOST_DROPS = 10_000
 
@@ -173,20 +174,20 @@ class Drop(NamedTuple):
         """Whether its middle lies in the frame."""
         return all(-0.5 <= at <= n - 0.5 for at, n in zip((self.y, self.x), view.shape, strict=True))
 
-    def coordinates(self, window: tuple[slice, slice]) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+    def coordinates(self, window: tuple[slice, slice]) -> tuple[Pixels, Pixels]:
         """Pixels from its middle, along the airflow and across it."""
         y, x = (np.arange(s.start, s.stop, dtype=np.float32) for s in window)
         up, right = (y - np.float32(self.y))[:, None], (x - np.float32(self.x))[None, :]
         c, s = np.float32(cos(self.airflow)), np.float32(sin(self.airflow))
         return c * right + s * up, c * up - s * right
 
-    def _half_axis(self, along: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    def _half_axis(self, along: Pixels) -> Pixels:
         return np.where(along > 0, np.float32(self.length), np.float32(self.radius))
 
-    def _share(self, along: Float[np.ndarray, "n m"], across: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    def _share(self, along: Pixels, across: Pixels) -> Pixels:
         return np.hypot(along / self._half_axis(along), across / np.float32(self.radius))
 
-    def cover(self, along: Float[np.ndarray, "n m"], across: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    def cover(self, along: Pixels, across: Pixels) -> Pixels:
         """Share of every pixel inside the outline, float32."""
         share = self._share(along, across)
         growth = np.hypot(along / self._half_axis(along) ** 2, across / np.float32(self.radius**2))
@@ -194,9 +195,7 @@ class Drop(NamedTuple):
         inward = share * (1 - share) / np.maximum(growth, np.float32(1e-9))
         return np.where(share < 0.5, 1, np.clip(inward + 0.5, 0, 1)).astype(np.float32)
 
-    def cap(
-        self, along: Float[np.ndarray, "n m"], across: Float[np.ndarray, "n m"], contact_rad: float
-    ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+    def cap(self, along: Pixels, across: Pixels, contact_rad: float) -> tuple[Pixels, Pixels]:
         """Tangents (y, x) of the angles between the cap's normal and the glass's."""
         share = np.minimum(self._share(along, across), 1)
         height = np.sqrt(np.float32(1 / sin(contact_rad) ** 2) - share**2)
@@ -221,24 +220,15 @@ class Drop(NamedTuple):
 class Rays(NamedTuple):
     """Where each pixel's light comes from, radians above the axis and towards +x, and the share the cap passes."""
 
-    elevation: Float[np.ndarray, "n m"]
-    azimuth: Float[np.ndarray, "n m"]
-    passed: Float[np.ndarray, "n m"]
+    elevation: Pixels
+    azimuth: Pixels
+    passed: Pixels
 
 
-def refracted(
-    tangent_y: Float[np.ndarray, "n m"],
-    tangent_x: Float[np.ndarray, "n m"],
-    tilt_rad: float,
-    slope: tuple[float, float] = (0.0, 0.0),
-) -> Rays:
-    """Follow rays from the camera through glass and water into the open.
+def refracted(tangent_y: Pixels, tangent_x: Pixels, tilt_rad: float, slope: tuple[float, float] = (0.0, 0.0)) -> Rays:
+    """Follow rays with tangents `slope` (y, x) from the camera through glass that leans back and water into the open.
 
-    Args:
-        tangent_y: tangent of the angle between the cap's normal and the glass's, up along the glass.
-        tangent_x: the same along x.
-        tilt_rad: how far the glass leans back.
-        slope: tangents (y, x) of the rays' direction before the glass.
+    The tangents are those of the angle between the cap's normal and the glass's, up along the glass and along x.
     """
     c, s = cos(tilt_rad), sin(tilt_rad)
     # Vectors are (y, x, z), z away from the camera. The glass's normal points out and up; `up` lies in the glass.
@@ -266,17 +256,11 @@ def _refract(ray: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], ratio:
 
 @dataclass(frozen=True)
 class DirtRaindrop(WithLimits):
-    """Dirt or raindrops, as the paper's network for windshields was trained.
+    """Dirt or raindrops, as the paper's network for windshields was trained."""
 
-    Attributes:
-        dirt: the dirt.
-        raindrop: the drops.
-        dirt_share: how often it is dirt.
-    """
-
-    dirt: Dirt = field(default_factory=Dirt)
-    raindrop: Raindrop = field(default_factory=Raindrop)
-    dirt_share: float = 0.5
+    dirt: Dirt = field(default_factory=Dirt)  # the dirt
+    raindrop: Raindrop = field(default_factory=Raindrop)  # the drops
+    dirt_share: float = 0.5  # how often it is dirt
 
     name: ClassVar[str] = "dirt_raindrop"
     limits: ClassVar[Mapping[str, Range]] = {"dirt_share": (0.0, 1.0)}

@@ -33,12 +33,9 @@ class ReleaseDirt(WithLimits):
     from the middle to the corners of the frame, divided by its largest value, and covering where that exceeds 0.3. The
     colour is (30, 20, 10) of 255 times 1 to 2.5, plus up to 5 either way for each colour, times that value. The paper's
     text has a Gaussian blur and a random threshold instead, and no fading.
-
-    Attributes:
-        depth_m: distance of the glass; 5 to 12 cm.
     """
 
-    depth_m: Range = (0.05, 0.12)
+    depth_m: Range = (0.05, 0.12)  # distance of the glass; 5 to 12 cm
 
     name: ClassVar[str] = "release_dirt"
     limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M}
@@ -74,14 +71,10 @@ class ReleaseRaindrop(WithLimits):
     distance from the frame's top, as an equidistant fish-eye lens of focal lengths 30 r and 20 r has it after
     straightening to 1.2 r^(1/3) times these; display values become 0.6 + 1.5 (x - 0.5). A real drop's image is inverted
     and much smaller (`sim.obstruction.raindrop`).
-
-    Attributes:
-        depth_m: distance of the glass; 5 to 12 cm.
-        radius_m: radius before it is cut short; 1 to 3 mm.
     """
 
-    depth_m: Range = (0.05, 0.12)
-    radius_m: Range = (1e-3, 3e-3)
+    depth_m: Range = (0.05, 0.12)  # distance of the glass; 5 to 12 cm
+    radius_m: Range = (1e-3, 3e-3)  # radius before it is cut short; 1 to 3 mm
 
     name: ClassVar[str] = "release_raindrop"
     limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "radius_m": (1e-5, 0.02)}
@@ -128,14 +121,10 @@ class ReleaseFence(WithLimits):
 
     The release scales photographed masks that were not published; here `Fence` takes their place, neither tilted nor
     bent, with meshes 8 to 14 wires wide (an estimate). Contrast of the display values changes by up to a fifth.
-
-    Attributes:
-        depth_m: distance of the fence; 40 to 80 cm.
-        wire_m: diameter of a wire; 5 to 15 mm.
     """
 
-    depth_m: Range = (0.4, 0.8)
-    wire_m: Range = (5e-3, 15e-3)
+    depth_m: Range = (0.4, 0.8)  # distance of the fence; 40 to 80 cm
+    wire_m: Range = (5e-3, 15e-3)  # diameter of a wire; 5 to 15 mm
 
     name: ClassVar[str] = "release_fence"
     limits: ClassVar[Mapping[str, Range]] = {"depth_m": DEPTHS_M, "wire_m": (1e-5, 0.1)}

@@ -1,4 +1,4 @@
-"""What a camera's frame spans: sizes of near things in pixels (eq. 11), directions of pixels."""
+"""The frame of a camera: sizes of near things in pixels (eq. 11), directions of pixels."""
 
 import math
 from dataclasses import dataclass

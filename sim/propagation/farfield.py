@@ -49,34 +49,24 @@ _FLOOR = 1e-9  # keeps the interpolation's weights small where the band leaves t
 
 
 class FarField(eqx.Module):
-    """Operators of one wavelength and depth.
+    """Operators of one wavelength and depth."""
 
-    Attributes:
-        gather: samples -> pixels along either axis, with all constant factors; `spread` is its transpose.
-        refine: samples of the field -> samples of the intensity along either axis, with the cell's sinc: real and
-            imaginary part of the weights (only the real one for a distant source), or none if the samples are the same;
-            `coarsen` holds their transposes.
-        tilt: phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`).
-        cells: DOE cells per axis.
-        length: transform length per axis.
-        kept: samples of the field kept around the axis.
-        blocks: rows per block in the pupil and on the sensor.
-        spacing_m: distance of the field's samples on the sensor.
-        expected_error: predicted relative L2 error of the pixel energies of a speckle-like image.
-    """
-
-    gather: Banded
+    gather: Banded  # samples -> pixels along either axis, with all constant factors; `spread` is its transpose
     spread: Banded
+    # Samples of the field -> samples of the intensity along either axis, with the cell's sinc: real and imaginary
+    # part of the weights (only the real one for a distant source), or none if the samples are the same; `coarsen`
+    # holds their transposes
     refine: tuple[Banded, ...]
     coarsen: tuple[Banded, ...]
+    # Phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`)
     tilt: tuple[Complex[Array, " cell"], Complex[Array, " cell"]] | None
-    cells: int = eqx.field(static=True)
-    length: int = eqx.field(static=True)
-    kept: int = eqx.field(static=True)
-    blocks: tuple[int, int] = eqx.field(static=True)
-    spacing_m: float = eqx.field(static=True)
+    cells: int = eqx.field(static=True)  # DOE cells per axis
+    length: int = eqx.field(static=True)  # transform length per axis
+    kept: int = eqx.field(static=True)  # samples of the field kept around the axis
+    blocks: tuple[int, int] = eqx.field(static=True)  # rows per block in the pupil and on the sensor
+    spacing_m: float = eqx.field(static=True)  # distance of the field's samples on the sensor
     # No static field: it changes with depth, and every depth would be compiled anew.
-    expected_error: float
+    expected_error: float  # predicted relative L2 error of the pixel energies of a speckle-like image
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy `[y, x]` in every pixel of the window, per unit power incident on the clear aperture.
@@ -98,14 +88,11 @@ def plan_far_field(
     Args:
         camera: DOE grid (square), aperture, lens and sensor.
         wavelength_m: vacuum wavelength.
-        depth_m: source depth, for the directions in which the cells are lit; without influence below a `sampling` of 2,
-            where the cell's sinc stays centred on the axis.
+        depth_m: source depth; without influence below a `sampling` of 2, where the cell's sinc stays centred on the
+            axis.
         sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
             `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
-
-    Raises:
-        ValueError: a DOE grid that is not square, or `sampling` below 1.
     """
     ny, nx = camera.grid.shape
     if ny != nx:
@@ -158,13 +145,9 @@ def field_weights(
 ) -> tuple[tuple[Float[np.ndarray, "sample fine"], ...], float]:
     """Weights that interpolate the field behind a disc of square cells, and their relative RMS error along one axis.
 
-    Args:
-        positions: where the field is wanted, in samples from the first one.
-        samples: number of samples; the middle one lies on the axis.
-        length: length of the transform that made them.
-        aperture: diameter of the disc, cells.
-        slope: direction in which a cell is lit, in waves per cell and cell from the axis; None leaves out the factor
-            sinc(direction of observation - direction of light) of a square cell.
+    `positions` count samples, whose middle one lies on the axis, from the first; `length` is that of their transform;
+    `aperture` is in cells; `slope` is the direction in which a cell is lit, in waves per cell and cell from the axis,
+    or None to leave out the factor sinc(direction of observation - direction of light) of a square cell.
 
     Real part of the weights, with the imaginary part if it is not zero. Least squares over the disc, weighted by its
     chords: every cell x contributes exp(-2 pi i k x / length) at sample k and, to the wanted field, the same at a

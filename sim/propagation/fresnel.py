@@ -27,21 +27,13 @@ _UNTAPERED = 0.75  # share of the kernel's band that passes in full
 
 
 class DirectPath(eqx.Module):
-    """Operators of one wavelength on the direct path.
+    """Operators of one wavelength on the direct path."""
 
-    Attributes:
-        gather: samples at the DOE pitch -> pixels, along either axis.
-        lens: `[y, x]` transmission of the thin lens, unit modulus.
-        kernel: `[ky, kx]` transfer function in FFT order on the padded grid.
-        first: first sample kept on the sensor, per axis.
-        expected_error: predicted relative L2 error of the pixel integration alone.
-    """
-
-    gather: Banded
-    lens: Complex[Array, "y x"]
-    kernel: Complex[Array, "ky kx"]
-    first: int = eqx.field(static=True)
-    expected_error: float
+    gather: Banded  # samples at the DOE pitch -> pixels, along either axis
+    lens: Complex[Array, "y x"]  # `[y, x]` transmission of the thin lens, unit modulus
+    kernel: Complex[Array, "ky kx"]  # `[ky, kx]` transfer function in FFT order on the padded grid
+    first: int = eqx.field(static=True)  # first sample kept on the sensor, per axis
+    expected_error: float  # predicted relative L2 error of the pixel integration alone
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""

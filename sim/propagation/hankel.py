@@ -31,23 +31,14 @@ _POINTS = 16  # per pixel and axis, for the areas
 
 
 class Hankel(eqx.Module):
-    """Operators of one wavelength for a profile of rings.
+    """Operators of one wavelength for a profile of rings."""
 
-    Attributes:
-        rings_to_field: `[subring, coarse radius]`, all constant factors included.
-        refine: coarse radii -> fine radii.
-        first: first fine radius used by each distinct pixel.
-        areas: `[distinct pixel, fine radius]` weights of the fine radii from `first` on.
-        distinct: `[y, x]` index of the distinct pixel that equals this one.
-        subrings: number of sub-rings per ring.
-    """
-
-    rings_to_field: Float[Array, "subring coarse"]
-    refine: Banded
-    first: Int[Array, " distinct"]
-    areas: Float[Array, "distinct fine"]
-    distinct: Int[Array, "y x"]
-    subrings: int = eqx.field(static=True)
+    rings_to_field: Float[Array, "subring coarse"]  # `[subring, coarse radius]`, all constant factors included
+    refine: Banded  # coarse radii -> fine radii
+    first: Int[Array, " distinct"]  # first fine radius used by each distinct pixel
+    areas: Float[Array, "distinct fine"]  # `[distinct pixel, fine radius]` weights of the fine radii from `first` on
+    distinct: Int[Array, "y x"]  # `[y, x]` index of the distinct pixel that equals this one
+    subrings: int = eqx.field(static=True)  # number of sub-rings per ring
 
     def energy(
         self,

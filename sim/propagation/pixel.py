@@ -54,11 +54,8 @@ def _speckle_spectrum(cutoff: float, width: float) -> tuple[np.ndarray, np.ndarr
 def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: float, samples: int) -> PixelWeights:
     """Weights that integrate samples at 0 .. samples-1 over pixels; each pixel's sum is `width`.
 
-    Args:
-        centres: pixel centres in units of the sample spacing.
-        width: side of a pixel's sensitive square in the same unit.
-        cutoff: highest spatial frequency of the intensity, cycles per sample; 1/2 is just enough.
-        samples: number of samples; every pixel must lie inside by two samples, or a ValueError is raised.
+    In units of the sample spacing: pixel centres, which must lie inside by two samples (else a ValueError), the side
+    `width` of a sensitive square, and the highest spatial frequency `cutoff` of the intensity (1/2 is just enough).
     """
     # Two samples beyond the pixel's edge on both sides: the gain of a third is below the plan's tolerance.
     taps = int(np.ceil(width)) + 5

@@ -35,24 +35,17 @@ def _cis_tangent(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
 
 
 class DoeRows(NamedTuple):
-    """Rows of a DOE and of the wave that lights it; every array's first axis is the grid's y.
+    """Rows of a DOE and of the wave that lights it; every array's first axis is the grid's y."""
 
-    Attributes:
-        coverage: open share of every cell.
-        height_m: DOE height, metres, or None.
-        transmission: transmission besides that of the height, or None for 1.
-        source: rows of the source (`sim.source`).
-    """
-
-    coverage: Float[Array, "y x"]
-    height_m: Float[Array, "y x"] | None
-    transmission: Complex[Array, "y x"] | None
-    source: Any
+    coverage: Float[Array, "y x"]  # open share of every cell
+    height_m: Float[Array, "y x"] | None  # DOE height, metres, or None
+    transmission: Complex[Array, "y x"] | None  # transmission besides that of the height, or None for 1
+    source: Any  # rows of the source (`sim.source`)
 
 
 @runtime_checkable
 class SourceColumns(Protocol):
-    """What a source says of all rows alike."""
+    """The part of a source that all rows share."""
 
     def waves(self, rows: Any, height_m: Float[Array, "y x"] | None) -> Float[Array, "y x"]:
         """Optical path through a DOE height (None: no relief) from the source, waves."""

@@ -26,21 +26,17 @@ FILTER_REACH = 10  # cells to either side
 
 
 class Cuts(NamedTuple):
-    """Lines that cut every cell of a tile along one axis.
+    """Lines that cut every cell of a tile along one axis."""
 
-    Attributes:
-        edges: where they are, in cells from the cell's lower side, increasing, with 0 and 1 at the ends.
-        state: `[mask, segment]` 0, 1 or 2: the segment lies before, between or behind the two lines of that mask.
-        low: `[mask, state]` offset in cells of the lowest mask pixel that a piece in that state sees.
-        high: the same for the highest.
-        line: `[mask, 2]` which of the inner `edges` (0 = first) are the mask's lines shift - |bias| and shift + |bias|;
-            modulo one cell, either may come first.
-    """
-
+    # Where they are, in cells from the cell's lower side, increasing, with 0 and 1 at the ends
     edges: Float[Array, " segment+1"]
+    # `[mask, segment]` 0, 1 or 2: the segment lies before, between or behind the two lines of that mask
     state: Int[Array, "mask segment"]
+    # `[mask, state]` offset in cells of the lowest mask pixel that a piece in that state sees
     low: Int[Array, "mask 3"]
-    high: Int[Array, "mask 3"]
+    high: Int[Array, "mask 3"]  # the same for the highest
+    # `[mask, 2]` which of the inner `edges` (0 = first) are the mask's lines shift - |bias| and shift + |bias|;
+    # modulo one cell, either may come first
     line: Int[Array, "mask 2"]
 
 

@@ -19,7 +19,7 @@ def walls(
     rates: Float[Array, " w"],
     plan: TilePlan,
 ) -> Float[Array, "m 2 w c"]:
-    """What tilted walls do besides shifting the wall (`effective_bias`), along every line.
+    """Change that tilted walls make along every line, besides shifting the wall (`effective_bias`).
 
     On a strip of width depth tan(angle) the light of the floor, B (1 above), is replaced by the mean over the slope,
     A = exp(-i pi d) sinc(d), d being the etch's depth in waves. (A - B) = (B - 1) (-1/2 + i g) with
@@ -66,7 +66,7 @@ def corners(
     rates: Float[Array, " w"],
     plan: TilePlan,
 ) -> Float[Array, "m 2 w c"]:
-    """What rounding changes where exactly one of the four pieces around a crossing of a mask's lines differs.
+    """Change that rounding makes where exactly one of the four pieces around a crossing of a mask's lines differs.
 
     The odd piece loses (1 - pi/4) r^2 to the state of its neighbours in that mask, in the middle of that area, with the
     other masks as they are there; where several masks have the same corner they change it together. Every crossing is

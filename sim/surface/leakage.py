@@ -43,16 +43,15 @@ class SplitPsf(NamedTuple):
 
 
 def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
-    """Split the PSF of one colour and depth into the light that leaked and the light that was diffracted.
+    """Split the PSF of one colour and depth (metres) of a `doe` into the light that leaked and that was diffracted.
 
     Args:
-        doe: the DOE, with the colour's wavelengths.
+        doe: the DOE, with the wavelengths of `colour`.
         depth_m: source depth, metres.
         colour: colour channel.
 
-    Returns:
-        energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms:
-        that they fit (`SplitPsf.excess`) is a check, not an assumption.
+    Energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms: that
+    they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
     chosen = [doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m]
     whole = doe.transmission[np.array(chosen)]

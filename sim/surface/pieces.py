@@ -33,7 +33,7 @@ def mask_states(
     kinds: range,
     plan: TilePlan,
 ) -> Float[Array, "j i t t"]:
-    """What is left open of one mask in each of its kinds of piece, for all cells of a tile.
+    """Open share of one mask in each of its kinds of piece, for all cells of a tile.
 
     `state` holds the mask's pixels with a halo; of `bias`, the growth of openings, only the sign counts; `kinds` are
     the states along either axis.

@@ -1,4 +1,4 @@
-"""What all tiles of a plate share: a process and its errors as the numbers that the physics needs."""
+"""A process and its errors as the numbers that all tiles of a plate share."""
 
 from dataclasses import fields
 from typing import NamedTuple
@@ -23,39 +23,24 @@ _BAND = 0.46  # waves per cell up to which second moments and their filters do
 
 
 class EtchParameters(NamedTuple):
-    """What all tiles share.
+    """Errors and depths as numbers."""
 
-    Attributes:
-        depth_m: `[mask]` depth of every etch.
-        shift_m: `[mask, (y, x)]` displacement of every mask at the middle of the DOE.
-        turn: `[mask]` rotation, radians.
-        growth: `[mask]` magnification.
-        bias_m: `[mask]` growth of openings per edge.
-        corner_m: radius of corners.
-        slope: tangent of the walls' angle.
-        lag: share of depth lost per depth over width.
-        bowl: uniformity: depth share per r² (metres²).
-        tilt: `[(y, x)]` depth share per metre.
-        rough_m: `[y, x]` height of the roughness, or None.
-        height_m: height of the blank surface above the deepest nominal floor.
-    """
-
-    depth_m: Array
-    shift_m: Array
-    turn: Array
-    growth: Array
-    bias_m: Array
-    corner_m: Array
-    slope: Array
-    lag: Array
-    bowl: Array
-    tilt: Array
-    rough_m: Array | None
-    height_m: Array
+    depth_m: Array  # `[mask]` depth of every etch
+    shift_m: Array  # `[mask, (y, x)]` displacement of every mask at the middle of the DOE
+    turn: Array  # `[mask]` rotation, radians
+    growth: Array  # `[mask]` magnification
+    bias_m: Array  # `[mask]` growth of openings per edge
+    corner_m: Array  # radius of corners
+    slope: Array  # tangent of the walls' angle
+    lag: Array  # share of depth lost per depth over width
+    bowl: Array  # uniformity: depth share per r² (metres²)
+    tilt: Array  # `[(y, x)]` depth share per metre
+    rough_m: Array | None  # `[y, x]` height of the roughness, or None
+    height_m: Array  # height of the blank surface above the deepest nominal floor
 
 
 class TilePlan(NamedTuple):
-    """What a compiled surface depends on besides its arrays. Hashable."""
+    """Static properties of a compiled surface. Hashable."""
 
     grid: Grid
     masks: int
@@ -78,7 +63,7 @@ _MOST, _TRACED_REACH = 8, 3
 
 
 def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> TilePlan:
-    """What has to be computed for these errors; everything that may be, where they are not known yet (`traced`)."""
+    """Plan the terms that these errors need; all of them, where the errors are not known yet (`traced`)."""
     grid = camera.grid
     reach = _TRACED_REACH
     cut = corners = walls = True
