@@ -20,7 +20,7 @@ def test_a_grid_that_just_samples_the_lens_is_accepted():
 
 
 def test_a_window_wider_than_the_padded_grid_is_refused():
-    with pytest.raises(InputError, match=r"sensor\.window.*three apertures"):
+    with pytest.raises(InputError, match=r"camera\.window.*three apertures"):
         plan_direct(make_camera(100, 0.1e-3, 8e-3, 2e-6, 200), YELLOW_M)
 
 
