@@ -56,16 +56,16 @@ def merge_exposures(
     dark_count: int = 1,
     names: Sequence[str] = (),
 ) -> MeasuredPsf:
-    """Merge exposures of the same scene into one image per unit of exposure.
+    """Merge exposures of the same scene, of any unit of time, into one image per unit of exposure.
 
     Args:
         frames: exposures of equal shape.
-        exposures: how long each was, in any unit.
+        exposures: their lengths.
         darks: for each a frame without light of the same length, or the level of black in counts.
         noise: gain and read noise.
         clipped_at: value from which a pixel is full; by default what each file says.
         dark_count: frames that every dark frame is the mean of.
-        names: what the frames are called in messages.
+        names: names of the frames in messages.
 
     Raises:
         InputError: frames or exposures that do not fit, or an image that is dark or saturated everywhere.
@@ -224,17 +224,14 @@ def cut_window(psf: MeasuredPsf, centre: tuple[float, float], window: int) -> tu
         raise InputError("image", rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
     corner = [place - (window - 1) / 2 for place in centre]
     starts = [round(place) for place in corner]
-    cut = MeasuredPsf(*(_square(values, starts, window) for values in psf))
-    return cut, (corner[0] - starts[0], corner[1] - starts[1])
-
-
-def _square(values: Any, starts: Sequence[int], window: int) -> Any:
-    out = np.zeros((window, window), values.dtype)
-    spans = [(max(start, 0), min(start + window, size)) for start, size in zip(starts, values.shape, strict=True)]
-    if all(low < high for low, high in spans):
-        (y0, y1), (x0, x1) = spans
-        out[y0 - starts[0] : y1 - starts[0], x0 - starts[1] : x1 - starts[1]] = values[y0:y1, x0:x1]
-    return out
+    # Rows and columns of the frame that lie in the window; none where it lies beyond.
+    spans = [slice(max(start, 0), max(start + window, 0)) for start in starts]
+    cut = [np.zeros((window, window), values.dtype) for values in psf]
+    for out, values in zip(cut, psf, strict=True):
+        part = values[spans[0], spans[1]]
+        y, x = (max(-start, 0) for start in starts)
+        out[y : y + part.shape[0], x : x + part.shape[1]] = part
+    return MeasuredPsf(*cut), (corner[0] - starts[0], corner[1] - starts[1])
 
 
 def binned(psf: MeasuredPsf, factor: int) -> MeasuredPsf:

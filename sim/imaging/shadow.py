@@ -34,20 +34,16 @@ def shadow(
     point: Point,
     border: Border = "edge",
 ) -> Complex[np.ndarray, "y x"]:
-    """Field that reaches every DOE cell past an obstruction, over the field without it.
+    """Field `[y, x]` that reaches every DOE cell past an obstruction, over the field without it.
 
     Args:
         camera: lens, sensor and grid.
         mask: `[y, x]` blocked share of every pixel of the view, the middle of the view in the middle of the array.
         depth_m: distance of the obstruction, metres.
-        background_depth_m: distance of the scene point, metres, beyond the obstruction (else a ValueError); `inf`
-            allowed.
+        background_depth_m: distance of the scene point behind it, metres; `inf` allowed.
         wavelength_m: wavelength, metres.
         point: where in the view the scene point is, pixels (row, column), as indices of the mask.
         border: whether the outermost pixels of the mask go on for ever ("edge") or nothing lies beyond them ("zero").
-
-    Returns:
-        `[y, x]` complex ratio at the cell centres, 1 where nothing is in the way.
     """
     if not 0 < depth_m < background_depth_m:
         raise ValueError(f"`depth_m` must lie from 0 to the background's {background_depth_m}, but got {depth_m}")

@@ -112,7 +112,8 @@ def corners(
             at = 2 * k + opening
             # Light gained where this mask's etch is missing from an opening, or added to a gap: factor - 1.
             phase = 2 * jnp.pi * (2 * opening - 1) * rates * relief.depth_m[k]
-            gain = Pair(jnp.cos(phase) - 1, jnp.sin(phase)).each(lambda part, a=amounts[at]: part[:, None] * a[:, None])
+            turn = jnp.cos(phase) - 1, jnp.sin(phase)
+            gain = Pair(*(part[:, None] * amounts[at][:, None] for part in turn))
             gained = changed.times(gain).times(Pair(found[at, :, 0], found[at, :, 1]))
             points = point_moments(axis_values(ys[at], plan.parts), axis_values(xs[at], plan.parts))
             total = total + jnp.stack([summed(points, part, kept=2) for part in gained], axis=1)

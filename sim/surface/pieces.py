@@ -4,7 +4,6 @@ Complex numbers are kept as real and imaginary parts here, and sums over pieces 
 what compiles to fast loops.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -96,10 +95,6 @@ class Pair(NamedTuple):
     def plus(self, other: "Pair", factor: Array) -> "Pair":
         """Sum with a multiple."""
         return Pair(self.real + factor * other.real, self.imaginary + factor * other.imaginary)
-
-    def each(self, work: Callable[..., Array]) -> "Pair":
-        """The same done to both parts."""
-        return Pair(work(self.real), work(self.imaginary))
 
 
 def summed(weights: Float[Array, "m ..."], values: Float[Array, "..."], kept: int = 3) -> Float[Array, "m ..."]:

@@ -155,4 +155,4 @@ def require_possible(grid: Grid, process: Process, variation: Variation) -> None
             raise InputError(f"variation.{name}", rule, format_length(value), cure)
     if not 0 <= variation.sidewall_rad < np.pi / 4:
         rule = "must lie between 0 and 45 degrees from the vertical"
-        raise InputError("variation.sidewall", rule, f"{np.degrees(variation.sidewall_rad):.3g} deg", "Give another angle.")
+        raise InputError("variation.sidewall", rule, f"{np.degrees(variation.sidewall_rad):.3g} deg", "Correct it.")
