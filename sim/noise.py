@@ -8,17 +8,14 @@ powers of 1 / sqrt(mean) with a standard normal w, and rounded down:
     x = mean + sqrt(mean) w + (w^2 + 2) / 6 - w (w^2 + 2) / (72 sqrt(mean)) + (3 w^4 + 7 w^2 - 16) / (810 mean)
         + w (2684 - 548 w^2 - 207 w^4) / (155520 mean^(3/2))
 
-At a mean of 8 the total variation distance to the Poisson distribution is 7.1e-5 and it falls like 1 / mean^2: of a
-hundred thousand counts, seven are not what they should be. Mean and variance are off by less than 2e-5 of themselves.
-Tails rarer than 1e-7 are cut, as they are for normal draws in single precision.
+The first terms: M. B. Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function",
+ACM TOMS 42 (2016); the last one follows from the same differential equation, dx/dmean = g dx/dw / phi(w), with g the
+Poisson weight at x - 1 and phi the normal density. At a mean of 8 the total variation distance to the Poisson
+distribution is 7.1e-5 and it falls like 1 / mean^2; mean and variance are off by less than 2e-5 of themselves. Tails
+rarer than 1e-7 are cut, as they are for normal draws in single precision.
 
 **Gradients.** A draw n of mean x and variance v(x) is taken for x + sqrt(v(x)) z with a fixed z, so dn/dx is
 1 + (n - x) v'(x) / (2 v(x)). The value itself stays the draw, to the last bit.
-
-References:
-    The first terms of the expansion: M. B. Giles, "Algorithm 955: approximation of the inverse Poisson cumulative
-    distribution function", ACM TOMS 42 (2016). The last one follows from the same differential equation,
-    dx/dmean = g dx/dw / phi(w), with g the Poisson weight at x - 1 and phi the normal density.
 """
 
 import equinox as eqx

@@ -8,37 +8,36 @@ whatever the DOE does; what is left lands by the far PSF, and the obstruction's 
     I = p_near ∗ (M · I_obs) + p_far ∗ ((1 - d ∗ M) · I_far)
 
 With several obstructions every layer loses to each nearer one by that one's own disc, and the passed shares are
-multiplied. That takes shadows in one bundle as independent: exact where they do not meet, and on average otherwise. The
+multiplied, as if shadows in one bundle were independent: exact where they do not meet, and on average otherwise. The
 second approximation is that a partly blocked pupil has the PSF of the open one, only weaker. So a uniform world stays
 uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with others its *energy* does.
 
-`reciprocal` does without that for the wide part of the PSF. In even light the picture is known exactly, by
-reciprocity: what a dark bar takes is what a bright one would send, p_near ∗ M. The sharp spot of the far PSF, in
-contrast, comes from every part of the aperture alike, so it dims by the shadow of each single point. Every part of the
-obstruction stands before a disc of the background, d ∗ I_far in the mean, so that it takes T = M · (d ∗ I_far), and
+`reciprocal` needs no such thing for the wide part of the PSF. In even light the picture is known exactly, by
+reciprocity: what a dark bar takes is what a bright one would send, p_near ∗ M. The sharp spot of the far PSF comes from
+every part of the aperture alike, so it dims by the shadow of each single point. Every part of the obstruction stands
+before a disc of the background, d ∗ I_far in the mean, so that it takes T = M · (d ∗ I_far), and
 
     I = p_far ∗ I_far + p_near ∗ (M · I_obs - T) + p_spot ∗ (d ∗ T - (d ∗ M) · I_far),
 
 where p_spot is the middle of p_far. As much light is lost as in `radiometric`, and for a lens alone the two are equal;
-a uniform world stays uniform for every plate. Where a window holds another share of p_near than of p_far, T lands
-scaled to the energy of p_far, so that an even light behind a cover is gone. What is taken from a bright point's halo is
-taken a little aside of where it lands, which may leave light slightly below zero.
+a uniform world stays uniform for every plate. T lands scaled to the energy of p_far in its window, so that an even
+light behind a cover is gone. What is taken from a bright point's halo is taken a little aside of where it lands, which
+may leave light slightly below zero.
 
 `paper` is eq. 10 as printed, with α = p_obs ∗ M for every colour:
 
     I = α ⊙ (p_obs ∗ I_obs) + (1 - α) ⊙ (p_far ∗ I_far)
 
-α is a share, and the paper's PSFs have unit sum, so it is divided by the energy of p_obs in its window (a cover over
-everything must not let the background through); the light itself keeps the PSFs' energies. Eq. 10 passes light that
-never reaches the aperture: with the paper's plate half the light of points that are completely hidden. In even light
-it is exact, too.
+α is a share and is divided by the energy of p_obs in its window; the light itself keeps the PSFs' energies. Eq. 10
+passes light that never reaches the aperture: with the paper's plate half the light of points that are completely
+hidden. In even light it is exact, too.
 
 `paper_release` is what the public code does: every PSF scaled to unit sum, α = clamp(1.5 · p_obs ∗ M, 0, 1).
 
 Under both, `outside` says what I_obs holds where there is no obstruction, which eq. 10 leaves open: the scene behind
 (the public code for dirt and fences) or nothing (for raindrops). Several obstructions are laid over each other from the
-farthest to the nearest. `sim.imaging.shadow` judges all of them, and examples/compare_occlusion.py shows by how much
-each is off for a plate. Say which model was used wherever a result is shown; none is a default.
+farthest to the nearest. `sim.imaging.shadow` judges all models, and examples/compare_occlusion.py shows by how much
+each is off for a plate. Say which one was used wherever a result is shown; none is a default.
 """
 
 from collections.abc import Callable, Sequence

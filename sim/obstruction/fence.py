@@ -115,7 +115,7 @@ class Fence(WithLimits):
         mask = np.zeros(view.shape, np.float32)
         shade = np.zeros(view.shape, np.float32)
         for family in wires:
-            cover, light = seen(family, plane, wire_m, view, lamp)
+            cover, light = seen(family, plane, wire_m, lamp)
             mask, shade = cover + (1 - cover) * mask, cover * light + (1 - cover) * shade
         colour = self.colour(rng)
         # The light of what covers a pixel, not that times its coverage.
@@ -248,7 +248,7 @@ def zigzags(u: Pixels, v: Pixels, mesh_m: float, diamond_rad: float, wire_m: flo
     return found[0], found[1]
 
 
-def seen(wires: _Wires, plane: _Plane, wire_m: float, view: CameraView, lamp: _Lamp) -> tuple[Pixels, Pixels]:
+def seen(wires: _Wires, plane: _Plane, wire_m: float, lamp: _Lamp) -> tuple[Pixels, Pixels]:
     """Coverage and light of a family of wires.
 
     Distances are turned into pixels by the gradient of the distance over the frame, which is that of the plane's

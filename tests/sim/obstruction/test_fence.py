@@ -81,7 +81,7 @@ def test_chain_link_is_a_lattice_of_diamonds():
 def test_a_tilted_fence_is_denser_but_its_wires_are_as_thick():
     mesh_m, wire_m, tilt = 40 * VIEW.pixel_at_m(0.5), 6 * VIEW.pixel_at_m(0.5), radians(50)
     plane = tilted_plane(VIEW, 0.5, tilt, 0.0)
-    mask, _ = seen(rods(plane.u, mesh_m, along_u=False), plane, wire_m, VIEW, LAMP)
+    mask, _ = seen(rods(plane.u, mesh_m, along_u=False), plane, wire_m, LAMP)
     row = mask[128]
     middles = np.flatnonzero((np.diff((row > 0.5).astype(int))) == 1)
     near_axis = middles[np.abs(middles - 256) < 90]
@@ -99,13 +99,13 @@ def test_a_wire_is_lit_as_a_cylinder():
     plane = tilted_plane(VIEW, 0.5, 0.0, 0.0)
     off = np.broadcast_to(np.linspace(-12, 12, 512, dtype=np.float32) * VIEW.pixel_at_m(0.5), VIEW.shape)
     wires = _Wires(off.astype(np.float32), 1.0, 0.0)
-    _, light = seen(wires, plane, 20 * VIEW.pixel_at_m(0.5), VIEW, LAMP)
+    _, light = seen(wires, plane, 20 * VIEW.pixel_at_m(0.5), LAMP)
     across = np.linspace(-12, 12, 512) / 10
     expected = 0.25 + 0.75 * np.sqrt(np.maximum(1 - across**2, 0))
     # float32, under a square root near the edge.
     np.testing.assert_allclose(light[0], expected, atol=2e-3)
     # From +x, the side at +x is bright.
-    _, light = seen(wires, plane, 20 * VIEW.pixel_at_m(0.5), VIEW, _Lamp(0.0, 1.0, 0.0, 1.0, 0.25))
+    _, light = seen(wires, plane, 20 * VIEW.pixel_at_m(0.5), _Lamp(0.0, 1.0, 0.0, 1.0, 0.25))
     assert light[0, 400] > 0.5
     assert light[0, 100] == pytest.approx(0.25)
 
