@@ -1,7 +1,7 @@
 """Optimisation of a spec into a design, in memory or in a run folder."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,6 @@ from sim.psf_bank import psf
 from sim.transfer import mtf
 
 log = logging.getLogger("doedesign")
-Save = Callable[[OptimizationState, Sequence[Mapping[str, Any]]], None]
 
 
 def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, overrides: Sequence[str] = ()) -> Design:
@@ -90,7 +89,7 @@ def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Se
         problem, sources = problem_of(spec, files)
         state, history = _resume(run, problem, sources, files)
         begin_run(run)
-        state, history = _iterate(problem, sources, spec, state, history, _saving(run))
+        state, history = _iterate(problem, sources, spec, state, history, run)
         log.info("evaluating the design")
         design = finished_design(spec, problem, state, history)
         if spec.process.chooses_depths:
@@ -120,30 +119,23 @@ def _resume(
     return OptimizationState(parameters, adam, step), history
 
 
-def _saving(run: Run) -> Save:
-    """Keep a checkpoint every so many steps, and after the last one."""
-
-    def save(state: OptimizationState, history: Sequence[Mapping[str, Any]]) -> None:
-        if state.step % run.spec.optimize.checkpoint_every == 0 or state.step == run.spec.optimize.steps:
-            arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.parameters, state.adam))]
-            save_checkpoint(run, arrays, state.step, history)
-
-    return save
-
-
 def _iterate(
     problem: Problem,
     sources: SourceSet,
     spec: Spec,
     state: OptimizationState,
     history: list[dict[str, Any]],
-    save: Save = lambda *_: None,
+    run: Run | None = None,
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    with meter("optimising", spec.optimize.steps, state.step) as progress:
+    """Do the steps that are left; in a run, keep a checkpoint every so many, and after the last one."""
+    last, every = spec.optimize.steps, spec.optimize.checkpoint_every
+    with meter("optimising", last, state.step) as progress:
         for state, record in steps(spec, problem, sources, state):  # noqa: B020 - the last state is the result
             history.append(record)
             progress.advance(state.step, f"loss {record['loss']:.4f}")
-            save(state, history)
+            if run is not None and (state.step % every == 0 or state.step == last):
+                arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.parameters, state.adam))]
+                save_checkpoint(run, arrays, state.step, history)
     return state, history
 
 

@@ -54,24 +54,11 @@ def tolerance(
     if draw is not None:
         print_text(_one_draw(run, draw, json_, **settings, scheduler=scheduler).rstrip())
         return
-    from doedesign.runs.folder import open_run
     from doedesign.tolerancing.results import tolerance as study
 
-    opened = open_run(run)
-    folder = out or opened.path("tolerance")
-    study(
-        opened,
-        **settings,
-        draws=draws,
-        sensitivity=sensitivity,
-        sobol=sobol,
-        corners=corners,
-        budget=budget,
-        wanted=yield_,
-        out=folder,
-        workers=workers,
-        scheduler=scheduler,
-    )
+    folder = out or run / "tolerance"
+    settings |= {"draws": draws, "sensitivity": sensitivity, "sobol": sobol, "corners": corners, "budget": budget}
+    study(run, **settings, wanted=yield_, out=folder, workers=workers, scheduler=scheduler)
     print_results(folder, json_, results=str(folder / "results.json"))
 
 
@@ -146,15 +133,12 @@ def calibrate(
         got = "neither" if measurement is None else "both"
         cure = "Give the measurement's TOML file, or --ring-to-disc with --probe and --depth."
         raise InputError("calibrate", "must be given a measurement or a ring:disc ratio", got, cure)
-    from doedesign.runs.folder import open_run
-
-    opened = open_run(run)
     if measurement is not None:
         from doedesign.calibration.estimate import calibrate as fit
 
-        folder = out or opened.path("calibration")
+        folder = out or run / "calibration"
         settings = {"process": process, "masks": masks, "evaluations": evaluations, "polish": polish, "seed": seed}
-        result = fit(opened, measurement, errors, **settings, out=folder)
+        result = fit(run, measurement, errors, **settings, out=folder)
         estimate = str(folder / "process-estimate.toml")
         print_results(folder, json_, estimate=estimate, explained=result.explained)
         return
@@ -162,18 +146,17 @@ def calibrate(
 
     lengths = {}
     for option, text, example in (("--probe", probe, "520 nm"), ("--depth", depth, "10 cm")):
+        cure = f'For example {option} "{example}".'
         if text is None:
-            raise InputError(
-                option, "must be given with --ring-to-disc", "nothing", f'For example {option} "{example}".'
-            )
+            raise InputError(option, "must be given with --ring-to-disc", "nothing", cure)
         lengths[option] = length_of(option, text)
         if not lengths[option] > 0:
-            raise InputError(option, "must be positive", text, f'For example {option} "{example}".')
+            raise InputError(option, "must be positive", text, cure)
     if throughput is not None and not 0 < throughput <= 1:
         raise InputError("--throughput", "must be a share of the light, above 0 and up to 1", throughput, "Write 0.86.")
     if not (throughput_sigma > 0 and reach > 0):
         raise InputError("--throughput-sigma, --reach", "must be positive", (throughput_sigma, reach), "Correct them.")
     targets = Targets(lengths["--probe"], lengths["--depth"], ring_to_disc or 0.0, throughput, throughput_sigma)
-    folder = out or opened.path("explanations")
-    explain_ratio(opened, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
+    folder = out or run / "explanations"
+    explain_ratio(run, targets, errors, process=process, masks=masks, pairs=pairs, reach=reach, out=folder)
     print_results(folder, json_)

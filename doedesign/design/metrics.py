@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import binary_erosion
 
 from doedesign.design.objectives import Term
 from doedesign.design.patterns import spot_centres_m
@@ -55,7 +56,10 @@ def pattern_metrics(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term
         else:
             area = target > target.max() / 2
             efficiency = far[area].sum(dtype=np.float64)
-            inner = far[_eroded(area, airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m)]
+            radius = airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m
+            reach = int(np.ceil(radius))
+            disc = radius_map_m((2 * reach + 1, 2 * reach + 1), 1.0) <= radius
+            inner = far[binary_erosion(area, disc)]
             uniformity = 1 - inner.std() / inner.mean() if inner.size and inner.mean() > 0 else 0.0
         rows.append({"efficiency": float(efficiency), "uniformity": float(uniformity)})
     return rows
@@ -68,11 +72,3 @@ def _spot_energies(camera: Camera, psf: Float[np.ndarray, "y x"], options: Any) 
     return np.array(
         [psf[np.hypot(axis[:, None] - y, axis[None, :] - x) <= radius].sum(dtype=np.float64) for y, x in centres]
     )
-
-
-def _eroded(area: Float[np.ndarray, "y x"] | np.ndarray, radius: float) -> np.ndarray:
-    from scipy.ndimage import binary_erosion
-
-    reach = int(np.ceil(radius))
-    disc = radius_map_m((2 * reach + 1, 2 * reach + 1), 1.0) <= radius
-    return binary_erosion(area, disc)

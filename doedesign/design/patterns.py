@@ -46,12 +46,12 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
     centres = spot_centres_m(count, positive_length(options.get("spacing"), f"{where}: spacing"))
     axis = camera.axis_m()
     if np.abs(centres).max() > axis[-1]:
-        raise InputError(
-            f"{where}: spacing",
-            f"spots must lie within the window, {2 * axis[-1] * 1e3:.4g} mm",
+        rule = f"spots must lie within the window, {2 * axis[-1] * 1e3:.4g} mm"
+        got, cure = (
             f"{2 * np.abs(centres).max() * 1e3:.4g} mm",
-            "Use fewer or closer spots, or a larger sensor.window.",
+            "Use fewer or closer spots, or a larger window.",
         )
+        raise InputError(f"{where}: spacing", rule, got, cure)
     zero = airy_radius_m(camera, camera.colours[0].wavelengths_m[0])
     image = np.zeros((camera.window, camera.window))
     for y, x in centres:

@@ -135,12 +135,9 @@ def _process(spec: Spec) -> Iterator[InputError]:
     die_m, radius_m = process.die_m or (0.0, 0.0), process.wafer_radius_m or math.inf
     reach_m = math.hypot(*die_m) + spec.doe.aperture_m / 2
     if reach_m > radius_m:
-        yield InputError(
-            "process.die",
-            f"the DOE must lie on the wafer of radius {format_length(radius_m)}",
-            f"a DOE that reaches {_rounded(reach_m)} from its middle",
-            "Move the die inward or choose a larger process.wafer_radius.",
-        )
+        rule = f"the DOE must lie on the wafer of radius {format_length(radius_m)}"
+        cure = "Move the die inward or choose a larger process.wafer_radius."
+        yield InputError("process.die", rule, f"a DOE that reaches {_rounded(reach_m)} from its middle", cure)
 
 
 def _limits(spec: Spec) -> Iterator[InputError]:

@@ -121,14 +121,12 @@ def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
     optics = raw.get("optics")
     if isinstance(optics, Mapping) and "colours" not in optics:
         key = _COLOURS_KEY.sub(r"optics.wavelengths\1", key)
-    found = _SIGMA_KEY.match(key)
-    return f"{found[1]}{found[3]}" if found and not _is_table(raw, "process", "errors", found[2]) else key
-
-
-def _is_table(raw: Any, *keys: str) -> bool:
-    for key in keys:
-        raw = raw.get(key) if isinstance(raw, Mapping) else None
-    return isinstance(raw, Mapping)
+    if not (found := _SIGMA_KEY.match(key)):
+        return key
+    spread: Any = raw
+    for part in ("process", "errors", found[2]):
+        spread = spread.get(part) if isinstance(spread, Mapping) else None
+    return key if isinstance(spread, Mapping) else f"{found[1]}{found[3]}"
 
 
 def _value_text(value: object) -> str:

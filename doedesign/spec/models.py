@@ -108,10 +108,8 @@ class OpticsSpec(SpecTable, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _spread_wavelengths(cls, table: Any, info: ValidationInfo) -> Any:
-        if info.context != FROM_TOML or not isinstance(table, dict) or "wavelengths" not in table:
-            return table
-        if "colours" in table:
-            return table  # the short form is then reported as a key too many
+        if info.context != FROM_TOML or not isinstance(table, dict) or "wavelengths" not in table or "colours" in table:
+            return table  # beside colours, the short form is reported as a key too many
         colours = table["wavelengths"]
         if isinstance(colours, list):
             colours = [{"name": _colour_name(w, i), "wavelengths": [w]} for i, w in enumerate(colours)]

@@ -21,7 +21,7 @@ from pydantic import (
 )
 
 from doedesign.spec.table import SpecTable, optional
-from doedesign.spec.values import ColourName, FarDepth, NotNegative, angle, broken, known, length, share
+from doedesign.spec.values import ColourName, FarDepth, NotNegative, bounded, broken, known, length, share
 from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK
 from fab.units import MM, NM, UM
@@ -81,8 +81,7 @@ class SpreadSpec(SpecTable, frozen=True):
 
 def quantity_of(error: Deviation, low: float, high: float) -> Any:
     """Type of a value of an error between two bounds, SI units."""
-    of_unit = {"1": share, "m": length, "rad": angle}[error.unit]
-    return Annotated[float, of_unit(low, high)]
+    return Annotated[float, share(low, high) if error.unit == "1" else bounded(error.unit, low, high)]
 
 
 def _spread_type(name: str, error: Deviation) -> type[SpreadSpec]:

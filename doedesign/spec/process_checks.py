@@ -59,12 +59,10 @@ def _one_value_per_mask(process: ProcessSpec) -> Iterator[InputError]:
         for part in ("mean", "sigma"):
             values = getattr(spread, part)
             if isinstance(values, tuple) and len(values) != process.masks:
-                yield InputError(
-                    f"process.errors.{toml_key(name)}.{part}",
-                    f"must have one entry per mask, {process.masks} for {process.levels} levels",
-                    f"a list of {len(values)}",
-                    "Add or remove entries, or give one value for all masks.",
-                )
+                key = f"process.errors.{toml_key(name)}.{part}"
+                rule = f"must have one entry per mask, {process.masks} for {process.levels} levels"
+                cure = "Add or remove entries, or give one value for all masks."
+                yield InputError(key, rule, f"a list of {len(values)}", cure)
 
 
 def variation_problems(file: VariationFile) -> Iterator[InputError]:

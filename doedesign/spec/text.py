@@ -1,17 +1,17 @@
 """Specs, processes and variations as text: canonical JSON with SI numbers for machines, TOML with units for people."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process import ProcessSpec, SpreadSpec
 from doedesign.spec.table import SpecTable, toml_key
-from doedesign.spec.values import angle_text
+from doedesign.spec.values import UNITS
 from doedesign.spec.variation import ProcessFile, variation_file
 from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
-from fab.units import format_length, parse_angle, parse_length
 
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
@@ -72,17 +72,14 @@ def _text(name: str, value: Any) -> str:
         return f"{{ {', '.join(f'{toml_key(key)} = {_text(key, part)}' for key, part in value.given().items())} }}"
     if isinstance(value, str):
         return _value_text(value)
-    if name.endswith("_m"):
-        return '"inf"' if value == float("inf") else _quantity_text(value, "m", format_length, parse_length)
-    if name.endswith("_rad"):
-        return _quantity_text(value, "rad", angle_text, parse_angle)
+    if value == math.inf:
+        return '"inf"'
+    for unit, (_, parse, write) in UNITS.items():
+        if name.endswith(f"_{unit}"):
+            text = write(value)
+            # Twelve digits are for people; a number with more of them is written in full.
+            return f'"{text}"' if parse(text) == value else f'"{value!r} {unit}"'
     return _value_text(value)
-
-
-def _quantity_text(value: float, unit: str, write: Callable[[float], str], parse: Callable[[str], float]) -> str:
-    text = write(value)
-    # Twelve digits are for people; a number with more of them is written in full.
-    return f'"{text}"' if parse(text) == value else f'"{value!r} {unit}"'
 
 
 def _value_text(value: Any) -> str:

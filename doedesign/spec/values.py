@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
 from pydantic_core import PydanticCustomError
@@ -57,15 +57,8 @@ def angle_text(angle_rad: float) -> str:
     return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
 
 
-class _Unit(NamedTuple):
-    name: str
-    plural: str
-    parse: Callable[[str], float]
-    format: Callable[[float], str]
-
-
-_LENGTH = _Unit("m", "metres", parse_length, format_length)
-_ANGLE = _Unit("rad", "radians", parse_angle, angle_text)
+# Name, reader and writer of the quantities of a spec by their SI unit.
+UNITS = {"m": ("metres", parse_length, format_length), "rad": ("radians", parse_angle, angle_text)}
 
 
 def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
@@ -74,29 +67,32 @@ def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
     return f"must lie between {text(low)} and {text(high)}"
 
 
-def _read(unit: _Unit, value: Any, context: Any) -> float:
+def _read(unit: str, value: Any, context: Any) -> float:
     """A quantity as text with a unit in TOML, as a number in SI units otherwise."""
+    plural, parse, _ = UNITS[unit]
     if context != FROM_TOML:
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
-        raise broken(f"must be a number of {unit.plural}", "Give a number.")
+        raise broken(f"must be a number of {plural}", "Give a number.")
     try:
-        parsed = unit.parse(value)
+        parsed = parse(value)
     except ValueError as error:
         raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
     number, _, name = value.strip().partition(" ")
     # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
-    return float(number) if name.strip() == unit.name else parsed
+    return float(number) if name.strip() == unit else parsed
 
 
-def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
+def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
+    """Return the validator of a quantity between two bounds in its SI unit, "m" or "rad"; "inf" may be allowed."""
+
     def validate(value: Any, info: ValidationInfo) -> float:
         if infinite and (value == "inf" or (value == math.inf and info.context != FROM_TOML)):
             return math.inf
         number = _read(unit, value, info.context)
         slack = 1e-12  # a bound itself, rounded on its way from text, is inside
         if not low - slack * abs(low) <= number <= high + slack * abs(high):
-            rule = _range_rule(low, high, unit.format) + (', or be "inf"' if infinite else "")
+            rule = _range_rule(low, high, UNITS[unit][2]) + (', or be "inf"' if infinite else "")
             raise broken(rule, "Check the unit.")
         return number
 
@@ -105,12 +101,7 @@ def _bounded(unit: _Unit, low: float, high: float, *, infinite: bool = False) ->
 
 def length(low_m: float, high_m: float, *, infinite: bool = False) -> BeforeValidator:
     """Return the validator of a length between two bounds, metres; "inf" may be allowed."""
-    return _bounded(_LENGTH, low_m, high_m, infinite=infinite)
-
-
-def angle(low_rad: float, high_rad: float) -> BeforeValidator:
-    """Return the validator of an angle between two bounds, radians."""
-    return _bounded(_ANGLE, low_rad, high_rad)
+    return bounded("m", low_m, high_m, infinite=infinite)
 
 
 def share(low: float, high: float) -> BeforeValidator:
