@@ -49,6 +49,7 @@ _OPTIONS = {
     "have the level map repaired": "take --on-violation fix",
     "take the mesh alone": "take the mesh alone (--mesh-patch)",
     "also `variation`": "also --variation",
+    "Train one (`doedesign.train`)": "Train one with doedesign train RUN --images DIR",
     "or its masks.": "or its masks (--order).",
     "Give `obstruction`,": "Add [obstruction] to the spec, or give --obstruction,",
     "Give `occlusion`:": "Add occlusion to [scene], or give --occlusion:",
