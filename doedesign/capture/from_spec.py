@@ -136,8 +136,10 @@ def _parameter(field: Field[Any], value: Any, where: str) -> Any:
 
 def _parsed(name: str, value: Any, where: str) -> Any:
     """A length or an angle, as the ending of its name says, in SI; anything else as it is."""
+    if not name.endswith(("_m", "_rad")):
+        return value
     try:
-        return parse_length(value) if name.endswith("_m") else parse_angle(value) if name.endswith("_rad") else value
+        return parse_length(value) if name.endswith("_m") else parse_angle(value)
     except ValueError as error:
         rule, _, got = str(error).partition(", but got ")
         raise InputError(where, rule, got, "Write the unit inside the quotes.") from error

@@ -30,18 +30,8 @@ def write_image(
 ) -> dict[str, Any]:
     """Write one image of an item, and describe it for JSON.
 
-    Args:
-        folder: where to.
-        name: its name without ending.
-        image: `[c, y, x]` values, row 0 at the lowest y.
-        channels: a name for each, such as R, G and B.
-        what: a few words on it.
-        png: write 16-bit PNG, which holds one channel or three, instead of EXR.
-        full_scale: in a PNG, the value (or with `inverse`, its inverse) of the highest count.
-        inverse: in a PNG, store inverses.
-
-    Returns:
-        "file", "what" and "channels"; of a PNG "full_scale", the value of 65535 counts, and "inverse" if it is so.
+    Values `[c, y, x]` with a name for each channel go into an EXR, or into a 16-bit PNG, which holds one channel or
+    three. `full_scale` is the value (or with `inverse`, its inverse) of a PNG's highest count.
 
     Raises:
         InputError: the system refuses the path.

@@ -73,8 +73,8 @@ class Pictures:
         files: the picture files.
         most_px: pixels that the shorter side of a picture may keep.
         budget_bytes: memory that decoded pictures may take.
-        skipped: why each file that cannot be used was skipped.
-        decodings: how often a file was decoded.
+        skipped: why each file was skipped that cannot be used.
+        decodings: number of decodings.
     """
 
     files: tuple[Path, ...]

@@ -46,12 +46,9 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneData:
-    """Source of scenes. An epoch shows every picture once.
+    """Source of scenes: pictures behind a kind of obstruction within a frame. An epoch shows every picture once.
 
     Attributes:
-        pictures: the pictures.
-        kind: obstruction before them.
-        view: the frame.
         far_m: least and greatest distance of the background, drawn evenly in 1/z; `inf` allowed.
         seed: seed of everything.
         batch: scenes per batch.

@@ -84,7 +84,10 @@ class SimulatedCapture:
         """Draw scene, conventional capture, capture with the DOE, and mask side by side; return the figure."""
         y, x = self.mask.shape
         pictures = {"scene": self.clean, "conventional camera": self.conventional, "camera with the DOE": self.doe}
-        with panels(ax, (10.0, 2.5 * y / x + 0.9), note=self._words(), layout="compressed") as figure:
+        near, far = length_text(self.depth_near_m), length_text(self.depth_far_m)
+        covered = 100 * self.mask.mean(dtype=np.float64)
+        words = f"{self.name}: {covered:.0f} % covered at {near}, scene at {far}; occlusion model {self.occlusion}"
+        with panels(ax, (10.0, 2.5 * y / x + 0.9), note=words, layout="compressed") as figure:
             *shown, last = figure.subplots(1, 4)
             for axes, (title, light) in zip(shown, pictures.items(), strict=True):
                 display = np.broadcast_to(np.clip(srgb_from_linear(self.rgb(light)), 0, 1), (3, y, x))
@@ -95,11 +98,6 @@ class SimulatedCapture:
             for axes in (*shown, last):
                 bare(axes)
         return figure
-
-    def _words(self) -> str:
-        near, far = length_text(self.depth_near_m), length_text(self.depth_far_m)
-        covered = 100 * self.mask.mean(dtype=np.float64)
-        return f"{self.name}: {covered:.0f} % covered at {near}, scene at {far}; occlusion model {self.occlusion}"
 
     def _repr_html_(self) -> str:
         y, x = self.mask.shape

@@ -84,14 +84,7 @@ class NetworkShape:
 
 
 class Block(eqx.Module):
-    """Convolution, instance normalisation, leaky ReLU.
-
-    Attributes:
-        weights: `[y, x, input, output]`.
-        bias: `[output]`, where nothing is normalised; a normalisation would take it away.
-        stride: step of the convolution.
-        act: whether the leaky ReLU follows.
-    """
+    """Convolution, instance normalisation or a bias (which a normalisation would take away), leaky ReLU if `act`."""
 
     weights: Float[Array, "ky kx i o"]
     bias: Float[Array, " o"] | None
@@ -138,12 +131,7 @@ class Scale(eqx.Module):
 
 
 class UpBlock(eqx.Module):
-    """From one scale to the next finer one.
-
-    Attributes:
-        weights: `[input, 2, 2, output]` of the transposed convolution.
-        join: the block that joins what comes from below with this scale's features.
-    """
+    """From one scale to the next finer one: a transposed convolution, joined with the features of that scale."""
 
     weights: Float[Array, "i 2 2 o"]
     join: Block

@@ -81,12 +81,9 @@ def _finite(photo: Photo) -> Photo:
 
 
 def write_reconstruction(path: str | Path, display: Float[np.ndarray, "c y x"], bits: int | None = 16) -> None:
-    """Write a picture of display values; the file appears whole or not at all.
+    """Write a picture of three colours or one, given in display values; the file appears whole or not at all.
 
-    Args:
-        path: the file. EXR, and TIFF where `bits` is None, get linear light; the rest gets display values, clipped.
-        display: `[c, y, x]` display values, 0 to 1; three colours or one.
-        bits: 8 or 16, for PNG and TIFF; None for floats.
+    PNG and TIFF get display values of 8 or 16 bits, clipped; EXR, and TIFF where `bits` is None, linear floats.
 
     Raises:
         InputError: another ending, or the system refuses the path.

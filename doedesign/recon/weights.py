@@ -49,13 +49,7 @@ def camera_facts(camera: Camera, near_m: Sequence[float]) -> dict[str, Any]:
 
 
 def write_network(path: str | Path, network: Network, about: Mapping[str, Any], *, half: bool = False) -> None:
-    """Write a network.
-
-    Args:
-        path: the file; its folder is made if missing.
-        network: the network.
-        about: its camera and training, for JSON; see the top of this file.
-        half: store float16.
+    """Write a network and, for JSON, its camera and training (see the top of this file); in float16 if `half`.
 
     Raises:
         InputError: a weight is not finite (or too large for float16), or the system refuses the path.

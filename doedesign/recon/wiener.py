@@ -19,12 +19,9 @@ from jaxtyping import Array, Complex, Float
 
 
 class Blur(NamedTuple):
-    """A PSF as images of one scale show it.
+    """A PSF as images of one scale show it: its transform, and tapers.
 
-    Attributes:
-        transfer: `[b, c, y, fx]` transform of the PSF, unit sum unless said otherwise.
-        taper_y: `[b, c, y]` share of a row that is its own and not the opposite row's, one half at both ends.
-        taper_x: `[b, c, x]` the same for columns.
+    A taper is the share of a row (of a column) that is its own and not the opposite one's, one half at both ends.
     """
 
     transfer: Complex[Array, "b c y fx"]

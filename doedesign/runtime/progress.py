@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 _INTERVAL_S = 10.0
 
@@ -37,11 +38,11 @@ class Meter:
 
 
 class _BarMeter(Meter):
-    def __init__(self, bar: object, task: object) -> None:
+    def __init__(self, bar: Any, task: Any) -> None:
         self._bar, self._task = bar, task
 
     def advance(self, done: int, note: str = "") -> None:
-        self._bar.update(self._task, completed=done, note=note)  # pyright: ignore[reportAttributeAccessIssue]
+        self._bar.update(self._task, completed=done, note=note)
 
 
 def _duration_text(seconds: float) -> str:
@@ -54,13 +55,7 @@ def _duration_text(seconds: float) -> str:
 
 @contextmanager
 def meter(title: str, total: int, start: int = 0) -> Iterator[Meter]:
-    """Show the progress of a piece of work on stderr.
-
-    Args:
-        title: its name.
-        total: number of pieces.
-        start: pieces that were done before (a resumed run).
-    """
+    """Show the progress of work of `total` pieces, `start` of them done before, on stderr."""
     if not sys.stderr.isatty():
         yield Meter(title, total, start)
         return

@@ -74,13 +74,8 @@ class Rates(NamedTuple):
 class Trainer(eqx.Module):
     """All that does not change from step to step. `Trainer.of` makes one.
 
-    Attributes:
-        doe: the DOE that training looks through.
-        perceptual: perceptual distance, or None.
-        bench: the rest of the camera.
-        process: process whose errors every step's plate has, or None.
-        spec: the spec.
-        mesh: devices, or None for one.
+    The DOE, the rest of the camera and the process whose errors every step's plate has, if any; the mesh of devices is
+    None for one.
     """
 
     doe: TrainingDoe

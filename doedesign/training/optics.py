@@ -20,12 +20,9 @@ from sim.psf_bank import BankOptic
 
 
 class TrainingDoe(eqx.Module):
-    """The DOE of a training: one that is learnt, or PSFs of one that stays as it is.
+    """The DOE of a training: one whose heights follow from parameters, or PSFs of one that stays as it is.
 
-    Attributes:
-        optic: the DOE; the heights of one that is learnt follow from its parameters.
-        plans: propagation of every line of the optic.
-        parametrization: parameters to heights; None for a DOE that stays as it is.
+    Every line of the optic has a plan of propagation.
     """
 
     optic: HeightOptic | RingOptic | BankOptic

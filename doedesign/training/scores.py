@@ -33,12 +33,9 @@ Values = Sequence[float] | Float[np.ndarray, "..."]
 
 
 class Region(NamedTuple):
-    """Scores of every picture in one region, in the order of Table 1. Higher is better.
+    """Scores of every picture in one region, in the order of Table 1; higher is better.
 
-    Attributes:
-        ssim: structural similarity.
-        psnr: dB; infinite for equal pictures.
-        closeness: 1 - LPIPS, or None where its weights are not at hand.
+    PSNR is in dB, infinite for equal pictures; closeness is 1 - LPIPS, None without its weights.
     """
 
     ssim: Float[Array, " b"]

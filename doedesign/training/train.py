@@ -27,13 +27,7 @@ from jaxtyping import Float
 from doedesign import __version__
 from doedesign.build import camera_from_spec
 from doedesign.capture.camera import depth_range_m
-from doedesign.capture.from_spec import (
-    channels_from_rgb,
-    obstruction_from_spec,
-    occlusion_from_spec,
-    plain_parameters,
-    rgb_from_channels,
-)
+from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, plain_parameters, rgb_from_channels
 from doedesign.capture.images import Pictures
 from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
@@ -234,7 +228,7 @@ class JointTraining(TrainingJob):
             with self.held_out.batches(stop=self.options.validation) as batches:
                 for batch in batches:
                     name, scene = batch.items[0]
-                    clean = srgb_from_linear(channels_from_rgb(np.asarray(scene.background), camera))
+                    clean = srgb_from_linear(np.asarray(trainer.bench.scene(scene).background))
                     shown = _shown(trainer, state, batch, baselines)
                     yield HeldOutScene(name, shown, clean, np.asarray(scene.obstructions[0].mask))
 
