@@ -66,8 +66,8 @@ class Deviation(NamedTuple):
         meaning: what a value of it does.
         one_sided: never negative; it is drawn from a folded normal distribution.
         largest: the largest mean or standard deviation that a spec may give.
-        prior_sigma: standard deviation before a calibration where the process gives none, what a careless lab would
-            still not exceed twice; 0 for an error that no single DOE has in a definite way (roughness).
+        prior_sigma: standard deviation before a calibration where the process gives none; 0 for roughness, which is
+            random.
         measured: what a lab measures to find it; "" if nothing.
         stock: mean and standard deviation in every stock process; None where they differ (`fab.stock`) or are zero.
     """

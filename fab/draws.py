@@ -169,19 +169,13 @@ def chosen_errors(process: Process, what: str) -> tuple[str, ...]:
     if what == DEFECTS and DEFECTS in sources_of(process):
         return ()
     names = varying(process)
-    found = tuple(name for name in names if what in _words_for(name))
+    # "overlay_x_m[2]" is also "overlay_x[2]", "overlay_x_m", "overlay_x" and "overlay".
+    keys = {name: name.partition("[")[0] for name in names}
+    found = tuple(n for n, key in keys.items() if what in (n, short_name(n), key, short_name(key), source_of(n)))
     if not found:
-        choices = ", ".join(
-            dict.fromkeys((*sources_of(process), *(short_name(name.partition("[")[0]) for name in names)))
-        )
+        choices = ", ".join(dict.fromkeys((*sources_of(process), *map(short_name, keys.values()))))
         raise InputError("budget", "must name errors that vary in this process", f'"{what}"', f"One of {choices}.")
     return found
-
-
-def _words_for(name: str) -> tuple[str, ...]:
-    """What a user may call an error: "overlay_x_m[2]", "overlay_x[2]", "overlay_x_m", "overlay_x", "overlay"."""
-    key = name.partition("[")[0]
-    return name, short_name(name), key, short_name(key), source_of(name)
 
 
 def normal_keys(count: int) -> list[str]:

@@ -96,20 +96,14 @@ def panels(
     note: str = "",
     layout: Literal["constrained", "compressed"] = "constrained",
 ) -> "Iterator[FigureBase]":
-    """Open a new figure, or a sub-figure in the place of some axes, in the house style.
+    """Open a new figure, or a sub-figure in the place of some axes, in the house style; its layout places everything.
 
     Args:
-        ax: axes of a subplot, which the sub-figure replaces; None for a new figure.
+        ax: axes of a subplot (otherwise ValueError), which the sub-figure replaces; None for a new figure.
         size_in: width and height of a new figure, inches.
         title: a line above all; a long one is shortened.
         note: small text below all, wrapped to the width.
         layout: "compressed" for a grid of pictures of fixed aspect.
-
-    Yields:
-        The figure to draw on; its layout engine places everything.
-
-    Raises:
-        ValueError: the axes are no subplot.
     """
     with _house_style():
         if ax is None:
@@ -117,7 +111,11 @@ def panels(
             # A right margin, which matplotlib's own wrapping would leave out.
             note = textwrap.fill(note, max(20, int(15.5 * size_in[0])))
         else:
-            figure = _sub_figure(ax)
+            place, parent = ax.get_subplotspec(), ax.get_figure()
+            if place is None or parent is None:
+                raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
+            ax.remove()
+            figure = parent.add_subfigure(place)
         if title:
             line = textwrap.shorten(title, int(12 * size_in[0]), placeholder="…")
             figure.suptitle(line, x=0.01, ha="left", fontsize=12, parse_math=False)
@@ -128,15 +126,6 @@ def panels(
         root: Any = figure.get_figure(root=True)
         if engine := root.get_layout_engine():
             engine.execute(root)
-
-
-def _sub_figure(ax: "Axes") -> "FigureBase":
-    """Replace axes by a sub-figure."""
-    place, parent = ax.get_subplotspec(), ax.get_figure()
-    if place is None or parent is None:
-        raise ValueError("`ax` must be a subplot (from `pyplot.subplots`), but its place is given by hand")
-    ax.remove()
-    return parent.add_subfigure(place)
 
 
 @contextmanager
@@ -225,13 +214,10 @@ def _mean_over_parts(values: NDArray[Any], count: int) -> NDArray[np.float32]:
 
 
 def shrunk(values: NDArray[Any], most: int, kind: Literal["mean", "smooth"] = "mean") -> NDArray[Any]:
-    """Average a map so that neither side has more than `most` samples; a smaller map is returned as it is.
+    """Average a map ``[y, x]`` so that neither side has more than `most` samples; a smaller map is returned as it is.
 
-    Args:
-        values: the map, ``[y, x]``.
-        most: samples per side that the picture can show.
-        kind: "mean" over equal parts of the map, which keeps its total, or "smooth" by a Lanczos filter, which leaves
-            no moire of fine regular structure.
+    "mean" averages over equal parts of the map, which keeps its total; "smooth" is a Lanczos filter, which leaves no
+    moire of fine regular structure.
     """
     ny, nx = (min(n, most) for n in values.shape)
     if (ny, nx) == values.shape:

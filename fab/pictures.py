@@ -53,17 +53,16 @@ def _size(most_pixels: int) -> str:
 
 
 def read_pixels(path: str | Path, *, most_pixels: int = MOST_PIXELS, others: str | None = None) -> NDArray[Any]:
-    """Read the values of a PNG or TIFF as they are; its orientation is left alone.
+    """Read the values of a PNG or TIFF, which its ending says it is, as they are; its orientation is left alone.
 
     Args:
-        path: the file; its ending says which of the two it is.
+        path: the file.
         most_pixels: number above which a picture is refused before anything is decoded.
-        others: mode of Pillow, such as "RGBA", into which pixels that are not plain counts (a palette, single bits)
-            are converted; they are refused if None.
+        others: mode of Pillow, such as "RGBA", into which pixels that are not plain counts (a palette, single bits) are
+            converted; they are refused if None.
 
     Returns:
-        uint8, uint16 or what else a TIFF holds: `[y, x]`, or `[y, x, plane]` with 2 planes (grey and opacity), 3 (red,
-        green, blue) or 4.
+        uint8, uint16 or what else a TIFF holds: `[y, x]`, or `[y, x, plane]` with 2 planes (grey and opacity), 3 or 4.
 
     Raises:
         InputError: the file is missing, damaged, of another kind, too large, or not a single picture.
@@ -124,16 +123,10 @@ def _png_pixels(path: Path, data: bytes, most_pixels: int, others: str | None) -
 
 
 def read_display(path: str | Path, most_px: int | None = None) -> NDArray[np.uint8]:
-    """Read any picture as a display shows it: upright as its orientation says, in 8 bits of red, green and blue.
+    """Read any picture as a display shows it: upright as its orientation says, `[y, x, 3]` in 8 bits (sRGB).
 
     Sixteen bits are rounded to eight, colour profiles are not looked at, transparent pixels count as they are painted.
-
-    Args:
-        path: a PNG, TIFF, JPEG, WebP or BMP file.
-        most_px: pixels that the shorter side may keep; what is larger is shrunk by averaging display values.
-
-    Returns:
-        `[y, x, 3]` display values (sRGB).
+    If the shorter side has more than `most_px` pixels, it is shrunk to them by averaging display values.
 
     Raises:
         InputError: the file is missing, damaged, too large, or holds no display values.
@@ -170,17 +163,14 @@ def write_pixels(
     about: str = "",
     pitch_m: float | None = None,
 ) -> None:
-    """Write a PNG or TIFF; the file appears whole or not at all, and the same values give the same bytes.
+    """Write a PNG or TIFF, which its ending says, whole or not at all; the same values give the same bytes.
 
     Args:
-        path: the file; its ending says which of the two it becomes.
+        path: the file.
         values: uint8 or uint16, for a TIFF floats too, `[y, x]` or `[y, x, 3]`.
         compression: zlib's level for a PNG of 16 bits, 0 to 9; its usual one if None.
         about: a description that goes into the file; a TIFF with one is compressed.
         pitch_m: edge of a pixel, metres, for the resolution tags of a TIFF.
-
-    Raises:
-        InputError: the system refuses the path.
     """
     import imageio.v3 as imageio
 

@@ -71,11 +71,11 @@ class Defects:
         for field_ in fields(self):
             value = getattr(self, field_.name)
             if not 0 <= value < math.inf:
-                where = f"process.defects.{field_.name}"
+                where = f"defects: {field_.name}"
                 raise InputError(where, "must be finite and not negative", value, "Give 0 or more.")
         if self.missed + self.doubled > 1:
             got = f"{self.missed} and {self.doubled}"
-            raise InputError("process.defects", "missed and doubled must sum to at most 1", got, "Lower one of them.")
+            raise InputError("defects", "missed and doubled must sum to at most 1", got, "Lower one of them.")
 
 
 @dataclass(frozen=True)
@@ -112,29 +112,35 @@ class Process:
             object.__setattr__(self, "order", tuple(sorted(masks, key=self.levels.etch_depth_m)))
         if tuple(sorted(self.order)) != masks:
             rule = f"must name each of the masks 0 to {len(masks) - 1} once"
-            raise InputError("process.order", rule, self.order, "List every mask.")
+            raise InputError("process: order", rule, self.order, "List every mask.")
         # A copy, and a plain dictionary, because a read-only view of one cannot be sent to another process.
         object.__setattr__(self, "spreads", dict(self.spreads))
         self._check_spreads()
         if self.tone not in ("clear", "dark"):
-            raise InputError("process.tone", 'must be "clear" or "dark"', self.tone, "Choose one of them.")
+            raise InputError("process: tone", 'must be "clear" or "dark"', self.tone, "Choose one of them.")
         for name in ("minimum_line_m", "minimum_space_m", "wafer_radius_m"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"process.{name}", "must be finite and not negative", getattr(self, name), "Mend it.")
+                raise InputError(
+                    f"process: {name}", "must be finite and not negative", getattr(self, name), "Give 0 or more."
+                )
         if not math.hypot(*self.die_m) <= self.wafer_radius_m:
             rule = f"must lie on the wafer of radius {self.wafer_radius_m} m"
-            raise InputError("process.die_m", rule, self.die_m, "Move the die.")
+            raise InputError("process: die_m", rule, self.die_m, "Move the die.")
 
     def _check_spreads(self) -> None:
         known = error_names(self.masks)
         for name, spread in self.spreads.items():
             if name not in known:
-                raise InputError(f"process.errors.{name}", "must be a known error", name, f"One of {', '.join(known)}.")
+                raise InputError(
+                    f"process: spreads: {name}", "must be a known error", name, f"One of {', '.join(known)}."
+                )
             if not (math.isfinite(spread.mean) and 0 <= spread.sigma < math.inf):
-                raise InputError(f"process.errors.{name}", "sigma must be finite and not negative", spread, "Mend it.")
+                raise InputError(
+                    f"process: spreads: {name}", "sigma must be finite and not negative", spread, "Give 0 or more."
+                )
             if spread.mean < 0 and deviation_of(name).one_sided:
                 rule = "the mean of an error that is never negative must not be negative"
-                raise InputError(f"process.errors.{name}", rule, spread, "Give 0 or more.")
+                raise InputError(f"process: spreads: {name}", rule, spread, "Give 0 or more.")
 
     @property
     def masks(self) -> int:

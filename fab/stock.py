@@ -80,10 +80,10 @@ class Stock:
 
 
 def process_from(given: Process | str | None, levels: Levels) -> Process:
-    """Return a process for a staircase: itself, the stock process of a name ("ideal" is one), or the ideal one.
+    """Return a process for a staircase: the one `given`, the stock process of that name, or by default the ideal one.
 
     Raises:
-        InputError: an unknown name, or a process that makes another staircase.
+        InputError: an unknown name, or a process that makes another staircase than `levels`.
     """
     known = {**STOCK, IDEAL.name: IDEAL}
     if given is None or isinstance(given, Process):

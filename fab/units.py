@@ -67,7 +67,7 @@ def parse_angle(text: str) -> float:
 
 
 def metres(value: float | str, name: str = "length", *, infinite: bool = False) -> float:
-    """Return a length in metres, given as an SI number or as text with a unit.
+    """Return `value`, a length as an SI number or as text with a unit, in metres.
 
     It is the length of `name`, for messages. If `infinite`, infinity will do, as a number or as ``"inf"``.
 

@@ -134,14 +134,10 @@ def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
 
 
 class GdstkReader:
-    """A mask file of some cells, read by gdstk.
+    """A mask file of some cells of the DOE on a pixel raster, read by gdstk.
 
     The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
-
-    Attributes:
-        does: the cells of the DOE.
-        edges: the pixel raster.
-        problems: one sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
+    `problems` has a sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
     """
 
     def __init__(self, does: Collection[str], edges: PixelEdges) -> None:

@@ -160,7 +160,7 @@ class _InUnits:
     def circle(self, diameter_m: float) -> Shapes:
         angle = (np.arange(_CORNERS) + 0.5) * 2 * np.pi / _CORNERS
         points = diameter_m / 2 / self.dbu_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return Shapes(np.empty((0, 4), dtype=np.int32), (np.rint(points).astype(np.int32),))
+        return Shapes(polygons=(np.rint(points).astype(np.int32),))
 
 
 def _size_m(part: Part) -> tuple[float, float]:

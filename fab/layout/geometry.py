@@ -1,13 +1,12 @@
 """The geometry of a mask set: cells with layers of rectangles and polygons in integer database units.
 
-Rules of the drawing. The centre of the clear aperture is (0, 0). Mask bit k is layer k + 1, datatype 0
-(the number is the bit, not the order of etching); chrome is layer 5 for up to four masks and the next
-free one otherwise. A polygon in an etch layer means "etched here", in the chrome layer "chrome here".
-Names of cells hold A-Z, 0-9 and _ only, up to 32 characters, and are never "main", which some writers
-keep for themselves.
+The centre of the clear aperture is (0, 0). Mask bit k is layer k + 1, datatype 0 (the number is the bit, not the order
+of etching); chrome is layer 5 for up to four masks and the next free one otherwise. A polygon in an etch layer means
+"etched here", in the chrome layer "chrome here". Names of cells hold A-Z, 0-9 and _ only, up to 32 characters, and are
+never "main", which some writers keep for themselves.
 
-The database unit is 1 nm where every pixel edge falls on it, otherwise the coarsest finer unit on which
-it does; where none does, each edge is rounded once, so that neighbours still share it.
+The database unit is 1 nm where every pixel edge falls on it, otherwise the coarsest finer unit on which it does; where
+none does, each edge is rounded once, so that neighbours still share it.
 """
 
 import re
@@ -64,7 +63,7 @@ def layer_from(text: str) -> Layer:
 class Shapes:
     """Rectangles ``(n, 4)``, x0 < x1 and y0 < y1, and simple polygons ``(v, 2)``, not closed, in database units."""
 
-    rectangles: NDArray[np.int32]
+    rectangles: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 4), dtype=np.int32))
     polygons: tuple[NDArray[np.int32], ...] = ()
 
     def __len__(self) -> int:
@@ -259,4 +258,4 @@ def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
         got = format_length(chrome.chord_error_m)
         raise InputError("chrome chord error", "must be one database unit or more", got, "Choose a larger one.")
     polygons = annulus_sectors(inner, outer, chrome.chord_error_m / dbu_m)
-    return Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygons))
+    return Shapes(polygons=tuple(polygons))

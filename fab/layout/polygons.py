@@ -1,14 +1,12 @@
 """Bitmaps as rectangles, and circles as sectors: the two shapes that masks are drawn from.
 
-A pixel plane becomes rectangles in one sweep. Every row is cut into its maximal runs of ones; a run that
-has exactly the columns of a run in the row below continues that rectangle, any other run opens a new
-one. The result covers each set pixel once and nothing else, has no holes and no polygon that touches
-itself at a corner, and is listed from the lowest row up, each row from left to right. It is not the
-smallest cover, but it is linear in the pixels, while a merge to large polygons is quadratic in their
-holes. Painting the rectangles back counts every pixel that is covered twice.
+A pixel plane becomes rectangles in one sweep. Every row is cut into its maximal runs of ones; a run that has exactly
+the columns of a run in the row below continues that rectangle, any other opens a new one. The result covers each set
+pixel once and nothing else, has no holes and no polygon that touches itself at a corner. It is not the smallest cover,
+but it is linear in the pixels, while a merge to large polygons is quadratic in their holes.
 
-A clear aperture is drawn as the annulus around it. GDSII knows neither circles nor holes, so the annulus
-is cut into equal sectors of few vertices that share their radial edges point by point.
+A clear aperture is drawn as the annulus around it. GDSII knows neither circles nor holes, so the annulus is cut into
+equal sectors of few vertices that share their radial edges point by point.
 """
 
 import math
@@ -92,13 +90,7 @@ def rectangles(
 
 @dataclass(frozen=True)
 class Painted:
-    """Defects of the rectangles of a plane; all zero for a sound one.
-
-    Attributes:
-        overlaps: how many pixels were covered again.
-        strays: rectangles with an edge off the pixel raster or outside it; they are not painted.
-        first_stray: number of the first of them, -1 if there is none.
-    """
+    """Pixels covered again by rectangles of a plane; how many, and first which (or -1), lie off the pixel raster."""
 
     overlaps: int
     strays: int
@@ -141,14 +133,9 @@ def paint(
     bit: int,
     canvas: NDArray[np.uint8],
 ) -> Painted:
-    """Paint the rectangles of one plane back onto the pixel raster they were made from.
+    """Paint rectangles ``(n, 4)`` of a plane back onto its pixels: set a bit of the canvas ``[y, x]``, in place.
 
-    Args:
-        rects: ``(n, 4)``: x0, y0, x1, y1, in the units of the edges.
-        x_edges: coordinate of each pixel edge along x, increasing and even to half a pixel, ``(nx + 1,)``.
-        y_edges: the same along y, ``(ny + 1,)``.
-        bit: bit of the canvas that is the plane, 0 to 7; a pixel where it is set counts as covered.
-        canvas: ``[y, x]``, changed in place: the bit is set wherever a rectangle lies.
+    Edges are as in `rectangles`, even to half a pixel. A pixel where the bit is set already counts as covered.
     """
     overlaps, strays, first = _paint(rects, x_edges, y_edges, np.uint8(1 << bit), canvas)
     return Painted(int(overlaps), int(strays), int(first))

@@ -1,4 +1,4 @@
-"""Pictures of marks and test structures: all masks over each other, and what the operator of an aligner sees."""
+"""The picture of marks and test structures, all masks over each other."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -9,15 +9,12 @@ from fab.figure import CHROME, SERIES, single
 from fab.units import UM
 
 if TYPE_CHECKING:
-    from klayout import db
     from matplotlib.axes import Axes
 
-    from fab.layout.geometry import Layer
+    from fab.layout.geometry import Layer, Shapes
     from fab.layout.part import Part, Photomask
 
-_ZERO = "#5b3a1e"
-_GLASS = "#f4f7fa"
-_MASK = "#2b2d31"
+_ZERO, _GLASS = "#5b3a1e", "#f4f7fa"
 _WIDTH_IN = 9.0
 
 # x0, y0, x1, y1
@@ -33,13 +30,18 @@ def plot_part(
     """
     from matplotlib.patches import Patch
 
-    window = _window_um(part, window_m)
-    height = _WIDTH_IN * (window[3] - window[1]) / (window[2] - window[0])
-    with single(ax, (_WIDTH_IN + 0.8, height + 1.1), title) as axes:
-        for layer in part.shapes:
-            _fill(axes, _cut(part, [layer], window), part.dbu_m, _colour(layer, masks), alpha=0.6)
+    x0, y0, x1, y1 = (edge * part.dbu_m / UM for edge in part.box)
+    margin = 0.02 * max(x1 - x0, y1 - y0)
+    x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
+    if window_m is not None:
+        x0, y0, x1, y1 = (edge / UM for edge in window_m)
+    window = tuple(round(edge * UM / part.dbu_m) for edge in (x0, y0, x1, y1))
+    with single(ax, (_WIDTH_IN + 0.8, _WIDTH_IN * (y1 - y0) / (x1 - x0) + 1.1), title) as axes:
+        for layer, shapes in part.shapes.items():
+            _fill(axes, shapes, window, part.dbu_m, _colour(layer, masks))
         keys = [Patch(color=_colour(mask.on(1), masks), alpha=0.6, label=mask.name) for mask in masks]
-        _finish(axes, window, keys)
+        axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", facecolor=_GLASS, xlabel="x (µm)", ylabel="y (µm)")
+        axes.legend(handles=keys, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(keys), borderaxespad=0.2)
     return axes
 
 
@@ -50,52 +52,23 @@ def _colour(layer: "Layer", masks: "Sequence[Photomask]") -> str:
     return _ZERO if mask.makes == "zero layer" else CHROME
 
 
-def _fill(axes: "Axes", drawn: "db.Region", dbu_m: float, colour: str, alpha: float = 1.0) -> None:
-    """Fill what is drawn as one outline with holes, since boxes that touch would show hairlines between them."""
+def _fill(axes: "Axes", shapes: "Shapes", window: tuple[int, ...], dbu_m: float, colour: str) -> None:
+    """Fill shapes in a window as one outline with holes, since boxes that touch would show hairlines between them."""
+    from klayout import db
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
+    drawn = db.Region()
+    for box in shapes.rectangles.tolist():
+        drawn.insert(db.Box(*box))
+    for polygon in shapes.polygons:
+        drawn.insert(db.Polygon([db.Point(x, y) for x, y in polygon.tolist()]))
     outlines = []
-    for polygon in drawn.merged().each():
+    for polygon in (drawn & db.Region(db.Box(*window))).merged().each():
         loops = [polygon.each_point_hull(), *(polygon.each_point_hole(n) for n in range(polygon.holes()))]
         for loop in loops:
             points = np.array([(point.x, point.y) for point in loop]) * (dbu_m / UM)
             outlines.append(Outline(np.concatenate([points, points[:1]]), closed=True))
     if outlines:
         whole = Outline.make_compound_path(*outlines)
-        axes.add_patch(PathPatch(whole, facecolor=colour, linewidth=0, alpha=alpha, snap=False))
-
-
-def _cut(part: "Part", layers: "Sequence[Layer]", window_um: _Box) -> "db.Region":
-    """Return what some layers hold as far as it lies in a window."""
-    from klayout import db
-
-    drawn = db.Region()
-    for shapes in (part.shapes[layer] for layer in layers):
-        for box in shapes.rectangles.tolist():
-            drawn.insert(db.Box(*box))
-        for polygon in shapes.polygons:
-            drawn.insert(db.Polygon([db.Point(x, y) for x, y in polygon.tolist()]))
-    return drawn & _everything(part, window_um)
-
-
-def _everything(part: "Part", window_um: _Box) -> "db.Region":
-    from klayout import db
-
-    return db.Region(db.Box(*(round(edge * UM / part.dbu_m) for edge in window_um)))
-
-
-def _window_um(part: "Part", window_m: _Box | None) -> _Box:
-    if window_m is not None:
-        x0, y0, x1, y1 = (edge / UM for edge in window_m)
-        return x0, y0, x1, y1
-    x0, y0, x1, y1 = (edge * part.dbu_m / UM for edge in part.box)
-    margin = 0.02 * max(x1 - x0, y1 - y0)
-    return x0 - margin, y0 - margin, x1 + margin, y1 + margin
-
-
-def _finish(axes: "Axes", window_um: _Box, keys: Sequence[object]) -> None:
-    """Set the view, the labels, and a legend above the panel."""
-    x0, y0, x1, y1 = window_um
-    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", facecolor=_GLASS, xlabel="x (µm)", ylabel="y (µm)")
-    axes.legend(handles=keys, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(keys), borderaxespad=0.2)
+        axes.add_patch(PathPatch(whole, facecolor=colour, linewidth=0, alpha=0.6, snap=False))

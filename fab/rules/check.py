@@ -17,7 +17,6 @@ the clear aperture nothing is etched, so the staircase of its edge is an edge li
 """
 
 import math
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -31,7 +30,6 @@ from fab.grid import Grid, fewest_pixels
 from fab.layout.geometry import pixel_edges
 from fab.layout.polygons import run_lengths
 from fab.level_map import LevelMap
-from fab.levels import Levels
 from fab.process import Process
 from fab.rules import bitplanes as bits
 from fab.rules.widths import count_bounded, narrow_runs, shortest
@@ -146,6 +144,24 @@ class PlaneRules:
         fine = self.line.minimum_m == self.space.minimum_m == 0
         return 0 if fine else self.line.narrow + self.space.narrow + self.kissing
 
+    @property
+    def headline(self) -> str:
+        """One sentence about what the process cannot print, saying why; empty if it can."""
+        if not self.breaks:
+            return ""
+        said = []
+        for widths, what in ((self.line, "lines"), (self.space, "spaces")):
+            if widths.narrow and widths.smallest_m is not None:
+                share, smallest = 100 * widths.narrow_share, format_length(float(f"{widths.smallest_m:.6g}"))
+                ribbons = f", {widths.slivers} of them slivers" if widths.slivers else ""
+                said.append(
+                    f"{share:.2g} % of its {what} are narrower than the {format_length(widths.minimum_m)} that the "
+                    f"process prints (down to {smallest}, in {widths.narrow} places{ribbons})"
+                )
+        if self.kissing:
+            said.append(f"{self.kissing} pairs of pixels touch only at a corner")
+        return f"mask {self.bit + 1} (bit {self.bit}): {'; '.join(said)}"
+
 
 @dataclass(frozen=True)
 class OffGrid:
@@ -183,12 +199,12 @@ class RulesReport:
         return plot_rules(self, title or f"{self.level_map.name}: where the masks break the rules", ax)
 
     def _repr_html_(self) -> str:
-        rows = {f"mask {plane.bit + 1}": "".join(_headline(plane)) or "breaks no rule" for plane in self.planes}
+        rows = {f"mask {plane.bit + 1}": plane.headline or "breaks no rule" for plane in self.planes}
         return html_of(f"Rules of {self.level_map.name}", rows, self.plot())
 
     def headlines(self) -> tuple[str, ...]:
         """Return one sentence per mask that the process cannot print, saying why."""
-        return tuple(text for plane in self.planes for text in _headline(plane))
+        return tuple(plane.headline for plane in self.planes if plane.breaks)
 
     def as_record(self) -> dict[str, Any]:
         """Return everything as plain JSON values; lengths in metres."""
@@ -202,23 +218,6 @@ class RulesReport:
             "planes": planes,
             "off_grid": asdict(self.off_grid),
         }
-
-
-def _headline(plane: PlaneRules) -> Iterator[str]:
-    if not plane.breaks:
-        return
-    said = []
-    for widths, what in ((plane.line, "lines"), (plane.space, "spaces")):
-        if widths.narrow and widths.smallest_m is not None:
-            share, smallest = 100 * widths.narrow_share, format_length(float(f"{widths.smallest_m:.6g}"))
-            ribbons = f", {widths.slivers} of them slivers" if widths.slivers else ""
-            said.append(
-                f"{share:.2g} % of its {what} are narrower than the {format_length(widths.minimum_m)} that the process "
-                f"prints (down to {smallest}, in {widths.narrow} places{ribbons})"
-            )
-    if plane.kissing:
-        said.append(f"{plane.kissing} pairs of pixels touch only at a corner")
-    yield f"mask {plane.bit + 1} (bit {plane.bit}): {'; '.join(said)}"
 
 
 def _metres(length_m: float) -> float:
@@ -303,11 +302,6 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
     return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
 
 
-def rules_from(process: Process | Rules | str, levels: Levels) -> Rules:
-    """Return the rules of a process or of a stock process by its name; rules are returned as they are."""
-    return process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
-
-
 def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     """Check every etch mask of a level map.
 
@@ -318,11 +312,12 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     Raises:
         InputError: a process of another staircase, or one of an unknown name.
     """
-    rules = rules_from(process, level_map.levels)
+    levels = level_map.levels
+    rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, aperture_m = level_map.grid, level_map.aperture_m
     spans = np.clip(_spans(grid, aperture_m), 0, grid.shape[1])
     area = int(np.sum(spans[:, 1] - spans[:, 0]))
-    words = bits.pack(level_map.level, level_map.levels.bits, spans)
+    words = bits.pack(level_map.level, levels.bits, spans)
     with ThreadPoolExecutor() as pool:
         tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)

@@ -1,17 +1,17 @@
 """Repair of a level map whose masks are too fine: new levels for the pixels that break a rule, few and near.
 
-No mask is repaired by itself, since a pixel that is moved in one bit plane jumps by the depth of that etch. Here
-levels change, and a level is judged by all its bits at once.
+No mask is repaired by itself, since a pixel that is moved in one bit plane jumps by the depth of that etch. Here levels
+change, and a level is judged by all its bits at once.
 
 A move sets a small rectangle of pixels to the level of one of its neighbours. Moves are weighed by what they do to the
-rules (the pixels by which runs are too short, and the kissing corners, of every mask) and to the light (1 - cos of the
-phase error against the map that was asked for). Sweeps over the offending pixels take the best move of each, while the
-weight of a broken rule rises: cheap repairs come first and expensive ones only where they are needed.
+rules (pixels by which runs are too short, and kissing corners, of every mask) and to the light (1 - cos of the phase
+error). Sweeps over the offending pixels take the best move of each, while the weight of a broken rule rises: cheap
+repairs come first and expensive ones only where they are needed.
 
 What is left is frozen: the plate is divided into squares as wide as the rules demand, and every square in which
-something is broken becomes one level. Squares that reach beyond the clear aperture become blank glass. Frozen squares
-stay frozen, and a plate of nothing but squares has no narrow line or space, so this ends; squares that touch only at
-a corner get another level. Last, pixels go back to the level that was asked for, or nearer to it, where they may.
+something is broken becomes one level, or blank glass at the rim of the aperture. Frozen squares stay frozen, and a
+plate of nothing but squares has no narrow line or space, so this ends; squares that touch only at a corner get another
+level. Last, pixels go back to the level that was asked for, or nearer to it, where they may.
 """
 
 import math

@@ -24,8 +24,7 @@ class MaskMeasured(NamedTuple):
     Attributes:
         overlay_x_m: how far the mask lies toward +x of the first plate's marks, at the die.
         overlay_y_m: the same toward +y.
-        edges_m: how far every edge of an etched area lies outward of its test structure's drawing; the mean over the
-            bars that were measured.
+        edges_m: how far edges of etched areas lie outward of the test structure's drawing, mean over the measured bars.
         edge_move_m: how far the edges of the DOE, not those of the bars, were moved outward on the mask.
         times_etched: 0 for a missed etch, 2 for a doubled one.
         depths_m: depth by the width of the pad; a depth without a pad has an infinite width.

@@ -3,19 +3,21 @@
 The recipes are ordinary ones for fused silica: positive resist, reactive ions through it, chrome by lift-off or wet
 etch. Doses, bakes and times belong to the lab and are left blank; what follows from the order is filled in.
 
-Depth first. Every etch has its own target, and the target of one is not changed by what another one did. If a staircase
-uses all its levels equally, the light that goes where it should is a product with one factor per mask, cos^2(phi / 2)
-for a phase error phi of that mask's depth; no other factor can make up for it. The choice that keeps the full depth
-right (`next_target_m`) puts its own mask wrong by as much, and so loses the factor twice.
+Depth first: every etch has its own target, whatever another one did. If a staircase uses all its levels equally, the
+light that goes where it should is a product with one factor per mask, cos^2(phi / 2) for a phase error phi of its
+depth; no other factor can make up for it. The choice that keeps the full depth right (`next_target_m`) puts its own
+mask wrong by as much, and so loses the factor twice.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
+from fab.layout.marks import alignment_notes
 from fab.layout.part import Photomask
 from fab.levels import Levels
 from fab.process import Normal, Process
+from fab.runsheet.tables import RunSheet
 from fab.units import NM, UM, format_length
 
 Deposition = Literal["evaporated", "sputtered"]
@@ -53,11 +55,6 @@ def depths_m(levels: Levels) -> tuple[float, ...]:
     return tuple(sorted(depths))
 
 
-def etch_time_s(depth_m: float, rate_m_per_s: float) -> float:
-    """Return the time that a depth takes, seconds: depth / rate."""
-    return depth_m / rate_m_per_s
-
-
 def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
     """Return the next etch's target that keeps the sum of all depths right, metres.
 
@@ -65,17 +62,6 @@ def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
     become wrong by as much as those of this one are.
     """
     return next_m - (measured_m - target_m)
-
-
-def resist_thickness_m(plate: Photomask, chrome_m: float, deposition: Deposition) -> float:
-    """Return the least thickness of the resist, metres.
-
-    For lift-off it is five times the metal if that is evaporated and ten times if it is sputtered, because sputtered
-    metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
-    """
-    if plate.makes == "etch":
-        return max(_THINNEST_M, 2 * plate.depth_m / _SELECTIVITY)
-    return _LIFTOFF_FOLD[deposition] * chrome_m if lifts_off(plate) else _THINNEST_M
 
 
 def lifts_off(plate: Photomask) -> bool:
@@ -122,13 +108,6 @@ def _printing(plate: Photomask, file: str, align: str, thickness_m: float, why: 
     )
 
 
-def _clean(first: bool) -> Action:
-    how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
-    if first:
-        how = f"Check thickness, flat and both polished faces, and mark the side to be etched. {how}"
-    return Action("Clean", how, ("wafer number",) if first else ())
-
-
 def _etch_actions(plate: Photomask, process: Process) -> tuple[Action, ...]:
     depth_m, bit = plate.depth_m, plate.bit or 0
     sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
@@ -165,36 +144,39 @@ def _chrome_actions(plate: Photomask, chrome_m: float, deposition: Deposition) -
     )
 
 
-def _resist_reason(plate: Photomask, chrome_m: float, deposition: Deposition) -> str:
+def least_resist(plate: Photomask, chrome_m: float, deposition: Deposition) -> tuple[float, str]:
+    """Return the least thickness of the resist, metres, and why.
+
+    For lift-off it is five times the metal if that is evaporated and ten times if it is sputtered, because sputtered
+    metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
+    """
     if plate.makes == "etch":
         used = format_length(float(f"{plate.depth_m / _SELECTIVITY:.3g}"))
-        return f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
+        why = f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
+        return max(_THINNEST_M, 2 * plate.depth_m / _SELECTIVITY), why
     if lifts_off(plate):
         fold, thickness = _LIFTOFF_FOLD[deposition], format_length(chrome_m)
-        return f"For lift-off of {deposition} chrome: at least {fold} times its {thickness}, with overhanging edges."
-    return "It only has to hold in the chrome etch."
+        why = f"For lift-off of {deposition} chrome: at least {fold} times its {thickness}, with overhanging edges."
+        return fold * chrome_m, why
+    return _THINNEST_M, "It only has to hold in the chrome etch."
 
 
-def steps_of(
-    plates: Sequence[Photomask],
-    process: Process,
-    files: Mapping[str, str],
-    notes: Sequence[str],
-    chrome_m: float,
-    deposition: Deposition,
-) -> tuple[Step, ...]:
-    """List the steps of a job, one per photomask in order of use, each aligned as its note says (`alignment_notes`)."""
+def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
+    """List the steps of a job, one per photomask in order of use."""
+    chrome_m, deposition, process = sheet.chrome_m, sheet.deposition, sheet.process
     steps, deepest_m = [], 0.0
-    for number, (plate, note) in enumerate(zip(plates, notes, strict=True)):
+    for number, (plate, note) in enumerate(zip(sheet.plates, alignment_notes(sheet.plates), strict=True)):
         deepest_m += plate.depth_m
         align = note if number else f"To the flat of the wafer, by eye, middle on middle. {note}"
-        thickness_m = resist_thickness_m(plate, chrome_m, deposition)
-        why = _resist_reason(plate, chrome_m, deposition)
-        before = [_clean(number == 0)]
+        thickness_m, why = least_resist(plate, chrome_m, deposition)
+        how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
+        if number == 0:
+            how = f"Check thickness, flat and both polished faces, and mark the side to be etched. {how}"
+        before = [Action("Clean", how, ("wafer number",) if number == 0 else ())]
         if plate.makes != "etch" and not lifts_off(plate):
             how = f"Chrome all over, {format_length(chrome_m)}, {deposition}."
             before.append(Action("Deposit", how, ("thickness (nm)",)))
-        before += _printing(plate, files[plate.name], align, thickness_m, why)
+        before += _printing(plate, sheet.files[plate.name].file, align, thickness_m, why)
         after = _etch_actions(plate, process) if plate.makes == "etch" else _chrome_actions(plate, chrome_m, deposition)
         steps.append(Step(plate, tuple(before), after, deepest_m))
     return tuple(steps)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fab.files import canonical_json, write_atomic
-from fab.layout.marks import VERNIER_STEP_M, alignment_notes
+from fab.layout.marks import BOXES, VERNIER_STEP_M
 from fab.layout.part import Photomask
 from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
 from fab.process import Normal
@@ -20,7 +20,6 @@ from fab.runsheet.recipe import (
     Action,
     Step,
     depths_m,
-    etch_time_s,
     next_target_m,
     spread_of,
     steps_of,
@@ -103,19 +102,10 @@ def _depth_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
     ]
 
 
-def _overlay_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
-    return [
-        {"axis": axis, "where": where, **place}
-        for axis in ("x", "y")
-        for where, place in _named(sheet, f"vernier {axis}, ", plate)
-    ]
-
-
-def _marks(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
-    kinds = ("finder", *("box " + gap for gap in ("25 um", "10 um", "5 um", "3 um", "2 um")))
-    return [
-        {"mark": kind, "where": where, **place} for kind in kinds for where, place in _named(sheet, f"{kind}, ", plate)
-    ]
+def _marks(sheet: RunSheet, plate: Photomask, key: str, *kinds: str, prefix: str = "") -> list[dict[str, Any]]:
+    """List where the marks of a plate are, except for the first one, to which all others are aligned."""
+    found = ((kind, _named(sheet, f"{prefix}{kind}, ", plate)) for kind in kinds if plate is not sheet.plates[0])
+    return [{key: kind, "where": where, **place} for kind, places in found for where, place in places]
 
 
 def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> dict[str, Any]:
@@ -135,7 +125,7 @@ def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> d
         "deepest_floor_nm": _nm(step.deepest_m),
         "time_formula": "time = target / rate",
         "times": [
-            {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(etch_time_s(plate.depth_m, rate))}
+            {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(plate.depth_m / rate)}
             for rate in RATES_M_PER_S
         ],
         "pads": _depth_rows(sheet, plate),
@@ -149,7 +139,7 @@ def _actions(actions: tuple[Action, ...]) -> list[dict[str, Any]]:
 
 
 def _step_record(sheet: RunSheet, number: int, step: Step) -> dict[str, Any]:
-    plate, first = step.plate, sheet.plates[0]
+    plate = step.plate
     later = tuple(other for other in sheet.plates[number:] if other.bit is not None)
     titles = {"etch": f"etch {plate.depth}", "zero layer": "chrome marks", "liftoff": "the aperture, by lift-off"}
     structures = plate.makes != "zero layer"
@@ -163,9 +153,9 @@ def _step_record(sheet: RunSheet, number: int, step: Step) -> dict[str, Any]:
         "file": sheet.files[plate.name].file,
         "before": _actions(step.before),
         "after": _actions(step.after),
-        "marks": _marks(sheet, plate) if plate is not first else [],
+        "marks": _marks(sheet, plate, "mark", "finder", *(f"box {mark.gap_um:g} um" for mark in BOXES)),
         "widths": _width_rows(sheet, plate) if structures else [],
-        "overlay": _overlay_rows(sheet, plate) if plate is not first else [],
+        "overlay": _marks(sheet, plate, "axis", "x", "y", prefix="vernier "),
         "overlay_tolerance_um": round(_TWO_SIGMA * overlay.sigma / UM, 3) or None,
         "etch": _etch_record(sheet, step, later) if plate.makes == "etch" else None,
     }
@@ -230,9 +220,6 @@ def _blanks(sheet: RunSheet) -> dict[str, Any]:
 
 def record(sheet: RunSheet) -> dict[str, Any]:
     """Return the run sheet as JSON values, the unit of every length in its key, all under "measured" null."""
-    files = {name: one.file for name, one in sheet.files.items()}
-    notes = alignment_notes(sheet.plates)
-    steps = steps_of(sheet.plates, sheet.process, files, notes, sheet.chrome_m, sheet.deposition)
     process, wafer = sheet.process, sheet.wafer
     wall = process.spreads.get("sidewall_rad", Normal())
     return {
@@ -261,7 +248,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "chrome": {"thickness_nm": _nm(sheet.chrome_m), "deposition": sheet.deposition},
         "vernier_step_um": _um(VERNIER_STEP_M),
         "reference": sheet.plates[0].name,
-        "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps, start=1)],
+        "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps_of(sheet), start=1)],
         "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
         "predicted": None if sheet.predictions is None else _predicted_record(sheet.predictions),
@@ -284,7 +271,7 @@ def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None 
         undefined=jinja2.StrictUndefined,
         finalize=_plain,
     )
-    environment.filters["clock"] = _clock
+    environment.filters["clock"] = lambda seconds: "{}:{:02d}".format(*divmod(round(seconds), 60))
     environment.filters["distance"] = format_length
     source = None if picture is None else "data:image/png;base64," + base64.b64encode(picture).decode()
     return environment.get_template("runsheet.html").render(sheet=content, json_name=json_name, picture=source)
@@ -293,12 +280,6 @@ def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None 
 def _plain(value: object) -> object:
     """Write 75.0 as 75."""
     return f"{value:.10g}" if isinstance(value, float) else value
-
-
-def _clock(seconds: float) -> str:
-    """Write a time as minutes and seconds, "3:45"."""
-    whole = round(seconds)
-    return f"{whole // 60}:{whole % 60:02d}"
 
 
 def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:

@@ -26,7 +26,7 @@ from fab.levels import Levels
 from fab.manifest.records import ModelEntry
 from fab.pictures import read_pixels, write_pixels
 from fab.solids.columns import PixelWindow, whole
-from fab.solids.model import DoeModel, ModelKind, Stated, window_of
+from fab.solids.model import DoeModel, ModelKind, model_entry, window_of
 from fab.units import MM, format_length
 
 # OpticStudio's manual asks for this many points along either axis.
@@ -130,11 +130,11 @@ def write_zemax_sag(
     write_atomic(path, b"".join([header.encode(), *body]))
 
 
-def _write(path: Path, model: DoeModel, content: str, write: Callable[[Path, LevelMap], float]) -> Stated:
-    return Stated(content, metres_per_count=write(path, model.level_map))
+def _write(path: Path, model: DoeModel, content: str, write: Callable[[Path, LevelMap], float]) -> ModelEntry:
+    return model_entry(path, content, metres_per_count=write(path, model.level_map))
 
 
-def _write_sag(path: Path, model: DoeModel) -> Stated | None:
+def _write_sag(path: Path, model: DoeModel) -> ModelEntry | None:
     """Write the middle of the map, if it has enough points."""
     (ny, nx), (rows, columns) = model.level_map.shape, (min(n, _SAG_CELLS) for n in model.level_map.shape)
     if min(rows, columns) < _FEWEST_ZEMAX:
@@ -142,7 +142,7 @@ def _write_sag(path: Path, model: DoeModel) -> Stated | None:
     window = PixelWindow((ny - rows) // 2, (nx - columns) // 2, rows, columns)
     write_zemax_sag(path, model.level_map, window)
     about = f"sag from the blank surface, the middle {rows} x {columns} pixels, seen as an exit face"
-    return Stated(about, metres_per_count=MM, window=window)
+    return model_entry(path, about, metres_per_count=MM, window=window)
 
 
 def _problems(path: Path, entry: ModelEntry, level_map: LevelMap, read: Callable[[Path], NDArray[Any]]) -> list[str]:

@@ -1,13 +1,11 @@
 """The relief as a closed mesh: for viewers (GLB), for printers and slicers (3MF, STL).
 
-A mesh stands on its map: every cell is a column with a flat top, walls are vertical, and a flat base closes
-it below. Corners of cells carry one vertex per height that meets there, and the walls use all of them, so
-that no vertex lies inside an edge and the mesh is closed whatever the map. Where two columns meet at a corner
-alone, each has its own vertex on top of the common edge, so that every edge belongs to two triangles, as 3MF
-demands. The volume is the sum of the columns.
+Every cell is a column with a flat top, walls are vertical, and a flat base closes the mesh below. Corners of cells
+carry one vertex per height that meets there, and the walls use all of them, so that no vertex lies inside an edge and
+the mesh is closed whatever the map. Where two columns meet at a corner alone, each has its own vertex on top of the
+common edge, so that every edge belongs to two triangles, as 3MF demands. The volume is the sum of the columns.
 
-The origin is the centre of the clear aperture, z = 0 the blank surface and +z away from the glass, as in
-the STEP files.
+The origin is the centre of the clear aperture, z = 0 the blank surface and +z away from the glass, as in STEP files.
 """
 
 import math
@@ -34,24 +32,22 @@ class Mesh:
     about: str = ""
 
     @property
+    def corners_m(self) -> tuple[NDArray[np.float64], ...]:
+        """First, second and third corner of every triangle, ``(m, 3)``."""
+        return tuple(self.vertices_m[self.triangles[:, corner]] for corner in range(3))
+
+    @property
+    def areas_m2(self) -> NDArray[np.float64]:
+        """Areas of the triangles as seen from +z, negative from below, ``(m,)``."""
+        a, b, c = self.corners_m
+        along, across = b - a, c - a
+        return (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2
+
+    @property
     def volume_m3(self) -> float:
         """Enclosed volume in cubic metres, each triangle counted with the prism between it and z = 0."""
-        return _volume(self.vertices_m, self.triangles)
-
-
-@njit(cache=True)
-def _volume(vertices, triangles):  # pragma: no cover - compiled
-    # Per block of triangles, so that the rounding of a long sum stays small.
-    total = 0.0
-    part = 0.0
-    for t in range(triangles.shape[0]):
-        a, b, c = vertices[triangles[t, 0]], vertices[triangles[t, 1]], vertices[triangles[t, 2]]
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
-        part += area * (a[2] + b[2] + c[2])
-        if t % 1024 == 1023:
-            total += part
-            part = 0.0
-    return (total + part) / 6
+        heights = sum(corner[:, 2] for corner in self.corners_m)
+        return float(np.sum(self.areas_m2 * heights)) / 3
 
 
 @njit(cache=True)

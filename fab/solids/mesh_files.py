@@ -4,6 +4,7 @@ A mesh must have the stated volume, and above every column of the map a top of t
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from fab.manifest.records import ModelEntry
 from fab.solids.columns import Columns, reduced_cells, window_cells
 from fab.solids.mesh import Mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solids.model import BASE_M, MESH_CELLS, DoeModel, MeshedRelief, ModelKind, Stated, window_of
+from fab.solids.model import BASE_M, MESH_CELLS, DoeModel, MeshedRelief, ModelKind, model_entry, window_of
 from fab.solids.step_files import volume_problems
 from fab.units import MM
 
@@ -24,7 +25,9 @@ _RELATIVE_ERROR, _SINGLE = 1e-6, 2.0**-23
 _Shown = Callable[[DoeModel], MeshedRelief | None]
 
 
-def _write(path: Path, model: DoeModel, shown: _Shown, unit: str, write: Callable[[Path, Mesh], None]) -> Stated | None:
+def _write(
+    path: Path, model: DoeModel, shown: _Shown, unit: str, write: Callable[[Path, Mesh], None]
+) -> ModelEntry | None:
     relief = shown(model)
     if relief is None:
         return None
@@ -34,8 +37,8 @@ def _write(path: Path, model: DoeModel, shown: _Shown, unit: str, write: Callabl
         # In single precision walls stand aside, the more so the farther out; over a whole map that cancels out.
         edges, closest = (np.concatenate([f(cells.x_edges_m), f(cells.y_edges_m)]) for f in (np.abs, np.diff))
         off += _SINGLE * float(edges.max() / closest.min())
-    volume = {"RELIEF": (cells.volume_m3 + cells.area_m2 * BASE_M) / MM**3}
-    return Stated(f"{unit}; {relief.about}", volume, relative_error=off, window=relief.window)
+    entry = model_entry(path, f"{unit}; {relief.about}", relative_error=off, window=relief.window)
+    return replace(entry, volumes_mm3={"RELIEF": (cells.volume_m3 + cells.area_m2 * BASE_M) / MM**3})
 
 
 def _problems(path: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
@@ -46,9 +49,7 @@ def _problems(path: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
 
 def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
     """Check that what faces up covers every column once, at the height of that column."""
-    a, b, c = (mesh.vertices_m[mesh.triangles[:, corner]] for corner in range(3))
-    along, across = b - a, c - a
-    areas = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) / 2
+    (a, b, c), areas = mesh.corners_m, mesh.areas_m2
     widths, depths = np.diff(cells.x_edges_m), np.diff(cells.y_edges_m)
     # The top of a column is two triangles, and walls stand upright but for the rounding of their corners.
     up = areas > 0.1 * widths.min() * depths.min()

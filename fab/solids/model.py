@@ -1,9 +1,10 @@
 """The DOE as the solids, meshes and height maps of an order show it, and the kinds of their files."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from fab.layout.geometry import Chrome
@@ -13,7 +14,8 @@ from fab.manifest.records import ModelEntry
 from fab.solids.columns import Columns, PixelWindow, reduced_cells
 from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.patch import Patch
-from fab.units import format_length
+from fab.solids.step import Body
+from fab.units import MM, format_length
 
 MESH_CELLS = 400
 # Glass below the deepest floor of a mesh or a patch.
@@ -70,41 +72,31 @@ def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> Me
     return MeshedRelief(cells, mesh, about, window)
 
 
-@dataclass(frozen=True)
-class Stated:
-    """Content of a file as the manifest states it (`fab.manifest.records.ModelEntry`)."""
-
-    content: str
-    volumes_mm3: Mapping[str, float] = field(default_factory=dict)
-    centres_mm: Mapping[str, list[float]] = field(default_factory=dict)
-    relative_error: float = 0.0
-    metres_per_count: float | None = None
-    window: PixelWindow | None = None
-
-    def entry(self, file: str) -> ModelEntry:
-        """Return the manifest's entry of the file."""
-        pixels = None if self.window is None else list(astuple(self.window))
-        return ModelEntry(
-            file,
-            self.content,
-            dict(self.volumes_mm3),
-            dict(self.centres_mm),
-            self.relative_error,
-            self.metres_per_count,
-            pixels,
-        )
+def model_entry(
+    path: Path,
+    content: str,
+    bodies: Mapping[str, Body] = MappingProxyType({}),
+    relative_error: float = 0.0,
+    metres_per_count: float | None = None,
+    window: PixelWindow | None = None,
+) -> ModelEntry:
+    """Return the manifest's entry of a model's file."""
+    volumes = {name: body.volume_m3 / MM**3 for name, body in bodies.items()}
+    centres = {name: [value / MM for value in body.centre_m] for name, body in bodies.items()}
+    pixels = None if window is None else list(astuple(window))
+    return ModelEntry(path.name, content, volumes, centres, relative_error, metres_per_count, pixels)
 
 
 @dataclass(frozen=True)
 class ModelKind:
     """One kind of file that an order holds besides its masks, whose names end with `ending`, such as "_HEIGHT.tif".
 
-    `write` says what the manifest states of the file, None if this DOE has no such file. `problems` reads it back, its
-    bytes known to be those of the manifest, and returns one sentence per difference from its entry and the level map.
+    `write` returns the entry of the file that it wrote, None if this DOE has no such file. `problems` reads it back,
+    its bytes those of the manifest, and returns one sentence per difference from its entry and the level map.
     """
 
     ending: str
-    write: Callable[[Path, DoeModel], Stated | None]
+    write: Callable[[Path, DoeModel], ModelEntry | None]
     problems: Callable[[Path, ModelEntry, LevelMap], list[str]]
 
 

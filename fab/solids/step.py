@@ -1,9 +1,9 @@
 """STEP, through the kernel of cadquery: the few shapes that plates are made of, their files, and their volumes.
 
-Lengths are metres here and millimetres in the file. Solids are built from their faces, whose common edges are
-shared, and never by Boolean operations: the time is linear in the number of faces, and thousands of them take
-seconds. The names of authors, programs and times in the file's header are fixed, so that the same
-shapes give the same bytes. What the functions return are shapes of the kernel.
+Lengths are metres here and millimetres in the file. Solids are built from their faces, whose common edges are shared,
+and never by Boolean operations: the time is linear in the number of faces, and thousands of them take seconds. Authors,
+programs and times in the header are fixed, so that the same shapes give the same bytes. The functions return shapes of
+the kernel.
 """
 
 import io

@@ -10,11 +10,10 @@ import numpy as np
 
 from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import PixelWindow
-from fab.solids.model import BASE_M, DoeModel, ModelKind, Stated
+from fab.solids.model import BASE_M, DoeModel, ModelKind, model_entry
 from fab.solids.patch import patch_body, patch_step
 from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
-from fab.solids.step import Body, step_bodies
+from fab.solids.step import step_bodies
 from fab.solids.substrate import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
 from fab.units import MM, format_length
 
@@ -22,7 +21,7 @@ from fab.units import MM, format_length
 _RELATIVE_ERROR = 1e-11
 
 
-def _write_die(path: Path, model: DoeModel) -> Stated:
+def _write_die(path: Path, model: DoeModel) -> ModelEntry:
     """Write one die, with its rings if the map is radial."""
     level_map = model.level_map
     glass = Substrate("die", model.die_m, model.wafer.thickness_m)
@@ -37,10 +36,10 @@ def _write_die(path: Path, model: DoeModel) -> Stated:
             f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
         )
     substrate_step(path, glass, level_map.aperture_m, chrome, rings)
-    return _stated(about, substrate_bodies(glass, chrome, rings))
+    return model_entry(path, about, substrate_bodies(glass, chrome, rings), _RELATIVE_ERROR)
 
 
-def _write_wafer(path: Path, model: DoeModel) -> Stated:
+def _write_wafer(path: Path, model: DoeModel) -> ModelEntry:
     """Write the wafer, with a flat unless the dies need its place."""
     wafer, dies = model.wafer, model.dies
     chrome = ChromeRing(*model.chrome.radii_m(model.level_map))
@@ -50,22 +49,17 @@ def _write_wafer(path: Path, model: DoeModel) -> Stated:
         glass, flat = Substrate("wafer", wafer.diameter_m, wafer.thickness_m), "no flat"
     wafer_step(path, glass, model.level_map.aperture_m, chrome, dies)
     about = f"millimetres; the wafer before it is diced, {flat}; chrome of {len(dies)} dies, no relief"
-    return _stated(about, wafer_bodies(glass, chrome, dies))
+    return model_entry(path, about, wafer_bodies(glass, chrome, dies), _RELATIVE_ERROR)
 
 
-def _write_patch(path: Path, model: DoeModel) -> Stated | None:
+def _write_patch(path: Path, model: DoeModel) -> ModelEntry | None:
     if model.patch is None or not model.patch.step or model.detail is None:
         return None
     level_map, window = model.level_map, model.patch.window(model.level_map.grid)
     patch_step(path, level_map, window, BASE_M)
     body = patch_body(level_map, window, BASE_M)
-    return _stated(f"millimetres; boxes side by side, {model.detail.about}", {"PATCH": body}, window)
-
-
-def _stated(about: str, bodies: Mapping[str, Body], window: PixelWindow | None = None) -> Stated:
-    volumes = {name: body.volume_m3 / MM**3 for name, body in bodies.items()}
-    centres = {name: [value / MM for value in body.centre_m] for name, body in bodies.items()}
-    return Stated(about, volumes, centres, _RELATIVE_ERROR, window=window)
+    about = f"millimetres; boxes side by side, {model.detail.about}"
+    return model_entry(path, about, {"PATCH": body}, _RELATIVE_ERROR, window=window)
 
 
 def _problems(path: Path, entry: ModelEntry, _: LevelMap) -> list[str]:

@@ -1,12 +1,11 @@
 """The plate as a solid, for mechanics: STEP files in millimetres.
 
-The origin is the centre of the clear aperture, the plane z = 0 the blank surface (the datum, on which the
-relief is etched and the chrome lies), and the z axis the light axis. The glass lies below, the relief faces
-+z. A file holds named parts: SUBSTRATE and CHROME are solids, DATUM_CLEAR_APERTURE is a disc without thickness
-in the plane z = 0, to be referred to.
+The origin is the centre of the clear aperture, z = 0 the blank surface (the datum, on which the relief is etched and
+the chrome lies), and the z axis the light axis. The glass lies below, the relief faces +z. A file holds named parts:
+SUBSTRATE and CHROME are solids, DATUM_CLEAR_APERTURE is a disc without thickness in the plane z = 0, to be referred to.
 
-A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into
-the top of the substrate. Any other map belongs in a mesh; only a small window of one can be STEP (`fab.solids.patch`).
+A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into the
+top of the substrate. Any other map belongs in a mesh; a small window of one can be STEP (`fab.solids.patch`).
 """
 
 import math

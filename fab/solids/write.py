@@ -32,8 +32,8 @@ KINDS: tuple[ModelKind, ...] = (
 
 def write_models(folder: Path, stem: str, model: DoeModel) -> list[ModelEntry]:
     """Write every kind of file that a DOE has into a folder, names beginning with `stem`; return their entries."""
-    written = ((f"{stem}{kind.ending}", kind) for kind in KINDS)
-    return [stated.entry(file) for file, kind in written if (stated := kind.write(folder / file, model)) is not None]
+    written = (kind.write(folder / f"{stem}{kind.ending}", model) for kind in KINDS)
+    return [entry for entry in written if entry is not None]
 
 
 def model_problems(folder: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:

@@ -89,7 +89,7 @@ def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: 
     off = abs(area - math.pi * (outer**2 - inner**2))
     if off > 2 * math.pi * (outer + inner) * chord:
         problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
-    drawn = Shapes(np.empty((0, 4), dtype=np.int32), tuple(polygon.astype(np.int32) for polygon in polygons))
+    drawn = Shapes(polygons=tuple(polygon.astype(np.int32) for polygon in polygons))
     if shapes_digest(drawn) != chrome.shapes_sha256:
         problems.append(f"layer {layer}: the chrome has another vertex, or one elsewhere")
     return problems
@@ -146,14 +146,13 @@ def _doe_problems(
     if doe is None:
         return [f"cell {name} is missing"]
     problems = [f"cell {name} places others"] if doe.references else []
-    none = Shapes(np.empty((0, 4), dtype=np.int32))
     for layer, shapes in doe.shapes.items():
         if layer not in etch and layer != chrome:
             problems += _count_problem(layer, len(shapes), "shapes on a layer that should be empty")
     for layer, mask in etch.items():
-        problems += _etch_problems(layer, doe.shapes.get(layer, none), mask, expected)
+        problems += _etch_problems(layer, doe.shapes.get(layer, Shapes()), mask, expected)
     if chrome is not None:
-        shapes = doe.shapes.get(chrome, none)
+        shapes = doe.shapes.get(chrome, Shapes())
         problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
         problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, expected.edges.dbu_m)
     # A split has the layers of the plate itself, so its problems need its name.

@@ -117,13 +117,12 @@ def _place_problems(layout: Layout, blank_m: float) -> list[str]:
 def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
     """Compare counts, areas and boxes of the DOE with those of the manifest."""
     problems = []
-    none = Shapes(np.empty((0, 4), dtype=np.int32))
     chrome = expected.chrome_layer(entry)
     for name, drawn in expected.etch_layers(entry).items():
         cell = layout.cell(name)
         stated = {**drawn, **({chrome: expected.manifest.chrome} if chrome is not None else {})}
         for layer, one in stated.items() if cell is not None else ():
-            found = geometry(cell.shapes.get(layer, none), layout.dbu_m)
+            found = geometry(cell.shapes.get(layer, Shapes()), layout.dbu_m)
             wanted = {"polygons": one.polygons, "area_um2": one.area_um2, "box_um": one.box_um}
             problems += [
                 f"cell {name}: layer {layer}: {key} is {found[key]} and not {wanted[key]} as the manifest says"

@@ -97,13 +97,6 @@ def _check_bytes(folder: Path, entry: FileEntry) -> Check:
     return Check(entry.file, "bytes as in the manifest", problems)
 
 
-def _check_nothing_else(folder: Path, manifest: Manifest) -> list[Check]:
-    masks = {path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas")}
-    unknown = sorted(masks - {entry.file for entry in manifest.files})
-    problems = ("a mask file that the manifest does not know",)
-    return [Check(name, "listed in the manifest", problems) for name in unknown]
-
-
 def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None:
     """Return the stored level numbers if they can be those of this order, whatever their digest."""
     try:
@@ -233,7 +226,10 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
     edges = pixel_edges(manifest.grid())
     with os_errors_explained(folder):
         byte_checks = {entry.file: _check_bytes(folder, entry) for entry in manifest.files}
-        checks = [*byte_checks.values(), *_check_nothing_else(folder, manifest)]
+        checks = [*byte_checks.values()]
+        masks = {path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas")}
+        for name in sorted(masks - byte_checks.keys()):
+            checks.append(Check(name, "listed in the manifest", ("a mask file that the manifest does not know",)))
         reference, map_check = _reference(folder, manifest, levels, edges)
         level_map = manifest.level_map(reference)
         expected = Expected(manifest, level_map, level_map.planes(), edges)

@@ -6,7 +6,7 @@ import pytest
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.solids import write
-from fab.solids.model import ModelKind, Stated
+from fab.solids.model import ModelKind, model_entry
 from fab.verification.verify import verify
 from tests.fab.maps import level_map_from
 from tests.fab.mended import mend, told
@@ -14,7 +14,7 @@ from tests.fab.mended import mend, told
 
 def write_counts(path, model):
     path.write_text(" ".join(map(str, np.bincount(model.level_map.level.ravel()))))
-    return Stated("how many pixels have each level")
+    return model_entry(path, "how many pixels have each level")
 
 
 def count_problems(path, entry, level_map):

@@ -100,24 +100,24 @@ def test_a_process_can_be_hashed_and_sent_to_another_process_and_keeps_its_own_n
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"order": (0, 1, 2)}, r"process.order: must name each of the masks 0 to 3 once, but got \(0, 1, 2\)"),
-        ({"order": (0, 1, 2, 2)}, "process.order"),
-        ({"order": (1, 2, 3, 4)}, "process.order"),
-        ({"spreads": {"overlay": Normal()}}, "process.errors.overlay: must be a known error"),
+        ({"order": (0, 1, 2)}, r"process: order: must name each of the masks 0 to 3 once, but got \(0, 1, 2\)"),
+        ({"order": (0, 1, 2, 2)}, "process: order"),
+        ({"order": (1, 2, 3, 4)}, "process: order"),
+        ({"spreads": {"overlay": Normal()}}, "process: spreads: overlay: must be a known error"),
         ({"spreads": {"overlay_x_m": Normal()}}, r"must be a known error.*overlay_x_m\[0\]"),
-        ({"spreads": {"overlay_x_m[4]": Normal()}}, r"process.errors.overlay_x_m\[4\]: must be a known error"),
+        ({"spreads": {"overlay_x_m[4]": Normal()}}, r"process: spreads: overlay_x_m\[4\]: must be a known error"),
         ({"spreads": {"etch_lag[0]": Normal()}}, "must be a known error"),
         ({"spreads": {"etch_lag": Normal(0.0, -1e-3)}}, "sigma must be finite and not negative"),
         ({"spreads": {"etch_lag": Normal(0.0, math.nan)}}, "sigma must be finite"),
         ({"spreads": {"etch_lag": Normal(math.inf, 0.0)}}, "must be finite"),
         ({"spreads": {"etch_lag": Normal(-0.01, 0.0)}}, "never negative must not be negative"),
         ({"spreads": {"corner_radius_m": Normal(-1e-9, 1e-6)}}, "never negative must not be negative"),
-        ({"tone": "grey"}, 'process.tone: must be "clear" or "dark", but got grey'),
-        ({"minimum_line_m": -1e-6}, "process.minimum_line_m: must be finite and not negative"),
-        ({"minimum_space_m": math.nan}, "process.minimum_space_m"),
-        ({"wafer_radius_m": math.inf}, "process.wafer_radius_m"),
-        ({"die_m": (0.04, 0.04)}, "process.die_m: must lie on the wafer of radius 0.05 m"),
-        ({"die_m": (math.nan, 0.0)}, "process.die_m: must lie on the wafer"),
+        ({"tone": "grey"}, 'process: tone: must be "clear" or "dark", but got grey'),
+        ({"minimum_line_m": -1e-6}, "process: minimum_line_m: must be finite and not negative"),
+        ({"minimum_space_m": math.nan}, "process: minimum_space_m"),
+        ({"wafer_radius_m": math.inf}, "process: wafer_radius_m"),
+        ({"die_m": (0.04, 0.04)}, "process: die_m: must lie on the wafer of radius 0.05 m"),
+        ({"die_m": (math.nan, 0.0)}, "process: die_m: must lie on the wafer"),
     ],
 )
 def test_impossible_processes_are_refused(changes: dict, message: str):
@@ -132,8 +132,8 @@ def test_means_below_zero_are_for_errors_that_go_both_ways():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"particles_per_m2": -1.0}, "process.defects.particles_per_m2: must be finite and not negative, but got -1.0"),
-        ({"pinhole_radius_m": math.nan}, "process.defects.pinhole_radius_m"),
+        ({"particles_per_m2": -1.0}, "defects: particles_per_m2: must be finite and not negative, but got -1.0"),
+        ({"pinhole_radius_m": math.nan}, "defects: pinhole_radius_m"),
         ({"missed": 0.7, "doubled": 0.4}, "missed and doubled must sum to at most 1, but got 0.7 and 0.4"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 
 from fab.errors import InputError
 from fab.levels import Levels
-from fab.runsheet.recipe import depths_m, etch_time_s, next_target_m, resist_thickness_m
+from fab.runsheet.recipe import depths_m, least_resist, next_target_m
 from fab.runsheet.write import BARS, PADS, html_page, record, write_run_sheet
 from fab.units import NM, UM
 from tests.fab.sheets import DIGEST, STEM, predictions, sheet, spreads_of
@@ -137,14 +137,13 @@ def test_steps_come_in_the_order_of_use_and_say_how_to_align():
 def test_resist_is_thick_enough():
     plates = {plate.name: plate for plate in sheet(Levels(64, 75 * NM)).plates}
     # A published rule: five times evaporated metal, ten times sputtered.
-    assert resist_thickness_m(plates["chrome"], 100 * NM, "evaporated") == pytest.approx(0.5 * UM)
-    assert resist_thickness_m(plates["chrome"], 100 * NM, "sputtered") == pytest.approx(1.0 * UM)
-    assert resist_thickness_m(plates["mask 1"], 100 * NM, "evaporated") == pytest.approx(1.0 * UM)
-    assert resist_thickness_m(plates["mask 6"], 100 * NM, "evaporated") == pytest.approx(1.6 * UM)
+    assert least_resist(plates["chrome"], 100 * NM, "evaporated")[0] == pytest.approx(0.5 * UM)
+    assert least_resist(plates["chrome"], 100 * NM, "sputtered")[0] == pytest.approx(1.0 * UM)
+    assert least_resist(plates["mask 1"], 100 * NM, "evaporated")[0] == pytest.approx(1.0 * UM)
+    assert least_resist(plates["mask 6"], 100 * NM, "evaporated")[0] == pytest.approx(1.6 * UM)
 
 
 def test_times_are_depth_over_rate():
-    assert etch_time_s(600 * NM, 20 * NM / 60) == pytest.approx(1800)
     times = record(sheet())["steps"][3]["etch"]["times"]
     assert [(row["rate_nm_per_min"], row["time_s"]) for row in times] == [(10, 3600), (20, 1800), (30, 1200)]
     assert "30:00 min" in page_of(record(sheet())).text
