@@ -11,7 +11,7 @@ from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import Columns, PixelWindow, reduced_cells
+from fab.solids.columns import Columns, PixelWindow, reduced_cells, window_cells
 from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.patch import Patch
 from fab.solids.step import Body
@@ -63,7 +63,7 @@ class DoeModel:
             f"{window.rows} x {window.columns} pixels of {format_length(grid.pitch_m)} about {middle} of the DOE, "
             f"on {format_length(BASE_M)} of glass"
         )
-        return _meshed(self.patch.cells(self.level_map), about, window)
+        return _meshed(window_cells(self.level_map, window), about, window)
 
 
 def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> MeshedRelief:

@@ -16,7 +16,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles
 from fab.level_map import LevelMap
-from fab.solids.columns import Columns, PixelWindow, window_cells
+from fab.solids.columns import PixelWindow
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
@@ -65,10 +65,6 @@ class Patch:
             raise InputError("patch", rule, f"{window.rows} x {window.columns}", cure)
         if self.step:
             _tops(level_map, window)
-
-    def cells(self, level_map: LevelMap) -> Columns:
-        """Return the columns of the patch."""
-        return window_cells(level_map, self.window(level_map.grid))
 
 
 def _tops(level_map: LevelMap, window: PixelWindow) -> dict[int, NDArray[np.int32]]:
