@@ -4,7 +4,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from doedesign.report.labels import error_label, value_text
 from fab.figure import (
@@ -74,8 +73,12 @@ def _draw_image(figure: "FigureBase", row: Sequence["Axes"], result: "Calibratio
         (f"difference, {found.chi2_per_pixel:.3g} chi2 per pixel", pulls, valid, differences, ends),
     )
     for axes, (title, values, there, colours, scale) in zip(row, images, strict=True):
-        box = extent_of(model.shape, pixel_m)
-        shown = axes.imshow(_masked(values, there), origin="lower", extent=box, cmap=colours, norm=scale)
+        box, dots = extent_of(model.shape, pixel_m), round(DPI * _SIDE)
+        # Shrunk to the picture's dots, over the pixels that are there.
+        share = shrunk(there.astype(np.float64), dots)
+        mean = shrunk(np.where(there, values, 0.0), dots) / np.maximum(share, 1e-9)
+        image = np.ma.array(mean, mask=share < 0.25)
+        shown = axes.imshow(image, origin="lower", extent=box, cmap=colours, norm=scale)
         axes.set_title(title)
         bare(axes)
         if axes is not row[0]:
@@ -84,14 +87,6 @@ def _draw_image(figure: "FigureBase", row: Sequence["Axes"], result: "Calibratio
     # The fitted place of the image.
     shift = objective.motion(at.scores, index) * pixel_m / UM
     row[1].set_xlabel(f"centre {shift[1]:+.2f}, {shift[0]:+.2f} µm (x, y)", fontsize=SMALL, loc="left")
-
-
-def _masked(values: Float[np.ndarray, "y x"], valid: np.ndarray) -> np.ma.MaskedArray:
-    """Shrunk to the picture's dots, over the pixels that are there."""
-    dots = round(DPI * _SIDE)
-    share = shrunk(valid.astype(np.float64), dots)
-    mean = shrunk(np.where(valid, values, 0.0), dots) / np.maximum(share, 1e-9)
-    return np.ma.array(mean, mask=share < 0.25)
 
 
 def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
@@ -191,23 +186,20 @@ def plot_explanations(found: "ExplanationSet", ax: "Axes | None" = None) -> "Fig
     shown = [*found.singles[:_MOST_EXPLANATIONS], *found.pairs[: _MOST_EXPLANATIONS // 2]]
     targets = found.targets
     title = f"what gives a ring:disc ratio of {targets.ring_to_disc:.3g} at {length_text(targets.depth_m)}"
-    with panels(ax, (11.1, max(_ROW * len(shown), 3.4) + 1.6), title, _words(found)) as figure:
-        curves, bars = figure.subplots(1, 2, width_ratios=(3.1, 2.2))
-        _draw_curves(curves, found)
-        _draw_explanations(bars, shown)
-    return figure
-
-
-def _words(found: "ExplanationSet") -> str:
     words = (
         "left: the model's ratio along the errors that change it most, dashed: measured; right: distance of each "
         "explanation from the process's means, in its standard deviations, with the throughput that comes with it"
     )
-    throughput = found.targets.throughput
-    if throughput is not None:
-        words += f"; full bars: throughput within two standard deviations of the {100 * throughput:.3g} % measured"
-    alone = list(map(error_label, found.unreached))
-    return words + (f"; none within {found.reach:g} standard deviations: {'; '.join(alone)}" if alone else "")
+    if targets.throughput is not None:
+        percent = f"{100 * targets.throughput:.3g} %"
+        words += f"; full bars: throughput within two standard deviations of the {percent} measured"
+    if alone := list(map(error_label, found.unreached)):
+        words += f"; none within {found.reach:g} standard deviations: {'; '.join(alone)}"
+    with panels(ax, (11.1, max(_ROW * len(shown), 3.4) + 1.6), title, words) as figure:
+        curves, bars = figure.subplots(1, 2, width_ratios=(3.1, 2.2))
+        _draw_curves(curves, found)
+        _draw_explanations(bars, shown)
+    return figure
 
 
 def _draw_curves(axes: "Axes", found: "ExplanationSet") -> None:
