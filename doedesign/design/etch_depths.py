@@ -42,12 +42,8 @@ _SHALLOWEST, _CLOSEST = 0.25, 0.05
 class HeightHistogram(NamedTuple):
     """Share of a DOE at every height, with the phase that light of each wavelength has there.
 
-    Attributes:
-        running: `[line, edge]` sum of share times exp(2 pi i waves_per_metre h) below each edge of the histogram, whose
-            bins divide one wave of the design, `period_m`, evenly.
-        waves_per_metre: `[line]` waves per metre of height.
-        weights: `[line]` weight of each line; they sum to 1.
-        period_m: see `running`.
+    `running` is the sum of share times exp(2 pi i waves_per_metre h) below each edge of the bins, `[line, edge]`, which
+    divide one wave of the design, `period_m`, evenly. The weights of the lines sum to 1.
     """
 
     running: NDArray[np.complex128]

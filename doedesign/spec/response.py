@@ -112,7 +112,11 @@ def read_responses(path: Path) -> list[Response]:
     if not rows:
         raise InputError(str(path), "must hold a spectral response", "no line with numbers", _CURE)
     names = None if _is_number(rows[0][1][0]) else rows.pop(0)[1]
-    table = np.array([_numbers(path, line, cells, rows[0][1]) for line, cells in rows])
+    for line, row in rows:
+        if len(row) != len(rows[0][1]) or not all(map(_is_number, row)):
+            rule = f"every line must hold {len(rows[0][1])} finite numbers"
+            raise InputError(f"{path}: line {line}", rule, f'"{",".join(row)}"', _CURE)
+    table = np.array([[float(cell) for cell in row] for _, row in rows])
     if len(table) < 2 or table.shape[1] < 2:
         got = f"{len(table)} lines of {table.shape[1] if table.ndim == 2 else 0} numbers"
         raise InputError(str(path), "needs at least two wavelengths and one colour", got, _CURE)
@@ -124,13 +128,6 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell))
     except ValueError:
         return False
-
-
-def _numbers(path: Path, line: int, cells: list[str], first: list[str]) -> list[float]:
-    if len(cells) != len(first) or not all(_is_number(cell) for cell in cells):
-        rule = f"every line must hold {len(first)} finite numbers"
-        raise InputError(f"{path}: line {line}", rule, f'"{",".join(cells)}"', _CURE)
-    return [float(cell) for cell in cells]
 
 
 def _checked(path: Path, names: list[str] | None, table: NDArray[np.float64]) -> list[Response]:
