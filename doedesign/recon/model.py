@@ -287,7 +287,7 @@ def _at(bank: PsfBank, depth_m: float, name: str) -> Float[np.ndarray, "c y x"]:
     if not depth_m > 0:
         raise InputError(name, "must be a positive distance", f"{depth_m:g} m", "Give metres, or inf.")
     try:
-        return bank.at(depth_m)
+        return np.asarray(bank.at(depth_m))
     except InputError as error:
         raise InputError(name, error.rule, error.got, error.cure) from error
 
