@@ -224,14 +224,11 @@ def cut_window(psf: MeasuredPsf, centre: tuple[float, float], window: int) -> tu
         raise InputError("image", rule, psf.rate.shape, "Take a smaller `window`, or the whole frame.")
     corner = [place - (window - 1) / 2 for place in centre]
     starts = [round(place) for place in corner]
-    # Rows and columns of the frame that lie in the window; none where it lies beyond.
-    spans = [slice(max(start, 0), max(start + window, 0)) for start in starts]
-    cut = [np.zeros((window, window), values.dtype) for values in psf]
-    for out, values in zip(cut, psf, strict=True):
-        part = values[spans[0], spans[1]]
-        y, x = (max(-start, 0) for start in starts)
-        out[y : y + part.shape[0], x : x + part.shape[1]] = part
-    return MeasuredPsf(*cut), (corner[0] - starts[0], corner[1] - starts[1])
+    # Places in the frame with a window of zeros all round.
+    places = [window + min(max(start, -window), size) for start, size in zip(starts, psf.rate.shape, strict=True)]
+    y, x = (slice(place, place + window) for place in places)
+    cut = MeasuredPsf(*(np.pad(values, window)[y, x] for values in psf))
+    return cut, (corner[0] - starts[0], corner[1] - starts[1])
 
 
 def binned(psf: MeasuredPsf, factor: int) -> MeasuredPsf:

@@ -155,15 +155,9 @@ def tiles(shape: Window, window: Window, border: Border, length: Window) -> Iter
 
 def _needed(start: int, count: int, window: int, samples: int, border: Border) -> tuple[int, np.ndarray]:
     """First sample and index of every sample that results `start` to `start + count` need along one axis."""
-    first = start if border == "own" else start - margins(window)[0]
-    index = np.arange(first, first + count + window - 1)
-    if border == "edge":
-        return first, np.clip(index, 0, samples - 1)
-    if border == "reflect":
-        period = max(2 * (samples - 1), 1)
-        folded = np.abs((index + samples - 1) % period - (samples - 1)) if samples > 1 else np.zeros_like(index)
-        return first, folded
-    return first, index
+    before = (0, 0) if border == "own" else margins(window)
+    index = np.arange(samples) if border == "own" else np.pad(np.arange(samples), before, mode=border)
+    return start - before[0], index[start : start + count + window - 1]
 
 
 _tile_convolved = jax.jit(convolve)
