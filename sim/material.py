@@ -122,10 +122,7 @@ def full_wave_height_m(name: str, wavelength_m: float) -> float:
 def full_wave_wavelength_m(name: str, height_m: float) -> float:
     """The wavelength, metres, that `height_m` of the material delays by exactly one wave: lambda = (n(lambda) - 1) h.
 
-    16 levels of 75 nm in fused silica give 552 nm.
-
-    Raises:
-        InputError: no wavelength in the material's range is delayed by one wave.
+    16 levels of 75 nm in fused silica give 552 nm. An InputError where no wavelength in the range does.
     """
     from scipy.optimize import brentq
 

@@ -64,8 +64,7 @@ class PsfBank(eqx.Module):
     ) -> MetricInputs:
         """These PSFs for metrics, with the DOE that makes them, as it is and as drawn, and those of the bare lens.
 
-        Raises:
-            ValueError: the camera is not known.
+        A ValueError where the camera is not known.
         """
         if self.camera is None:
             raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
@@ -181,10 +180,8 @@ class BankOptic(Optic):
 def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
     """The optic of something that carries one, or of a bare height map `[y, x]` (metres) and a camera.
 
-    Raises:
-        ValueError: a map without a camera or of another shape than its grid, or a camera of another aperture or
-            substrate.
-        TypeError: a camera for an optic that is not made of cells.
+    A ValueError for a map without a camera, or a camera of another grid, aperture or substrate; a TypeError for a
+    camera beside an optic that is not made of cells.
     """
     if hasattr(optic, "as_optic"):
         found: Optic = optic.as_optic()

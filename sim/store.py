@@ -7,7 +7,8 @@
   number attributes are float32.
 * A digest of pixels and lengths rides along as the text `sha256` and is checked on reading (EXR itself leaves
   incompressible blocks unguarded). Files without one are taken as they are.
-* The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`).
+* The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`);
+  a path that the system refuses is an InputError.
 
 A PSF measured elsewhere (channels R, G, B, or one channel of any name; half, float or integer) is read as a bank of one
 depth with the values its author wrote: as a rule counts, perhaps negative where a background was taken off.
@@ -62,9 +63,6 @@ def write_height(
         pitch_m: cell pitch, metres.
         aperture_m: diameter of the clear aperture, metres.
         extra: further text attributes; a ValueError for a name that is taken.
-
-    Raises:
-        InputError: the system refuses the path.
     """
     texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": repr(float(aperture_m))}
     _write(Path(path), {"height": height_m}, texts, extra)
@@ -97,9 +95,6 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
         path: the file; its folder is made if missing.
         bank: PSFs; a ValueError where two depths or colours have the same name.
         extra: further text attributes; a ValueError for a name that is taken.
-
-    Raises:
-        InputError: the system refuses the path.
     """
     channels = {
         _channel_name(depth, colour): bank.energy[c, d]
@@ -166,9 +161,6 @@ def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[
         path: the file; its folder is made if missing.
         channels: maps by name, such as R, G and B; infinity allowed.
         extra: text attributes; a ValueError for a name that is taken.
-
-    Raises:
-        InputError: the system refuses the path.
     """
     shapes = {np.shape(values) for values in channels.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:

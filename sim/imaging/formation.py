@@ -54,11 +54,7 @@ class Optics(eqx.Module):
 
     @classmethod
     def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float]) -> "Optics":
-        """Optics for layers at given depths, background first, from a bank whose PSFs are mixed linearly in 1/z.
-
-        Raises:
-            InputError: a depth beyond the bank's.
-        """
+        """Optics for layers at depths (background first) within a bank's, its PSFs mixed linearly in 1/z."""
         psf = stacked([bank.at(depth) for depth in depths_m])
         return cls(psf, camera.aperture_m, camera.sensor_distance_m, bank.pixel_m)
 

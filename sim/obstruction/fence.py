@@ -99,7 +99,10 @@ class Fence(WithLimits):
         depth_m, wire_m, mesh_m = (draw_from(rng, given) for given in (self.depth_m, self.wire_m, self.mesh_m))
         plane = tilted_plane(view, depth_m, draw_from(rng, self.tilt_rad), rng.uniform(0, 2 * pi))
         plane = self.bent(rng, view, plane, mesh_m)
-        plane = turned(plane, draw_from(rng, self.rotation_rad), mirrored=bool(rng.integers(2)))
+        rotation, mirrored = draw_from(rng, self.rotation_rad), bool(rng.integers(2))
+        c, s = np.float32(cos(rotation)), np.float32(sin(rotation))
+        u, v = c * plane.u + s * plane.v, c * plane.v - s * plane.u
+        plane = plane._replace(u=-u if mirrored else u, v=v)
         diamond, row, column = draw_from(rng, self.diamond_rad), *(int(rng.integers(n)) for n in view.shape)
         wire_u, wire_v = on_a_wire(pattern, mesh_m, diamond, wire_m, rng.uniform(-0.5, 0.5))
         # A wire runs through a random pixel, so that no frame falls into a gap.
@@ -117,7 +120,8 @@ class Fence(WithLimits):
         for family in wires:
             cover, light = seen(family, plane, wire_m, lamp)
             mask, shade = cover + (1 - cover) * mask, cover * light + (1 - cover) * shade
-        colour = self.colour(rng)
+        finish = np.array(_FINISHES[rng.integers(len(_FINISHES))])
+        colour = (finish * (1 + self.colour_jitter * rng.uniform(-1, 1, 3))).astype(np.float32)
         # The light of what covers a pixel, not that times its coverage.
         bare = np.where(mask > 1e-6, shade / np.maximum(mask, 1e-6), 0)
         stain = 1 + 0.4 * layered_noise(rng, view.shape, max(view.pixels(3 * wire_m, depth_m), 2.0), octaves=3)
@@ -141,11 +145,6 @@ class Fence(WithLimits):
         across = (1 - toward**2) ** 0.5
         strength, ambient = draw_from(rng, self.light), draw_from(rng, self.ambient)
         return _Lamp(across * sin(azimuth), across * cos(azimuth), toward, strength, ambient)
-
-    def colour(self, rng: np.random.Generator) -> Float[np.ndarray, " c"]:
-        """Linear reflectance of a random finish, float32."""
-        finish = np.array(_FINISHES[rng.integers(len(_FINISHES))])
-        return (finish * (1 + self.colour_jitter * rng.uniform(-1, 1, 3))).astype(np.float32)
 
 
 class _Plane(NamedTuple):
@@ -194,13 +193,6 @@ def tilted_plane(view: CameraView, depth_m: float, tilt_rad: float, towards_rad:
     u, v = along * away * np.float32(depth_m / cos(tilt_rad)), across * away * np.float32(depth_m)
     u, v = u * cos(towards_rad) - v * sin(towards_rad), u * sin(towards_rad) + v * cos(towards_rad)
     return _Plane(u, v, away, view.pixel_at_m(depth_m))
-
-
-def turned(plane: _Plane, angle_rad: float, *, mirrored: bool) -> _Plane:
-    """Turn and mirror the coordinates within the plane."""
-    c, s = np.float32(cos(angle_rad)), np.float32(sin(angle_rad))
-    u, v = c * plane.u + s * plane.v, c * plane.v - s * plane.u
-    return plane._replace(u=-u if mirrored else u, v=v)
 
 
 def rods(across: Pixels, mesh_m: float, *, along_u: bool) -> _Wires:

@@ -71,9 +71,7 @@ class MaskFolder(WithLimits):
     def __post_init__(self) -> None:
         """Check the parameters and read every picture once.
 
-        Raises:
-            InputError: a parameter cannot be meant, the folder holds no picture that can be used, or one of its
-                pictures cannot be used and `on_skip` is not given.
+        An InputError for a parameter out of bounds, no usable picture, or one that is not usable without `on_skip`.
         """
         super().__post_init__()
         for value in self.colour:
@@ -162,11 +160,7 @@ def _averages(rows: Float[np.ndarray, "n m"], count: int, step: float, start: fl
 
 
 def read_mask(path: Path) -> MaskPicture:
-    """Read a mask and what is known of its size.
-
-    Raises:
-        InputError: the file is missing, broken, too large, or no picture; it covers nothing; or its size is no length.
-    """
+    """Read a mask and its size; an InputError for no picture, one that covers nothing, or a size that is no length."""
     values = read_pixels(path, most_pixels=_MOST_PIXELS, others="RGBA")
     full = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     values = np.clip(np.nan_to_num(values.astype(np.float32)) / np.float32(full), 0, 1)

@@ -53,8 +53,7 @@ def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> f
 def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_spectrum") -> DirectPath:
     """Prepare the direct path of one wavelength; phases are formed in float64 and wrapped before float32.
 
-    Raises:
-        InputError: eq. 6 does not hold, or the window does not fit on the padded grid.
+    An InputError where eq. 6 does not hold, or the window does not fit on the padded grid.
     """
     cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m)
