@@ -88,8 +88,11 @@ class SourceSet(NamedTuple):
         return self._chosen([0] if self.near[0] else [], [0] if self.far[0] else [], None)
 
     def _chosen(self, near: list[int], far: list[int], offset_m: Array | None) -> StepSources:
-        waves = (tuple(tuple(line[i] for i in at) for line in w) for w, at in ((self.near, near), (self.far, far)))
-        return StepSources(*waves, jnp.asarray(self.lens[:, near]), offset_m)
+        near_waves, far_waves = (
+            tuple(tuple(line[i] for i in chosen) for line in waves)
+            for waves, chosen in ((self.near, near), (self.far, far))
+        )
+        return StepSources(near_waves, far_waves, jnp.asarray(self.lens[:, near]), offset_m)
 
 
 def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSet]:
