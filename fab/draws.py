@@ -216,34 +216,30 @@ def variation_at(process: Process, seed: int, plate_m: float, key: str) -> Varia
     Raises:
         InputError: no such key in a study of this process.
     """
+    cause = None
     try:
-        return _variation_at(process, seed, plate_m, key)
+        match key.split("/"):
+            case ["nominal"]:
+                return Variation()
+            case ["expected"]:
+                return replace(process.expected(), seed=seed)
+            case ["normal", index]:
+                return normal_draw(process, seed, _index(index), plate_m)
+            case ["corners", index]:
+                return draw_at(process, corner_scores(process)[_index(index)], seed)
+            case ["one_at_a_time", name, reach]:
+                scores = one_at_a_time_scores(process, (float(reach),))
+                return draw_at(process, scores[varying(process).index(name)], seed)
+            case ["sobol", half, index]:
+                return _sobol_draw(process, seed, plate_m, half, _index(index))
+            case ["budget", what, factor, index]:
+                return _scaled_draw(process, seed, plate_m, what, float(factor), _index(index))
     except InputError:
         raise
     except (ValueError, IndexError) as error:
-        cure = "For example normal/17, expected, or a key of draws.csv."
-        raise InputError("draw", "must be the key of a plate of this study", f'"{key}"', cure) from error
-
-
-def _variation_at(process: Process, seed: int, plate_m: float, key: str) -> Variation:
-    match key.split("/"):
-        case ["nominal"]:
-            return Variation()
-        case ["expected"]:
-            return replace(process.expected(), seed=seed)
-        case ["normal", index]:
-            return normal_draw(process, seed, _index(index), plate_m)
-        case ["corners", index]:
-            return draw_at(process, corner_scores(process)[_index(index)], seed)
-        case ["one_at_a_time", name, reach]:
-            scores = one_at_a_time_scores(process, (float(reach),))
-            return draw_at(process, scores[varying(process).index(name)], seed)
-        case ["sobol", half, index]:
-            return _sobol_draw(process, seed, plate_m, half, _index(index))
-        case ["budget", what, factor, index]:
-            return _scaled_draw(process, seed, plate_m, what, float(factor), _index(index))
-        case _:
-            raise ValueError(key)
+        cause = error
+    cure = "For example normal/17, expected, or a key of draws.csv."
+    raise InputError("draw", "must be the key of a plate of this study", f'"{key}"', cure) from cause
 
 
 def _index(text: str) -> int:

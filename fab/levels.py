@@ -202,10 +202,7 @@ def height_of(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.floa
 def planes(level_map: NDArray[np.integer], levels: Levels) -> NDArray[np.uint8]:
     """Split a level map ``[y, x]`` into its etch masks ``[bit, y, x]``: 1 where mask `bit` is open (etched)."""
     etched = np.uint8(levels.count - 1) - require_levels(level_map, levels)
-    out = np.empty((levels.bits, *etched.shape), dtype=np.uint8)
-    for bit in range(levels.bits):
-        np.bitwise_and(etched >> np.uint8(bit), np.uint8(1), out=out[bit])
-    return out
+    return etched >> np.arange(levels.bits, dtype=np.uint8)[:, None, None] & np.uint8(1)
 
 
 def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], levels: Levels) -> NDArray[np.uint8]:
@@ -215,7 +212,5 @@ def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], l
         raise InputError("bit planes", rule, f"shape {bit_planes.shape}", "Give one plane per mask.")
     if bit_planes.size and (bit_planes.min() < 0 or bit_planes.max() > 1):
         raise InputError("bit planes", "every value must be 0 or 1", "another value", "Threshold the planes first.")
-    etched = np.zeros(bit_planes.shape[1:], dtype=np.uint8)
-    for bit in range(levels.bits):
-        etched |= bit_planes[bit].astype(np.uint8) << np.uint8(bit)
-    return np.uint8(levels.count - 1) - etched
+    shifted = bit_planes.astype(np.uint8) << np.arange(levels.bits, dtype=np.uint8)[:, None, None]
+    return np.uint8(levels.count - 1) - np.bitwise_or.reduce(shifted, axis=0)

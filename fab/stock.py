@@ -119,9 +119,11 @@ def _defects(particles_per_m2: float, dust: Source) -> Mapping[str, Figure]:
     )
 
 
-def _errors(**printing: Typical) -> Mapping[str, Typical]:
-    """What all processes share, which is etching, and what printing adds."""
-    return MappingProxyType({name: error.stock for name, error in DEVIATIONS.items() if error.stock} | printing)
+def _errors(alignment: Typical, **printing: Typical) -> Mapping[str, Typical]:
+    """Etching, which all processes share, the alignment of etches and chrome, and what printing adds."""
+    etching = {name: error.stock for name, error in DEVIATIONS.items() if error.stock}
+    aligned = dict.fromkeys(("overlay_y_m", "overlay_x_m", "chrome_y_m", "chrome_x_m"), alignment)
+    return MappingProxyType(etching | aligned | printing)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------
@@ -139,8 +141,7 @@ _CONTACT_ALIGNER = Stock(
     name="contact_aligner",
     title="contact aligner, laser-written chrome plates at 1:1, aligned by eye",
     errors=_errors(
-        overlay_y_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
-        overlay_x_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
+        Typical(0.0, 0.5e-6, _MA6_OVERLAY),
         rotation_rad=Typical(0.0, 10e-6, estimate("the overlay at marks 70 mm apart: 0.5 um * sqrt(2) / 70 mm")),
         magnification=Typical(
             0.0, 5e-6, estimate("a soda-lime plate expands by 8.5e-6 per kelvin more than the wafer; 0.6 kelvin")
@@ -148,8 +149,6 @@ _CONTACT_ALIGNER = Stock(
         common_cd_bias_m=Typical(0.0, 0.1e-6, estimate("exposure and development at a gap that varies by a few um")),
         cd_bias_m=Typical(0.0, 0.125e-6, _PLATE_CD),
         corner_radius_m=Typical(0.5e-6, 0.1e-6, estimate("half of the narrowest line")),
-        chrome_y_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
-        chrome_x_m=Typical(0.0, 0.5e-6, _MA6_OVERLAY),
         chrome_diameter_m=Typical(0.0, 1.27e-6, _PLATE_OPENING),
     ),
     minimum_line_m=Figure(1e-6, _MA6_LINE),
@@ -171,15 +170,12 @@ _STEPPER = Stock(
     name="stepper",
     title="i-line wafer stepper, numerical aperture 0.5, reticles five times as large",
     errors=_errors(
-        overlay_y_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
-        overlay_x_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
+        Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         rotation_rad=Typical(0.0, 1e-6, estimate("the overlay at marks 70 mm apart: 50 nm * sqrt(2) / 70 mm")),
         magnification=Typical(0.0, 1e-6, estimate("lens and reticle are trimmed to 1e-6 or 2e-6")),
         common_cd_bias_m=Typical(0.0, 30e-9, estimate("dose and focus: 10 % of a line of 0.6 um, half per edge")),
         cd_bias_m=Typical(0.0, 25e-9, sourced(f"{_PLATE_CD.text}; a fifth of it on the wafer")),
         corner_radius_m=Typical(0.25e-6, 50e-9, estimate("half of the narrowest line")),
-        chrome_y_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
-        chrome_x_m=Typical(0.0, 50e-9, _STEPPER_OVERLAY),
         chrome_diameter_m=Typical(0.0, 0.254e-6, sourced(f"{_PLATE_OPENING.text}; a fifth of it on the wafer")),
     ),
     minimum_line_m=Figure(0.5e-6, _I_LINE),
@@ -201,15 +197,12 @@ _DIRECT_WRITE = Stock(
     name="direct_write",
     title="laser writer, every layer written onto the wafer without a plate",
     errors=_errors(
-        overlay_y_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
-        overlay_x_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
+        Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
         rotation_rad=Typical(0.0, 5e-6, estimate("the overlay at marks 70 mm apart: 0.25 um * sqrt(2) / 70 mm")),
         magnification=Typical(0.0, 1e-6, estimate("silica expands by 0.55e-6 per kelvin; 2 kelvin")),
         common_cd_bias_m=Typical(0.0, 0.1e-6, estimate("dose, and focus over a wafer that is not flat")),
         cd_bias_m=Typical(0.0, 50e-9, estimate("drift of laser power between layers")),
         corner_radius_m=Typical(0.5e-6, 0.1e-6, estimate("half of a laser spot 1 um wide")),
-        chrome_y_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
-        chrome_x_m=Typical(0.0, 0.25e-6, _WRITER_OVERLAY),
         chrome_diameter_m=Typical(0.0, 0.2e-6, estimate("twice the common bias of its edge")),
     ),
     minimum_line_m=Figure(1e-6, _DWL),

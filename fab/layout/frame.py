@@ -82,7 +82,10 @@ def draw_frame(
     marks = die_marks(plates, dbu_m)
     site = alignment_site(plates, dbu_m)
     monitor = process_monitor(level_map.levels, plates, level_map.grid.pitch_m, dbu_m, minimum_line_m)
-    marks, side_m = _below(marks, chrome_m)
+    # The DOE is in the middle of its die, the marks are below its chrome.
+    width, height = _size_m(marks)
+    half = chrome_m / 2 + 2 * _GAP_M + height
+    marks, side_m = moved(marks, 0, -(half - _GAP_M / 2 - height / 2)), max(2 * half, width + _GAP_M)
     pitch = wafer.pitch_m or math.ceil(side_m / MM - 1e-6) * MM
     if pitch < side_m - dbu_m:
         rule = f"must be {format_length(side_m)} or more, what a die with its marks needs"
@@ -106,8 +109,13 @@ def draw_frame(
     drawn = (*(0,) * (len(dies) - len(splits) + 1), *range(1, len(splits)))
     placed = [Reference(names["SITE"], -unit(site_m)), Reference(names["SITE"], unit(site_m))]
     placed += [Reference(names["TEST"], 0, unit(monitor_m))]
-    on_wafer = (*_die_references(raster, dies, drawn, die_cells, unit, pitch), *placed)
-    wafer_cell = Cell(names["WAFER"], {WAFER: unit.circle(wafer.diameter_m)}, on_wafer)
+    on_wafer = [Reference(die_cells[n].name, unit(x), unit(y)) for n, (x, y) in zip(drawn, dies, strict=True)]
+    if not any(drawn):
+        # One raster, since all dies are alike.
+        (rows, columns), step = raster, unit(pitch)
+        raster_steps = (step * (columns > 1), step * (rows > 1))
+        on_wafer = [Reference(on_wafer[0].cell, on_wafer[0].x, on_wafer[0].y, columns, rows, *raster_steps)]
+    wafer_cell = Cell(names["WAFER"], {WAFER: unit.circle(wafer.diameter_m)}, (*on_wafer, *placed))
     labels = _labels(plates, wafer, stem, level_map.digest, dbu_m)
     top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
     sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
@@ -126,22 +134,6 @@ def _titled(marks: Part, split: DieSplit, plate: Photomask) -> Part:
     title = centred(written(plate, split.lettering, _TITLE_STROKE_UM, marks.dbu_m))
     _, y0, _, y1 = marks.box
     return joined([marks, moved(title, 0, -(y0 + y1) / 2 * marks.dbu_m)])
-
-
-def _die_references(
-    raster: tuple[int, int],
-    dies: Sequence[tuple[float, float]],
-    drawn: Sequence[int],
-    cells: Sequence[Cell],
-    unit: "_InUnits",
-    pitch_m: float,
-) -> tuple[Reference, ...]:
-    """Place the dies: as one raster where all are alike, else one by one."""
-    if any(drawn):
-        return tuple(Reference(cells[n].name, unit(x), unit(y)) for n, (x, y) in zip(drawn, dies, strict=True))
-    (rows, columns), step = raster, unit(pitch_m)
-    first = (unit(dies[0][0]), unit(dies[0][1]))
-    return (Reference(cells[0].name, *first, columns, rows, step * (columns > 1), step * (rows > 1)),)
 
 
 class _InUnits:
@@ -166,13 +158,6 @@ class _InUnits:
 def _size_m(part: Part) -> tuple[float, float]:
     x0, y0, x1, y1 = part.box
     return (x1 - x0) * part.dbu_m, (y1 - y0) * part.dbu_m
-
-
-def _below(marks: Part, chrome_m: float) -> tuple[Part, float]:
-    """Put a die's marks below its chrome; return them and the edge of the die, which has its DOE in the middle."""
-    width, height = _size_m(marks)
-    half = chrome_m / 2 + 2 * _GAP_M + height
-    return moved(marks, 0, -(half - _GAP_M / 2 - height / 2)), max(2 * half, width + _GAP_M)
 
 
 def _raster(dies: tuple[int, int], pitch_m: float) -> tuple[tuple[float, float], ...]:

@@ -16,6 +16,8 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 
+# Glass below the deepest floor of a mesh or a patch.
+BASE_M = 10e-6
 _MOST_CELLS = 4_000_000
 # Heights that differ by less than this part of the relief are one height that was rounded differently.
 _CLOSEST = 1e-9

@@ -12,10 +12,10 @@ import numpy as np
 
 from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import Columns, reduced_cells, window_cells
+from fab.solids.columns import BASE_M, Columns, reduced_cells, window_cells
 from fab.solids.mesh import Mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solids.model import BASE_M, MESH_CELLS, DoeModel, MeshedRelief, ModelKind, model_entry, window_of
+from fab.solids.model import MESH_CELLS, DoeModel, MeshedRelief, ModelKind, model_entry, window_of
 from fab.solids.step_files import volume_problems
 from fab.units import MM
 

@@ -11,15 +11,13 @@ from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import Columns, PixelWindow, reduced_cells, window_cells
+from fab.solids.columns import BASE_M, Columns, PixelWindow, reduced_cells, window_cells
 from fab.solids.mesh import Mesh, closed_volume_m3, relief_mesh
 from fab.solids.patch import Patch
 from fab.solids.step import Body
 from fab.units import MM, format_length
 
 MESH_CELLS = 400
-# Glass below the deepest floor of a mesh or a patch.
-BASE_M = 10e-6
 
 
 class MeshedRelief(NamedTuple):

@@ -16,7 +16,7 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.layout.polygons import rectangles
 from fab.level_map import LevelMap
-from fab.solids.columns import PixelWindow
+from fab.solids.columns import BASE_M, PixelWindow
 from fab.solids.step import Body, boxes, write_step
 from fab.units import format_length
 
@@ -79,13 +79,13 @@ def _tops(level_map: LevelMap, window: PixelWindow) -> dict[int, NDArray[np.int3
     return tops
 
 
-def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float) -> Body:
+def patch_body(level_map: LevelMap, window: PixelWindow) -> Body:
     """Return volume and centre of all the boxes that `patch_step` writes."""
     levels, grid = level_map.levels, level_map.grid
-    heights_m = levels.heights_m()[window.cut(level_map.level)] + base_m
+    heights_m = levels.heights_m()[window.cut(level_map.level)] + BASE_M
     x_m, y_m = ((edges[1:] + edges[:-1]) / 2 for edges in window.edges_m(grid))
     total = math.fsum(heights_m.ravel())
-    bottom_m = -float(levels.heights_m().max()) - base_m
+    bottom_m = -float(levels.heights_m().max()) - BASE_M
     centre_m = (
         math.fsum(heights_m.sum(axis=0) * x_m) / total,
         math.fsum(heights_m.sum(axis=1) * y_m) / total,
@@ -94,16 +94,14 @@ def patch_body(level_map: LevelMap, window: PixelWindow, base_m: float) -> Body:
     return Body(total * grid.pitch_m**2, centre_m)
 
 
-def patch_step(path: str | Path, level_map: LevelMap, window: PixelWindow, base_m: float) -> None:
-    """Write a window of a map as STEP: part PATCH, boxes on `base_m` (metres) of glass, 7 kB of file each."""
+def patch_step(path: str | Path, level_map: LevelMap, window: PixelWindow) -> None:
+    """Write a window of a map as STEP: part PATCH, boxes on `BASE_M` of glass, 7 kB of file each."""
     window.require(level_map.grid)
-    if not 0 < base_m < math.inf:
-        raise InputError("patch base", "must be positive and finite", base_m, "Give the glass below the relief.")
     tops = _tops(level_map, window)
     x_m, y_m = window.edges_m(level_map.grid)
     heights_m = level_map.levels.heights_m()
     z_m = heights_m - heights_m.max()
-    bottom = float(z_m.min()) - base_m
+    bottom = float(z_m.min()) - BASE_M
     corners = (
         (float(x_m[x0]), float(y_m[y0]), bottom, float(x_m[x1]), float(y_m[y1]), float(z_m[level]))
         for level, found in tops.items()

@@ -10,7 +10,7 @@ import numpy as np
 
 from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
-from fab.solids.model import BASE_M, DoeModel, ModelKind, model_entry
+from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.solids.patch import patch_body, patch_step
 from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
 from fab.solids.step import step_bodies
@@ -56,8 +56,8 @@ def _write_patch(path: Path, model: DoeModel) -> ModelEntry | None:
     if model.patch is None or not model.patch.step or model.detail is None:
         return None
     level_map, window = model.level_map, model.patch.window(model.level_map.grid)
-    patch_step(path, level_map, window, BASE_M)
-    body = patch_body(level_map, window, BASE_M)
+    patch_step(path, level_map, window)
+    body = patch_body(level_map, window)
     about = f"millimetres; boxes side by side, {model.detail.about}"
     return model_entry(path, about, {"PATCH": body}, _RELATIVE_ERROR, window=window)
 

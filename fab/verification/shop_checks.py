@@ -120,8 +120,10 @@ def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> li
     chrome = expected.chrome_layer(entry)
     for name, drawn in expected.etch_layers(entry).items():
         cell = layout.cell(name)
+        if cell is None:
+            continue
         stated = {**drawn, **({chrome: expected.manifest.chrome} if chrome is not None else {})}
-        for layer, one in stated.items() if cell is not None else ():
+        for layer, one in stated.items():
             found = geometry(cell.shapes.get(layer, Shapes()), layout.dbu_m)
             wanted = {"polygons": one.polygons, "area_um2": one.area_um2, "box_um": one.box_um}
             problems += [

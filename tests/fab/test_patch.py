@@ -5,8 +5,7 @@ import pytest
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, height_of
-from fab.solids.columns import PixelWindow
-from fab.solids.model import BASE_M
+from fab.solids.columns import BASE_M, PixelWindow
 from fab.solids.patch import Patch, patch_body, patch_step
 from fab.solids.step import step_bodies
 from fab.units import NM, UM
@@ -27,9 +26,9 @@ PATCHES = {
 def test_a_patch_has_the_volume_of_its_columns(tmp_path, level_map):
     level_map = level_map_from(level_map, SIXTEEN, 1.85 * UM)
     window = PixelWindow(0, 0, *level_map.shape)
-    patch_step(tmp_path / "p.step", level_map, window, UM)
-    want = (height_of(level_map.level, SIXTEEN) + UM).sum() * (1.85 * UM) ** 2
-    assert patch_body(level_map, window, UM).volume_m3 == pytest.approx(want, rel=1e-14)
+    patch_step(tmp_path / "p.step", level_map, window)
+    want = (height_of(level_map.level, SIXTEEN) + BASE_M).sum() * (1.85 * UM) ** 2
+    assert patch_body(level_map, window).volume_m3 == pytest.approx(want, rel=1e-14)
     # Edges of 1e-3 mm are written with 15 digits.
     assert volumes(step_bodies(tmp_path / "p.step")) == pytest.approx({"PATCH": want}, rel=1e-11)
 
@@ -42,13 +41,13 @@ def test_a_patch_lies_where_its_window_does(tmp_path):
     level_map = np.random.default_rng(2).integers(0, 16, (20, 30)).astype(np.uint8)
     level_map[5, 8] = 15
     level_map, window = level_map_from(level_map), PixelWindow(5, 8, 4, 6)
-    patch_step(tmp_path / "p.step", level_map, window, BASE_M)
+    patch_step(tmp_path / "p.step", level_map, window)
     (shape,) = [shape for shape, *_ in cadquery.Assembly.importStep(str(tmp_path / "p.step"))]
     bounds = shape.BoundingBox(1e-9)
     box = [bounds.xmin, bounds.xmax, bounds.ymin, bounds.ymax, bounds.zmin, bounds.zmax]
     # From the blank surface down to the deepest floor and 10 um more.
     assert box == pytest.approx([-7e-3, -1e-3, -5e-3, -1e-3, -11.125e-3, 0], abs=1e-6)
-    want, found = patch_body(level_map, window, BASE_M), step_bodies(tmp_path / "p.step")["PATCH"]
+    want, found = patch_body(level_map, window), step_bodies(tmp_path / "p.step")["PATCH"]
     assert found.volume_m3 == pytest.approx(want.volume_m3, rel=1e-11)
     # A hundredth of a nanometre, as in the proof of an order.
     assert found.centre_m == pytest.approx(want.centre_m, abs=1e-11)
@@ -57,9 +56,9 @@ def test_a_patch_lies_where_its_window_does(tmp_path):
 def test_patches_too_large_for_step_are_refused_with_the_number_of_boxes(tmp_path):
     level_map = level_map_from(np.indices((50, 50)).sum(axis=0) % 2)
     with pytest.raises(InputError, match=r"at most 2000 boxes.*got 2500 in 50 x 50 pixels.*mesh"):
-        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 0, 50, 50), UM)
+        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 0, 50, 50))
     with pytest.raises(InputError, match="window"):
-        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 46, 5, 5), UM)
+        patch_step(tmp_path / "p.step", level_map, PixelWindow(0, 46, 5, 5))
     assert not list(tmp_path.iterdir())
 
 
