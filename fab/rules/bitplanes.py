@@ -20,7 +20,7 @@ _EACH = np.uint64(0x0101010101010101)
 # Carries bit 0 of byte i to bit 56 + i.
 _GATHER = np.uint64(0x0102040810204080)
 _THREADS = 4
-_ONE, _SIX, _TOP = np.uint64(1), np.uint64(6), np.uint64(63)
+_ONE, _TOP = np.uint64(1), np.uint64(63)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -32,32 +32,21 @@ def _ones(word):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _pack(levels, top, spans, out):  # pragma: no cover - compiled
+def _pack(levels, top, out):  # pragma: no cover - compiled
     # `levels` holds eight pixels per word; no byte borrows from the next, since none exceeds `top`.
     bits, ny = out.shape[:2]
     for y in range(ny):
         out[:, y] = NONE
-        first, last = np.uint64(spans[y, 0]), np.uint64(spans[y, 1])
-        if first >= last:
-            continue
         for group in range(levels.shape[1]):
             etched = top * _EACH - levels[y, group]
             place = np.uint64(8 * (group & 7))
             for bit in range(bits):
                 byte = (((etched >> np.uint64(bit)) & _EACH) * _GATHER) >> np.uint64(56)
                 out[bit, y, group >> 3] |= byte << place
-        for bit in range(bits):
-            out[bit, y, : first >> _SIX] = NONE
-            out[bit, y, first >> _SIX] &= ALL << (first & _TOP)
-            out[bit, y, (last - _ONE) >> _SIX] &= ALL >> (_TOP - ((last - _ONE) & _TOP))
-            out[bit, y, ((last - _ONE) >> _SIX) + _ONE :] = NONE
 
 
-def pack(level_map: NDArray[np.uint8], bits: int, spans: NDArray[np.int64]) -> Words:
-    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into etch masks ``[bit, y, word]``, set where etched.
-
-    `spans` holds first and end column of every row that may be etched, ``(ny, 2)``.
-    """
+def pack(level_map: NDArray[np.uint8], bits: int) -> Words:
+    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into etch masks ``[bit, y, word]``, set where etched."""
     ny, nx = level_map.shape
     top = np.uint64(2**bits - 1)
     if nx % 8:
@@ -66,7 +55,7 @@ def pack(level_map: NDArray[np.uint8], bits: int, spans: NDArray[np.int64]) -> W
     out = np.empty((bits, ny, -(-nx // 64)), dtype=np.uint64)
     rows = [slice(ny * i // _THREADS, ny * (i + 1) // _THREADS) for i in range(_THREADS)]
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda part: _pack(groups[part], top, spans[part], out[:, part]), rows))
+        list(pool.map(lambda part: _pack(groups[part], top, out[:, part]), rows))
     return out
 
 

@@ -225,15 +225,6 @@ def _metres(length_m: float) -> float:
     return round(length_m, 15)
 
 
-def _spans(grid: Grid, aperture_m: float) -> NDArray[np.int64]:
-    """First and end column of the clear aperture in every row; the same pixels as `Grid.inside_circle`."""
-    limit = (aperture_m / 2) ** 2 * (1 + 1e-12)
-    half = grid.axis_m("x")[grid.shape[1] // 2 :]
-    reach = np.searchsorted(half**2, limit - grid.axis_m("y") ** 2, side="right")
-    first = grid.shape[1] // 2 + (grid.shape[1] % 2) - reach
-    return np.stack([first, np.maximum(grid.shape[1] // 2 + reach, first)], axis=1)
-
-
 def _off_grid(grid: Grid, rules: Rules) -> OffGrid:
     address_m = pixel_edges(grid).dbu_m if rules.address_m is None else rules.address_m
     doubled = 2 * round(address_m * _FEMTO)
@@ -315,9 +306,8 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, aperture_m = level_map.grid, level_map.aperture_m
-    spans = np.clip(_spans(grid, aperture_m), 0, grid.shape[1])
-    area = int(np.sum(spans[:, 1] - spans[:, 0]))
-    words = bits.pack(level_map.level, levels.bits, spans)
+    area = int(np.count_nonzero(grid.inside_circle(aperture_m)))
+    words = bits.pack(level_map.level, levels.bits)
     with ThreadPoolExecutor() as pool:
         tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)

@@ -44,7 +44,7 @@ def klayout_places(pairs: kdb.EdgePairs) -> set[tuple[int, ...]]:
 
 def own_places(plane, outside, fewest) -> set[tuple[int, ...]]:
     """All narrow places as boxes, from the functions that the check is made of."""
-    words = bits.pack(1 - plane, 1, np.tile([[0, plane.shape[1]]], (plane.shape[0], 1)))[0]
+    words = bits.pack(1 - plane, 1)[0]
     left, alone, found = words if outside == bits.NONE else ~words, np.empty_like(words), set()
     whole = left
     for axis in (0, 1):
