@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-
 _PICTURES = (".png", *TIFF_FILES)
 
 

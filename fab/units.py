@@ -19,7 +19,6 @@ MM = 1e-3
 
 _LENGTH_STEPS = ((1.0, "m"), (MM, "mm"), (UM, "um"), (NM, "nm"))
 
-
 # One number and one unit, so that no text is ever evaluated as an expression.
 _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_]+|\N{DEGREE SIGN})\s*")
 

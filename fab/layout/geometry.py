@@ -29,7 +29,6 @@ _NANO_FM = 10**6
 _UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
 _LIMIT = 2**31 - 1
 
-
 # x0, y0, x1, y1
 Box = tuple[int, int, int, int]
 

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 _TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
 
-
 Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
