@@ -52,12 +52,6 @@ class Layer:
         return f"{self.number}/{self.datatype}"
 
 
-def layer_from(text: str) -> Layer:
-    """The layer of a short form, such as ``3/0``."""
-    number, datatype = text.split("/")
-    return Layer(int(number), int(datatype))
-
-
 @dataclass(frozen=True, eq=False)
 class Shapes:
     """Rectangles ``(n, 4)``, x0 < x1 and y0 < y1, and simple polygons ``(v, 2)``, not closed, in database units."""

@@ -207,12 +207,6 @@ def _sheet_number(path: Path, data: Mapping[str, Any], key: str) -> float:
     return float(value)
 
 
-def _edge_moves_m(path: Path, data: Mapping[str, Any]) -> dict[str, float]:
-    order = data.get("order")
-    rows = [row for row in order if isinstance(row, Mapping)] if isinstance(order, list) else []
-    return {str(row.get("plate")): _sheet_number(path, row, "edge_move_nm") * NM for row in rows}
-
-
 def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
     """Read a filled run sheet; InputError for none, one of another design, or an impossible value, named by key."""
     data = read_json(path)
@@ -224,7 +218,9 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
         rule = f"must be the run sheet of this design (level map {digest[:12]})"
         cure = "Give the run that the wafer was made from, or its masks."
         raise InputError(str(path), rule, _short(data.get("level_map_sha256"))[:14], cure)
-    moves = _edge_moves_m(path, data)
+    order = data.get("order")
+    rows = [row for row in order if isinstance(row, Mapping)] if isinstance(order, list) else []
+    moves = {str(row.get("plate")): _sheet_number(path, row, "edge_move_nm") * NM for row in rows}
     measured = _Table(path, "measured", data.get("measured"))
     names = [f"mask {bit + 1}" for bit in range(levels.bits)]
     masks = tuple(

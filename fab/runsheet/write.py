@@ -269,17 +269,12 @@ def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None 
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
-        finalize=_plain,
+        finalize=lambda value: f"{value:.10g}" if isinstance(value, float) else value,  # 75.0 as 75
     )
     environment.filters["clock"] = lambda seconds: "{}:{:02d}".format(*divmod(round(seconds), 60))
     environment.filters["distance"] = format_length
     source = None if picture is None else "data:image/png;base64," + base64.b64encode(picture).decode()
     return environment.get_template("runsheet.html").render(sheet=content, json_name=json_name, picture=source)
-
-
-def _plain(value: object) -> object:
-    """Write 75.0 as 75."""
-    return f"{value:.10g}" if isinstance(value, float) else value
 
 
 def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:

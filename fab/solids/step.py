@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -171,12 +171,6 @@ def _silence() -> Iterator[None]:
             messenger.AddPrinter(printer)
 
 
-def _recount() -> Callable[[re.Match[bytes]], bytes]:
-    """Number the placements of parts from 1; the kernel counts on from file to file."""
-    numbers = itertools.count(1)
-    return lambda found: b"%s'%d',%s;" % (found[1], next(numbers), found[2].replace(b"\n", b"").replace(b"  ", b""))
-
-
 def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
     """Write named parts, shapes of the kernel, as one STEP assembly whose bytes depend on them alone."""
 
@@ -210,7 +204,13 @@ def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
         for setter in (header.SetPreprocessorVersion, header.SetOriginatingSystem, header.SetAuthorisation):
             setter(text("doedesign"))
         writer.WriteStream(stream)
-    write_atomic(path, _COUNTED.sub(_recount(), stream.getvalue()))
+    # The kernel counts the placements of parts on from file to file.
+    numbers = itertools.count(1)
+
+    def numbered(found: re.Match[bytes]) -> bytes:
+        return b"%s'%d',%s;" % (found[1], next(numbers), found[2].replace(b"\n", b"").replace(b"  ", b""))
+
+    write_atomic(path, _COUNTED.sub(numbered, stream.getvalue()))
 
 
 def step_bodies(path: str | Path) -> dict[str, Body]:

@@ -31,7 +31,7 @@ from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
 from fab.layout.compensation import read_back
-from fab.layout.geometry import Layer, PixelEdges, layer_from, pixel_edges
+from fab.layout.geometry import Layer, PixelEdges, pixel_edges
 from fab.layout.polygons import paint
 from fab.level_map import level_digest
 from fab.levels import Levels
@@ -193,7 +193,7 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
     again = GdstkReader(expected.etch_layers(entry), expected.edges)
-    others = dict.fromkeys(layer_from(one.layer) for cell in entry.cells for one in cell.layers)
+    others = dict.fromkeys(Layer(*map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
     problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
