@@ -1,6 +1,10 @@
 """The notebook session of the README, as a user types it, with the quick spec; every value draws itself."""
 
+import json
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -16,7 +20,8 @@ import doedesign as dd
 import fab
 import sim
 
-QUICK = Path(__file__).parents[1] / "examples" / "quick.toml"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+QUICK = EXAMPLES / "quick.toml"
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +108,19 @@ def test_a_capture_and_its_reconstruction(design: dd.Design, tmp_path: Path):
     picture = dd.Model.released().reconstruct(shot)
     assert np.isfinite(np.asarray(picture.light)).all()
     picture.plot()
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path):
+    """Cell by cell in a process of its own, beside a copy of the examples."""
+    cells = json.loads((EXAMPLES / "session.ipynb").read_text())["cells"]
+    program = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    shutil.copytree(EXAMPLES, tmp_path / "examples")
+    # Workers of a study import the main program, so it has to know that it is one.
+    indented = "".join(f"    {line}\n" for line in program.splitlines())
+    (tmp_path / "session.py").write_text(f'if __name__ == "__main__":\n{indented}')
+    done = subprocess.run(
+        [sys.executable, "session.py"], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "masks" / "quick" / "manifest.json").is_file()
