@@ -52,6 +52,13 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("repeatable")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile without optimisation where most programs run once; the long tests run the code that users run."""
+    if config.option.markexpr != "slow":
+        quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
+
+
 # Above this, a test process forgets the programs it compiled when a module of tests is done; jax itself never does.
 RESIDENT_BYTES = 1.6e9
 
