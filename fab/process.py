@@ -80,7 +80,7 @@ class Defects:
 
 @dataclass(frozen=True)
 class Process:
-    """What a fab lab does to a plate, and how well; lengths in metres.
+    """Etches that a fab lab makes, and how well; lengths in metres.
 
     Attributes:
         levels: the staircase that the etches make together.
