@@ -168,7 +168,7 @@ class HeightOptic(CellOptic):
     """A DOE given by its height map.
 
     Attributes:
-        height_m: `[y, x]` DOE height, metres; None for the bare lens.
+        height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.
         deviation: `[line, y, x]` transmission of a DOE as fabricated over that of its heights, or None.
         source_kind: how sources are described; `SeparableSource` where a compiled step takes many of them.
     """
@@ -181,12 +181,12 @@ class HeightOptic(CellOptic):
 
     @classmethod
     def of(cls, camera: Camera, height_m: Any = None) -> "HeightOptic":
-        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); none for the bare lens."""
-        if height_m is not None and np.shape(height_m) != camera.grid.shape:
-            got = np.shape(height_m)
-            raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {got}")
-        coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return cls(camera, coverage, None if height_m is None else jnp.asarray(height_m, jnp.float32))
+        """A height map `[y, x]` on `camera.grid`, metres (numpy or jax, perhaps traced); flat for the bare lens."""
+        # A flat map shares its compiled programs with every other.
+        height = jnp.asarray(np.zeros(camera.grid.shape) if height_m is None else height_m, jnp.float32)
+        if height.shape != camera.grid.shape:
+            raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
+        return cls(camera, jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)), height)
 
     def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""

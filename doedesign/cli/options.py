@@ -39,6 +39,9 @@ _PLACES = {
     "scale_m": "--scale",
     "aperture_m": "--aperture",
     "tile, overlap": "--tile, --overlap",
+    "propagation": "optics.propagation",
+    "camera.window": "sensor.window",
+    "sensor.pattern": "sensor.bayer",
 }
 _OPTIONS = {
     "Give the pitch of a pixel": "Add --pitch-um",
