@@ -193,7 +193,8 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
     again = GdstkReader(expected.etch_layers(entry), expected.edges)
-    others = dict.fromkeys(Layer(*map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers)
+    numbers = [tuple(map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers]
+    others = dict.fromkeys(Layer(number, datatype) for number, datatype in numbers)
     readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
     problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
     problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
