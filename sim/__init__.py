@@ -19,6 +19,7 @@ Reading order, from the substance to the picture:
     imaging     from a scene to the light on the sensor
     noise       fast Poisson counts, and noise that gradients pass through
     sensor      from light to raw numbers, and back to an image
+    tracing     sums and stacks of arrays that jax may be tracing
     store       PSF banks, height maps and pictures as OpenEXR files
     plots       pictures of all this
 

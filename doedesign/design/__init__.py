@@ -7,5 +7,6 @@ objectives    what a design is judged by
 etch_depths   etch depths that suit a design
 problem       spec -> loss of one step, ready to differentiate
 optimize      the loop
+design        the result: a level map, the camera it is for, and how it was found
 metrics       the table of numbers every design gets
 """
