@@ -23,6 +23,8 @@ import sim
 EXAMPLES = Path(__file__).parents[1] / "examples"
 QUICK = EXAMPLES / "quick.toml"
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def design(tmp_path_factory: pytest.TempPathFactory) -> dd.Design:
@@ -111,7 +113,6 @@ def test_a_capture_and_its_reconstruction(design: dd.Design, tmp_path: Path):
     picture.plot()
 
 
-@pytest.mark.slow
 def test_the_notebook_runs(tmp_path: Path):
     """Cell by cell in a process of its own, beside a copy of the examples."""
     cells = json.loads((EXAMPLES / "session.ipynb").read_text())["cells"]

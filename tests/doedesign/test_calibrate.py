@@ -142,6 +142,7 @@ def test_what_only_adds_up_is_known_only_as_a_sum(tmp_path: Path):
     assert not any(result.determined.values())
 
 
+@pytest.mark.slow
 def test_fewer_electrons_are_less_certain_and_still_right(tmp_path: Path):
     design, process = small()
     sigmas = {}
@@ -157,6 +158,7 @@ def test_fewer_electrons_are_less_certain_and_still_right(tmp_path: Path):
     assert (sigmas[3e5] > 2.0 * sigmas[3e6]).all()
 
 
+@pytest.mark.slow
 def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
     """Half of the pixels, as the green ones of a RAW file lie; the others are never looked at."""
     design, process = small()

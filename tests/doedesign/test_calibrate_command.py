@@ -120,6 +120,7 @@ def test_the_estimate_is_a_process_like_any_other(run: Path, fitted: tuple[int, 
     assert json.loads(out)["paths"]
 
 
+@pytest.mark.slow
 def test_the_same_measurement_gives_the_same_bytes(run: Path, fitted: tuple[int, str, str], tmp_path: Path):
     code, out, said = call("calibrate", run, run.parent / "measurement.toml", "--out", tmp_path / "again")
     assert code == 0, said

@@ -43,7 +43,7 @@ def test_loss_falls(parametrization: str, quantisation: str) -> None:
     assert np.mean(history[-6:]) < np.mean(history[:6])
 
 
-@pytest.mark.parametrize("parametrization", ["freeform", "radial"])
+@pytest.mark.parametrize("parametrization", ["freeform", pytest.param("radial", marks=pytest.mark.slow)])
 def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, f"optimize.parametrization={parametrization}"])
     problem, scene = problem_of(spec, {})

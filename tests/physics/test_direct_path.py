@@ -39,7 +39,7 @@ def slit_intensity(x_m: np.ndarray, width_m: float, distance_m: float) -> np.nda
 
 
 @pytest.mark.parametrize("kernel", ["fresnel", "angular_spectrum"])
-@pytest.mark.parametrize("distance_m", [6e-3, 20e-3])
+@pytest.mark.parametrize("distance_m", [pytest.param(6e-3, marks=pytest.mark.slow), 20e-3])
 def test_square_opening(kernel: Kernel, distance_m: float):
     """A square of 200 um; its edges lie on cell edges."""
     camera = without_lens(800, 0.4e-3, distance_m, 2e-6, 120)

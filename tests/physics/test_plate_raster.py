@@ -192,14 +192,23 @@ ALIKE_M = float(np.sqrt(32 / (1 - np.pi / 4))) * F
     [
         # A corner is a point in the middle of its area; from 0.44 waves per cell its arms, 0.4 cells long, are seen.
         pytest.param(TWO, ALONE, 0.06, 0.12, id="one mask"),
-        pytest.param(TWO, {**ALONE, "common_cd_bias_m": 8 * F}, 0.06, 0.12, id="one mask, wide openings"),
-        pytest.param(TWO, {**ALONE, "common_cd_bias_m": -8 * F}, 0.06, 0.12, id="one mask, narrow openings"),
-        pytest.param(SIXTEEN, TOGETHER, 0.08, 0.14, id="the same corner in several masks"),
+        pytest.param(
+            TWO, {**ALONE, "common_cd_bias_m": 8 * F}, 0.06, 0.12, id="one mask, wide openings", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            TWO,
+            {**ALONE, "common_cd_bias_m": -8 * F},
+            0.06,
+            0.12,
+            id="one mask, narrow openings",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(SIXTEEN, TOGETHER, 0.08, 0.14, id="the same corner in several masks", marks=pytest.mark.slow),
         # Where another mask's edge runs through the area, the area is taken to lie on one side of it.
         pytest.param(SIXTEEN, OVERLAY, 0.18, 0.24, id="corners of different masks apart"),
-        pytest.param(SIXTEEN, HALF_CELL, 0.14, 0.2, id="half a cell apart"),
+        pytest.param(SIXTEEN, HALF_CELL, 0.14, 0.2, id="half a cell apart", marks=pytest.mark.slow),
         # Worst case: several edges run through every area. Measured 0.74 and 0.88; the change is 3e-3 of the light.
-        pytest.param(SIXTEEN, CLOSE, 0.85, 1.0, id="corners of different masks close together"),
+        pytest.param(SIXTEEN, CLOSE, 0.85, 1.0, id="corners of different masks close together", marks=pytest.mark.slow),
     ],
 )
 def test_corners_change_what_they_change_on_a_raster(levels: Levels, others: dict, red: float, blue: float):

@@ -31,7 +31,10 @@ def wait_for(path: Path, process) -> None:
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [(signal.SIGKILL, -signal.SIGKILL), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)],
+)
 def test_killed_after_a_checkpoint(tiny, cli, content, uninterrupted, start_process, tmp_path, kind, code):
     folder = tmp_path / "run"
     process = start_process("optimize", tiny, "--out", folder, *LONG)

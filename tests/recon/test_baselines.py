@@ -126,6 +126,7 @@ def test_lucy_is_that_of_scikit_image_far_from_edges(capture: np.ndarray):
     np.testing.assert_allclose(ours[inner], theirs[inner], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_lucy_stops_at_the_noise(capture: np.ndarray):
     psf = ring_psf()
     variance = noise_variance(capture, SENSOR)

@@ -68,7 +68,7 @@ def planned(name: str, moved: bool) -> tuple[Camera, FarField]:
     return camera, displaced(plan, jnp.array([0.4e-6, -0.7e-6])) if moved else plan
 
 
-@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("moved", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PLANS)
 def test_value_and_gradient(name: str, moved: bool, rng: np.random.Generator):
     camera, plan = planned(name, moved)

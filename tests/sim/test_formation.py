@@ -97,6 +97,7 @@ def test_prepared_optics_give_the_same(rng, model: Model):
     np.testing.assert_allclose(capture(scene, optics.prepared(SHAPE), model), capture(scene, optics, model), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_gradients_are_finite_differences(rng, model: Model):
     """Along a random direction in everything at once: PSFs, images and mask."""

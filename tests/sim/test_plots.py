@@ -130,6 +130,7 @@ def test_programmers_mistakes_are_named(rng: np.random.Generator):
         plot_pattern(np.zeros((4, 4)), np.zeros((5, 5)), CAMERA, efficiency=0.0, uniformity=0.0)
 
 
+@pytest.mark.slow
 def test_unusual_banks_are_drawn(rng: np.random.Generator):
     """An odd window of few pixels, one and five colours, many depths, a dark bank."""
     five = tuple(Colour(f"c{i}", (450e-9 + 50e-9 * i, 460e-9 + 50e-9 * i), (0.5, 0.5)) for i in range(5))

@@ -91,6 +91,7 @@ def test_psfs_of_the_direct_path(propagation: Any):
     check(lambda height: psf(height, fine, NEAR_M, propagation=propagation).energy, wrapped_map(64), 2e-3)
 
 
+@pytest.mark.slow
 def test_a_doe_as_fabricated():
     """Its PSF, 0th order and overlap with the design as functions of a number (metres) that moves several errors."""
     process, nominal = Process(LEVELS), as_fabricated(LEVEL, ONE, Process(LEVELS), variation_of(1, {}))
