@@ -60,7 +60,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 # Above this, a test process forgets the programs it compiled when a module of tests is done; jax itself never does.
-RESIDENT_BYTES = 1.6e9
+RESIDENT_BYTES = 1.3e9
 
 
 def resident_bytes() -> int:
