@@ -18,6 +18,11 @@ def on_host(array: Any) -> Any:
     return array if isinstance(array, Tracer) else np.asarray(array)
 
 
+def single(value: Any) -> Any:
+    """A number or array in single precision: numpy's, or jax's where it is traced."""
+    return (jnp if is_traced(value) else np).asarray(value, np.float32)
+
+
 def total(array: Any) -> Any:
     """Sum of an array: a float, or a traced scalar."""
     return jnp.sum(array) if is_traced(array) else float(np.sum(np.asarray(array), dtype=np.float64))

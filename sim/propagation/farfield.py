@@ -34,7 +34,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jaxtyping import Array, Complex, Float, Inexact, PyTree
 from scipy.fft import next_fast_len
 
 from sim.camera import Camera
@@ -53,11 +53,10 @@ class FarField(eqx.Module):
 
     gather: Banded  # samples -> pixels along either axis, with all constant factors; `spread` is its transpose
     spread: Banded
-    # Samples of the field -> samples of the intensity along either axis, with the cell's sinc: real and imaginary
-    # part of the weights (only the real one for a distant source), or none if the samples are the same; `coarsen`
-    # holds their transposes
-    refine: tuple[Banded, ...]
-    coarsen: tuple[Banded, ...]
+    # Samples of the field -> samples of the intensity along either axis, with the cell's sinc (real weights for a
+    # distant source), or None if the samples are the same; `coarsen` is its transpose
+    refine: Banded | None
+    coarsen: Banded | None
     # Phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`)
     tilt: tuple[Complex[Array, " cell"], Complex[Array, " cell"]] | None
     cells: int = eqx.field(static=True)  # DOE cells per axis
@@ -120,7 +119,7 @@ def plan_far_field(
     amount = pitch**2 / scale * fine / np.sqrt(np.pi * aperture**2 / 4)
     envelope = np.sinc(positions * pitch / scale) ** 2 if cell and bare else np.ones(samples)
     matrix = weights.matrix * (amount * envelope)[:, None]
-    refine, missed = (), 0.0
+    refine, missed = None, 0.0
     if not bare:
         curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
         slope = curvature * pitch**2 / wavelength_m if cell else None
@@ -128,8 +127,8 @@ def plan_far_field(
     return FarField(
         gather=Banded.from_dense(matrix),
         spread=Banded.from_dense(matrix.T, 256),
-        refine=tuple(Banded.from_dense(part) for part in refine),
-        coarsen=tuple(Banded.from_dense(part.T) for part in refine),
+        refine=None if refine is None else Banded.from_dense(refine),
+        coarsen=None if refine is None else Banded.from_dense(refine.T),
         tilt=None,
         cells=nx,
         length=length,
@@ -142,14 +141,14 @@ def plan_far_field(
 
 def field_weights(
     positions: Float[np.ndarray, " fine"], samples: int, length: int, aperture: float, slope: float | None
-) -> tuple[tuple[Float[np.ndarray, "sample fine"], ...], float]:
+) -> tuple[Inexact[np.ndarray, "sample fine"], float]:
     """Weights that interpolate the field behind a disc of square cells, and their relative RMS error along one axis.
 
     `positions` count samples, whose middle one lies on the axis, from the first; `length` is that of their transform;
     `aperture` is in cells; `slope` is the direction in which a cell is lit, in waves per cell and cell from the axis,
     or None to leave out the factor sinc(direction of observation - direction of light) of a square cell.
 
-    Real part of the weights, with the imaginary part if it is not zero. Least squares over the disc, weighted by its
+    Real weights if the imaginary part is zero. Least squares over the disc, weighted by its
     chords: every cell x contributes exp(-2 pi i k x / length) at sample k and, to the wanted field, the same at a
     fractional k times its sinc.
     """
@@ -169,16 +168,7 @@ def field_weights(
     matrix = np.zeros((samples, len(positions)), np.complex128)
     matrix[first[:, None] + lags, np.arange(len(positions))[:, None]] = weights
     error = float(np.sqrt(missed.mean() / (target**2 @ power).mean()))
-    return ((matrix.real, matrix.imag) if slope else (matrix.real,)), error
-
-
-def _apply(parts: Float[Array, "2 ..."], operators: tuple[Banded, ...]) -> Float[Array, "2 ..."]:
-    """Product of a complex array, as real and imaginary part, with real or complex weights along the last axis."""
-    product = operators[0](parts)
-    if len(operators) > 1:
-        turned = operators[1](parts)
-        product = product + jnp.stack([-turned[1], turned[0]])
-    return product
+    return matrix if slope else matrix.real, error
 
 
 def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
@@ -196,7 +186,7 @@ def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
 
 def _transform(plan: FarField, field: Complex[Array, "row n"]) -> Complex[Array, "row length"]:
     """FFT of rows; where it is to be interpolated their middle is the origin, so that it varies slowly enough."""
-    middle = plan.cells // 2 if plan.refine else 0
+    middle = 0 if plan.refine is None else plan.cells // 2
     if middle or plan.length > plan.cells:
         gap = jnp.zeros((field.shape[0], plan.length - plan.cells), field.dtype)
         field = jnp.concatenate([field[:, middle:], gap, field[:, :middle]], axis=-1)
@@ -205,7 +195,7 @@ def _transform(plan: FarField, field: Complex[Array, "row n"]) -> Complex[Array,
 
 def _untransform(plan: FarField, spectrum: Complex[Array, "row length"]) -> Complex[Array, "row n"]:
     """Transpose of `_transform`."""
-    middle, field = plan.cells // 2 if plan.refine else 0, jnp.fft.fft(spectrum)
+    middle, field = 0 if plan.refine is None else plan.cells // 2, jnp.fft.fft(spectrum)
     if not middle:
         return field[:, : plan.cells]
     return jnp.concatenate([field[:, plan.length - middle :], field[:, : plan.cells - middle]], axis=-1)
@@ -252,8 +242,8 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
             columns = columns * plan.tilt[0]
         return _central(_transform(plan, columns), plan.kept)
 
-    blocks = jnp.arange(plan.kept // sensor_block)
-    if not plan.refine:
+    blocks, refine = jnp.arange(plan.kept // sensor_block), plan.refine
+    if refine is None:
         # The samples are those of the intensity: a block is integrated while it is in the cache.
         def integrated(block: Array) -> tuple[Array, Array]:
             field = along_y(block)
@@ -264,11 +254,11 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
 
     def refined(block: Array) -> Array:
         field = along_y(block)
-        return _apply(jnp.stack([field.real, field.imag]), plan.refine)
+        return refine.of_complex(jnp.stack([field.real, field.imag]))
 
     parts = jax.lax.map(refined, blocks)  # [block, part, x, y]
     parts = jnp.transpose(parts, (1, 3, 0, 2)).reshape(2, parts.shape[3], plan.kept)
-    parts = _apply(parts, plan.refine)
+    parts = refine.of_complex(parts)
     columns = plan.gather(parts[0] ** 2 + parts[1] ** 2)
     return plan.gather(columns.T).T, parts
 
@@ -298,13 +288,13 @@ def _adjoint(
     cotangents, and the transpose of a Fourier transform is itself.
     """
     (rows, shared), (constant_rows, constant_shared) = eqx.partition(operands, perturbed)
-    pupil_block, sensor_block = plan.blocks
+    (pupil_block, sensor_block), coarsen = plan.blocks, plan.coarsen
 
     def along_y(samples: Array) -> Array:
         columns = _untransform(plan, _uncentral(samples, plan.length))
         return columns if plan.tilt is None else columns * plan.tilt[0]
 
-    if not plan.refine:
+    if coarsen is None:
         half_spread = plan.spread(cotangent).T.reshape(-1, sensor_block, cotangent.shape[0])
 
         def spread_block(block: tuple[Array, Array]) -> Array:
@@ -315,11 +305,11 @@ def _adjoint(
     else:
         weights = plan.spread(plan.spread(cotangent).T).T
         back = jnp.stack([2.0 * weights * parts[0], -2.0 * weights * parts[1]])
-        back = _apply(back, plan.coarsen)
+        back = coarsen.of_complex(back)
         back = jnp.transpose(back.reshape(2, back.shape[1], -1, sensor_block), (2, 0, 3, 1))
 
         def coarse_block(block: Array) -> Array:
-            real, imaginary = _apply(block, plan.coarsen)
+            real, imaginary = coarsen.of_complex(block)
             return along_y(jax.lax.complex(real, imaginary))
 
         half_done = jax.lax.map(coarse_block, back)

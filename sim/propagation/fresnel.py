@@ -39,7 +39,7 @@ class DirectPath(eqx.Module):
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
         field = pupil(rows, shared) * self.lens
         spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
-        kept = self.gather.starts[-1] + self.gather.tiles[-1].shape[0]  # samples per axis that the pixels use
+        kept = self.gather.inputs  # samples per axis that the pixels use
         image = jnp.roll(jnp.fft.ifft2(spectrum), (-self.first, -self.first), (0, 1))[:kept, :kept]
         intensity = image.real**2 + image.imag**2
         return self.gather(self.gather(intensity).T).T

@@ -1,7 +1,7 @@
 """A process and its errors as the numbers that all tiles of a plate share."""
 
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from fab.grid import Grid
 from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
+from sim.tracing import single, stacked
 
 SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
 jax.tree_util.register_dataclass(
@@ -103,38 +104,36 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
     """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
     masks, levels = process.masks, process.levels
 
-    def per_mask(value: tuple[float | Array, ...]) -> Array:
-        return jnp.asarray(jnp.stack([jnp.asarray(v, jnp.float32) for v in value]) if value else jnp.zeros(masks))
+    # Known errors are numbers of the host: one by one, the operations below would take a second to compile.
+    def per_mask(value: tuple[float | Array, ...]) -> Any:
+        return stacked([single(v) for v in value or (0.0,) * masks])
 
     repeats = np.asarray(variation.repeats or (0,) * masks)
     nominal = np.asarray(process.depths_m())
     scale = (1.0 + variation.common_depth_scale) * (1.0 + per_mask(variation.depth_scale))
     y, x = process.die_m
     turn, growth = per_mask(variation.rotation_rad), per_mask(variation.magnification)
-    shift = jnp.stack(
-        [
-            per_mask(variation.overlay_y_m) + growth * y + turn * x,
-            per_mask(variation.overlay_x_m) + growth * x - turn * y,
-        ],
-        axis=1,
-    )
+    shift = [
+        per_mask(variation.overlay_y_m) + growth * y + turn * x,
+        per_mask(variation.overlay_x_m) + growth * x - turn * y,
+    ]
     radius = process.wafer_radius_m
-    tilt = jnp.stack([jnp.asarray(variation.linear_nonuniformity_y), jnp.asarray(variation.linear_nonuniformity_x)])
+    tilt = stacked([single(variation.linear_nonuniformity_y), single(variation.linear_nonuniformity_x)])
     return EtchParameters(
-        depth_m=jnp.asarray((nominal * (1 + repeats)).astype(np.float32)) * scale,
-        shift_m=shift,
+        depth_m=(nominal * (1 + repeats)).astype(np.float32) * scale,
+        shift_m=stacked(shift, 1),
         turn=turn,
         growth=growth,
-        bias_m=jnp.asarray(variation.common_cd_bias_m, jnp.float32) + per_mask(variation.cd_bias_m),
-        corner_m=jnp.asarray(variation.corner_radius_m, jnp.float32),
-        slope=jnp.tan(jnp.asarray(variation.sidewall_rad, jnp.float32)),
-        lag=jnp.asarray(variation.etch_lag, jnp.float32),
-        bowl=jnp.asarray(variation.radial_nonuniformity, jnp.float32) / radius**2,
+        bias_m=single(variation.common_cd_bias_m) + per_mask(variation.cd_bias_m),
+        corner_m=single(variation.corner_radius_m),
+        slope=jnp.tan(single(variation.sidewall_rad)),
+        lag=single(variation.etch_lag),
+        bowl=single(variation.radial_nonuniformity) / radius**2,
         tilt=tilt / radius,
         rough_m=rough_m,
-        height_m=jnp.float32(levels.count - 1) * jnp.float32(levels.step_m)
+        height_m=np.float32(levels.count - 1) * np.float32(levels.step_m)
         if levels.is_binary
-        else jnp.asarray(levels.total_m, jnp.float32),
+        else single(levels.total_m),
     )
 
 

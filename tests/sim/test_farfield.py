@@ -55,9 +55,10 @@ def energy64(plan: FarField, field: np.ndarray) -> np.ndarray:
     matrix = np.exp(-2j * np.pi * np.outer(samples, cells) / plan.length)
     if plan.tilt is not None:
         field = np.asarray(plan.tilt[0])[:, None] * field * np.asarray(plan.tilt[1])
-    if plan.refine:
-        parts = [dense(part, plan.kept).T for part in plan.refine]
-        matrix = (parts[0] + 1j * parts[1] if len(parts) > 1 else parts[0]) @ matrix
+    if plan.refine is not None:
+        unit = jnp.eye(plan.kept, dtype=jnp.float32)
+        real, imaginary = np.asarray(plan.refine.of_complex(jnp.stack([unit, 0 * unit])), np.float64)
+        matrix = (real + 1j * imaginary).T @ matrix
     gather = dense(plan.gather, len(matrix))
     return gather.T @ np.abs(matrix @ field @ matrix.T) ** 2 @ gather
 

@@ -70,9 +70,12 @@ def test_banded_is_the_dense_product(inputs: int, outputs: int, tile: int, half_
     middle = np.sort(rng.integers(0, inputs, outputs))
     band = np.abs(np.arange(inputs)[:, None] - middle) <= half_width
     # Some outputs use no input at all.
-    dense = np.where(band, rng.normal(size=band.shape), 0.0) * (rng.random(outputs) < 0.8)
+    dense = np.where(band, rng.normal(size=(2, *band.shape)), 0.0) * (rng.random(outputs) < 0.8)
     x = rng.normal(size=(2, inputs)).astype(np.float32)
-    got = np.asarray(Banded.from_dense(dense, tile)(jnp.asarray(x)))
+    got = np.asarray(Banded.from_dense(dense[0], tile)(jnp.asarray(x)))
     assert got.shape == (2, outputs)
-    # Sums of at most 25 float32 products of order 1.
-    np.testing.assert_allclose(got, x @ dense, atol=1e-4)
+    # Sums of at most 25 (complex: 50) float32 products of order 1.
+    np.testing.assert_allclose(got, x @ dense[0], atol=1e-4)
+    weights = dense[0] + 1j * dense[1]
+    real, imaginary = np.asarray(Banded.from_dense(weights, tile).of_complex(jnp.asarray(x)))
+    np.testing.assert_allclose(real + 1j * imaginary, (x[0] + 1j * x[1]) @ weights, atol=2e-4)
