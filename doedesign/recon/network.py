@@ -106,7 +106,7 @@ class Block(eqx.Module):
     ) -> "Block":
         """Draw weights of the variance that keeps signals as large as they are (He et al. 2015), times `gain`²."""
         scale = gain * np.sqrt(2 / (1 + _LEAK**2) / (inputs * size * size))
-        weights = jnp.asarray(scale * rng.standard_normal((size, size, inputs, outputs)), jnp.float32)
+        weights = jnp.asarray((scale * rng.standard_normal((size, size, inputs, outputs))).astype(np.float32))
         return cls(weights, None if normal else jnp.zeros(outputs), stride, act)
 
     def __call__(self, image: Float[Array, "b y x i"], half: bool = False) -> Float[Array, "b v u o"]:
@@ -198,7 +198,7 @@ class Network(eqx.Module):
         up = tuple(
             UpBlock(
                 # Of a transposed convolution.
-                jnp.asarray(rng.standard_normal((coarse, 2, 2, fine)) / np.sqrt(coarse), jnp.float32),
+                jnp.asarray((rng.standard_normal((coarse, 2, 2, fine)) / np.sqrt(coarse)).astype(np.float32)),
                 Block.make(rng, fine + beside(level), fine),
             )
             for level, (fine, coarse) in reversed([*enumerate(pairwise(widths))])

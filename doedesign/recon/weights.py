@@ -112,6 +112,6 @@ def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) 
         raise InputError(str(path), "must hold the layout's arrays alone", f"also {extra[0]}", _CURE)
 
     def filled(where: Any, leaf: Any) -> Any:
-        return jnp.asarray(arrays[jax.tree_util.keystr(where)], leaf.dtype) if eqx.is_array(leaf) else leaf
+        return jnp.asarray(arrays[jax.tree_util.keystr(where)].astype(leaf.dtype)) if eqx.is_array(leaf) else leaf
 
     return jax.tree_util.tree_map_with_path(filled, empty)

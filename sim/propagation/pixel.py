@@ -11,6 +11,7 @@ at nu = 0 that makes energy come out right. The same expectation predicts the er
 with fewer samples the rule stays the best linear estimate.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import equinox as eqx
@@ -78,6 +79,7 @@ def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: fl
     return PixelWeights(matrix, float(error))
 
 
+@lru_cache(maxsize=32)  # every depth asks for the same
 def sampling_for(pixel: float, tolerance: float) -> float:
     """Samples per lambda d / D with which pixels of side `pixel` (in lambda d / D) are integrated to `tolerance`.
 
