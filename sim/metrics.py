@@ -5,7 +5,7 @@ None changes a PSF's energy. `jax.grad`, `jit` and `vmap` go through all but the
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -30,9 +30,12 @@ def radius_map_m(shape: tuple[int, int], pixel_m: float) -> Float[np.ndarray, "y
     return np.hypot(y[:, None], x[None, :])
 
 
+@lru_cache(maxsize=32)
 def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Float[np.ndarray, "y x"]:
-    """Share of every pixel's area inside a centred disc, float32."""
-    return circle_coverage(Grid(shape, pixel_m), 2 * radius_m)
+    """Share of every pixel's area inside a centred disc, float32; kept and read-only, for every draw asks for a few."""
+    weights = circle_coverage(Grid(shape, pixel_m), 2 * radius_m)
+    weights.setflags(write=False)
+    return weights
 
 
 def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
