@@ -52,7 +52,7 @@ def write_masks(
         out: order folder; `masks/NAME` by default.
         levels: number of heights; the run's own by default.
         on_violation: what to do where the process cannot print a mask: say so, refuse, or change the level map.
-        probe_m: wavelength of the laser that the lab tests the plate with, metres.
+        probe_m: wavelength of the laser that the lab tests the DOE with, metres.
         patch: a window to write as a solid at full resolution, too.
         process: a process, the name of a stock process or a TOML file; that of the run, or an ideal one, by default.
         wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default.
@@ -85,20 +85,20 @@ def write_masks(
         order = replace(order, source={**order.source, "repair": repair})
 
     def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
-        plate, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
+        wafer, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
         dbu_m, aperture_m = order.dbu_m, order.level_map.aperture_m
         title = f"{order.stem}: what lies where"
-        save(plot_wafer(order.wafer, frame, aperture_m, dbu_m, title), fresh / plate)
-        site = alignment_site(order.plates, dbu_m)
+        save(plot_wafer(order.wafer, frame, aperture_m, dbu_m, title), fresh / wafer)
+        site = alignment_site(order.photomasks, dbu_m)
         title = f"{order.stem}: alignment site, every mask in its colour"
-        save(plot_part(site, order.plates, title), fresh / marks)
+        save(plot_part(site, order.photomasks, title), fresh / marks)
         log.info("writing the run sheet")
         sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m))
         if order.rules.clean:
-            return [plate, marks, *sheets]
+            return [wafer, marks, *sheets]
         title = f"{order.stem}: where the masks break the rules of {made_by.name}"
         save(order.rules.plot(title=title), fresh / name)
-        return [plate, marks, *sheets, name]
+        return [wafer, marks, *sheets, name]
 
     return write_planned(Path("masks") / level_map.name if out is None else out, order, add=add)
 
@@ -116,18 +116,18 @@ def _run_sheet(
         except InputError as error:
             log.warning("the run sheet says nothing of the light: %s", error)
     files = {
-        plate.name: PhotomaskFile(
-            file=f"{order.plate_stem(plate)}.gds",
-            sha256=sha256_file(folder / f"{order.plate_stem(plate)}.gds"),
-            cell=order.plate_stem(plate),
-            edge_move_m=0.0 if plate.bit is None else moves_m[plate.bit],
+        photomask.name: PhotomaskFile(
+            file=f"{order.photomask_stem(photomask)}.gds",
+            sha256=sha256_file(folder / f"{order.photomask_stem(photomask)}.gds"),
+            cell=order.photomask_stem(photomask),
+            edge_move_m=0.0 if photomask.bit is None else moves_m[photomask.bit],
         )
-        for plate in order.plates
+        for photomask in order.photomasks
     }
     sheet = RunSheet(
         stem=order.stem,
         level_map=order.level_map,
-        plates=order.plates,
+        photomasks=order.photomasks,
         files=files,
         process=order.process,
         opening_m=2 * order.chrome.radii_m(order.level_map)[0],

@@ -226,7 +226,7 @@ def study(
     if not sources_of(made):
         rule = "a tolerance study needs errors that vary"
         cure = 'Give a process with errors, such as "contact_aligner".'
-        raise InputError("process.errors", rule, "none with a sigma above zero", cure)
+        raise InputError("process", rule, "none with a sigma above zero", cure)
     if seed < 0:
         raise InputError("seed", "must not be negative", seed, "For example 0.")
     if out is not None and "<" in evaluate.__qualname__:

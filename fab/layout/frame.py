@@ -1,10 +1,10 @@
-"""Where everything lies: the mask plate, the wafer on it, its dies, alignment sites and test structures.
+"""Where everything lies: the photomask, the wafer on it, its dies, alignment sites and test structures.
 
     PLATE    outline of the mask blank (100/0), labels beside the wafer
     WAFER    outline (101/0), dies on a raster, alignment sites left and right, test structures
     DIE      the DOE in its middle, marks below it, the die's box (110/0) and the clear aperture (102/0)
 
-All cells are placed upright, about the middle of the plate, which is the middle of the wafer. Layers from 100 on say
+All cells are upright, about the middle of the photomask, which is the middle of the wafer. Layers from 100 on say
 where things are; they are in the review files and on no mask.
 """
 
@@ -43,7 +43,7 @@ class Frame(NamedTuple):
     """The cells around a DOE.
 
     Attributes:
-        cells: die, sites, test structures, wafer and plate, each after those that it places.
+        cells: die, sites, test structures, wafer and photomask, each after those that it places.
         places: where on the wafer people measure, ``(x_m, y_m)`` by name.
         raster: rows and columns of dies.
         dies: middles of the dies, ``(x_m, y_m)``, row by row from the lowest y.
@@ -61,7 +61,7 @@ class Frame(NamedTuple):
 
 def draw_frame(
     wafer: Wafer,
-    plates: Sequence[Photomask],
+    photomasks: Sequence[Photomask],
     level_map: LevelMap,
     *,
     splits: Sequence[DieSplit],
@@ -79,9 +79,9 @@ def draw_frame(
     Raises:
         InputError: the wafer is too small for what is asked, or the dies lie too close.
     """
-    marks = die_marks(plates, dbu_m)
-    site = alignment_site(plates, dbu_m)
-    monitor = process_monitor(level_map.levels, plates, level_map.grid.pitch_m, dbu_m, minimum_line_m)
+    marks = die_marks(photomasks, dbu_m)
+    site = alignment_site(photomasks, dbu_m)
+    monitor = process_monitor(level_map.levels, photomasks, level_map.grid.pitch_m, dbu_m, minimum_line_m)
     # The DOE is in the middle of its die, the marks are below its chrome.
     width, height = _size_m(marks)
     half = chrome_m / 2 + 2 * _GAP_M + height
@@ -101,7 +101,7 @@ def draw_frame(
     die_cells = [
         Cell(
             f"{stem}_DIE" if number == 0 else f"{stem}_{split.code}_DIE",
-            {DIE: unit.square(pitch), APERTURE: aperture, **_titled(marks, split, plates[0]).shapes},
+            {DIE: unit.square(pitch), APERTURE: aperture, **_titled(marks, split, photomasks[0]).shapes},
             (Reference(f"{stem}_{split.code}"),),
         )
         for number, split in enumerate(splits)
@@ -116,7 +116,7 @@ def draw_frame(
         raster_steps = (step * (columns > 1), step * (rows > 1))
         on_wafer = [Reference(on_wafer[0].cell, on_wafer[0].x, on_wafer[0].y, columns, rows, *raster_steps)]
     wafer_cell = Cell(names["WAFER"], {WAFER: unit.circle(wafer.diameter_m)}, (*on_wafer, *placed))
-    labels = _labels(plates, wafer, stem, level_map.digest, dbu_m)
+    labels = _labels(photomasks, wafer, stem, level_map.digest, dbu_m)
     top = Cell(stem, {BLANK: unit.square(wafer.blank_m), **labels.shapes}, (Reference(names["WAFER"]),))
     sites = [prefixed(moved(site, x, 0), f"{side} site: ") for side, x in (("left", -site_m), ("right", site_m))]
     # Every die has its marks; the places are those of the one in the middle.
@@ -127,11 +127,11 @@ def draw_frame(
     return Frame((*die_cells, *small, wafer_cell, top), places, raster, dies, drawn, pitch)
 
 
-def _titled(marks: Part, split: DieSplit, plate: Photomask) -> Part:
+def _titled(marks: Part, split: DieSplit, photomask: Photomask) -> Part:
     """Add what is special about a die above its DOE, where the marks are below."""
     if not split.lettering:
         return marks
-    title = centred(written(plate, split.lettering, _TITLE_STROKE_UM, marks.dbu_m))
+    title = centred(written(photomask, split.lettering, _TITLE_STROKE_UM, marks.dbu_m))
     _, y0, _, y1 = marks.box
     return joined([marks, moved(title, 0, -(y0 + y1) / 2 * marks.dbu_m)])
 
@@ -200,9 +200,9 @@ def _beside(
     return round(site_m / MM, 1) * MM, monitor_m
 
 
-def _labels(plates: Sequence[Photomask], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
+def _labels(photomasks: Sequence[Photomask], wafer: Wafer, stem: str, digest: str, dbu_m: float) -> Part:
     """Labels of all masks side by side, above the wafer on the blank; each mask carries its own."""
-    blocks = [label_block([(p, mask_label(stem, p, wafer.reading, digest))], _LETTERS_M, dbu_m) for p in plates]
+    blocks = [label_block([(p, mask_label(stem, p, wafer.reading, digest))], _LETTERS_M, dbu_m) for p in photomasks]
     labels = centred(row(blocks, 4 * _LETTERS_M))
     width, height = _size_m(labels)
     y = wafer.diameter_m / 2 + _GAP_M + height / 2

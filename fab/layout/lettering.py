@@ -87,14 +87,14 @@ def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
     return Shapes(letter_boxes(text) * np.int32(stroke))
 
 
-def mask_label(job: str, plate: Photomask, reading: str, digest: str) -> list[str]:
+def mask_label(job: str, photomask: Photomask, reading: str, digest: str) -> list[str]:
     """Return what is written on a mask, in capitals, line by line from the top, with 8 digits of the digest."""
-    if plate.bit is not None:
-        what = f"mask {plate.bit + 1} bit {plate.bit} etch {plate.depth}"
+    if photomask.bit is not None:
+        what = f"mask {photomask.bit + 1} bit {photomask.bit} etch {photomask.depth}"
     else:
-        what = "zero layer - chrome marks" if plate.makes == "zero layer" else "chrome aperture"
-    field = "dark" if plate.tone == "clear" else "clear"
-    tone = f"polygons {plate.tone} - {field} field plate"
+        what = "zero layer - chrome marks" if photomask.makes == "zero layer" else "chrome aperture"
+    field = "dark" if photomask.tone == "clear" else "clear"
+    tone = f"polygons {photomask.tone} - {field} field plate"
     return [line.upper() for line in (job, what, tone, reading, f"hash {digest[:8]}")]
 
 
@@ -106,14 +106,16 @@ def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: flo
     """
     stroke_m = height_m / HEIGHT
     blocks = []
-    for plate, lines in labels:
-        drawn = [Part(dbu_m, {plate.on(3): lettering(line, height_m, dbu_m)}, {}) for line in lines]
+    for photomask, lines in labels:
+        drawn = [Part(dbu_m, {photomask.on(3): lettering(line, height_m, dbu_m)}, {}) for line in lines]
         placed = [moved(p, 0, (len(lines) - 1 - i) * _LINE * stroke_m) for i, p in enumerate(drawn)]
         part = joined(placed)
-        blocks.append(Part(dbu_m, part.shapes, {f"label, {plate.name}": (part.box[0] * dbu_m, part.box[1] * dbu_m)}))
+        blocks.append(
+            Part(dbu_m, part.shapes, {f"label, {photomask.name}": (part.box[0] * dbu_m, part.box[1] * dbu_m)})
+        )
     return column(blocks, (_BLOCK - HEIGHT) * stroke_m)
 
 
-def written(plate: Photomask, text: str, stroke_um: float, dbu_m: float) -> Part:
-    """Write a line of text on datatype 3 of a plate, beginning at the origin, with strokes of whole database units."""
-    return Part(dbu_m, {plate.on(3): lettering(text, HEIGHT * stroke_um * UM, dbu_m)}, {})
+def written(photomask: Photomask, text: str, stroke_um: float, dbu_m: float) -> Part:
+    """Write a line of text on datatype 3 of a photomask, from the origin on, with strokes of whole database units."""
+    return Part(dbu_m, {photomask.on(3): lettering(text, HEIGHT * stroke_um * UM, dbu_m)}, {})

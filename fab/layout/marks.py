@@ -1,21 +1,21 @@
 """Alignment marks: how every mask finds the place of the first one, and how far off it landed.
 
-All masks are aligned to the same marks (a star), those of the first plate that is used: the chrome zero layer, or else
+All masks are aligned to the same marks (a star), those of the first one that is used: the chrome zero layer, or else
 the mask that is etched first. Aligning each mask to the one before it would add up the errors.
 
-Every other plate has its own slot. There the first plate draws what is looked at, and the slot's own plate what is
-laid over it; no third plate draws anything there, so no mark is ever worked on twice.
+Every other photomask has its own slot. There the first one draws what is looked at, and the slot's own what is laid
+over it; no third one draws anything there, so no mark is ever worked on twice.
 
-    finder      the wafer's cross between four squares of the plate, for the first rough look
-    boxes       a square of the plate in a square frame of the wafer, with a gap of 25, 10, 5, 3 and 2 um all around
-    verniers    lines 10 um apart on the wafer against lines 9.75 um apart on the plate: where line n meets its
+    finder      the wafer's cross between four squares of the photomask, for the first rough look
+    boxes       a square of the photomask in a square frame of the wafer, with a gap of 25, 10, 5, 3 and 2 um all around
+    verniers    lines 10 um apart on the wafer against lines 9.75 um apart on the photomask: where line n meets its
                 partner, the mask lies n x 0.25 um toward +x (or +y)
-    F           right-reading in the drawing; a plate that is the wrong way round shows it mirrored
+    F           right-reading in the drawing; a photomask that is the wrong way round shows it mirrored
 
-Squares are always the dark part of a plate. A clear-field plate draws just them, and the wafer is seen all around. A
-dark-field plate draws a window without them: light passes around a dark square, and the wafer's cross or frame is seen
+Squares are always the dark part of a photomask. A clear-field one draws just them, and the wafer is seen all around.
+A dark-field one draws a window without them: light passes around a dark square, and the wafer's cross or frame is seen
 in the window. What lies in a window is exposed and worked on together with the mark (`alignment_notes` says how).
-Verniers have no window, because they are read in the developed resist, when the plate is gone and the wafer's lines
+Verniers have no window, because they are read in the developed resist, when the photomask is gone and the wafer's lines
 are seen through the resist; so the lines of the wafer stay as they were made.
 """
 
@@ -67,28 +67,30 @@ def _cross(length_um: float, arm_um: float) -> Boxes:
 
 
 def _seen(
-    name: str, first: Photomask, plate: Photomask, wafer: Boxes, dark: Boxes, window_um: float, dbu_m: float
+    name: str, first: Photomask, photomask: Photomask, wafer: Boxes, dark: Boxes, window_um: float, dbu_m: float
 ) -> Part:
-    """Draw a mark that is seen through the plate: the wafer's part, and the dark part or the window without it."""
-    drawn = dark if plate.tone == "dark" else without([_square(window_um)], dark)
-    part = joined([block(first.on(1), wafer, dbu_m), block(plate.on(1), drawn, dbu_m)])
-    return Part(dbu_m, part.shapes, {f"{name}, {plate.name}": (0.0, 0.0)})
+    """Draw a mark that is seen through the photomask: the wafer's part, and the dark part or the window without it."""
+    drawn = dark if photomask.tone == "dark" else without([_square(window_um)], dark)
+    part = joined([block(first.on(1), wafer, dbu_m), block(photomask.on(1), drawn, dbu_m)])
+    return Part(dbu_m, part.shapes, {f"{name}, {photomask.name}": (0.0, 0.0)})
 
 
-def _finder(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
-    """Draw a cross on the wafer and four squares between its arms on the plate, centred."""
+def _finder(first: Photomask, photomask: Photomask, dbu_m: float) -> Part:
+    """Draw a cross on the wafer and four squares between its arms on the photomask, centred."""
     off = _ARM_UM / 2 + _CROSS_GAP_UM + _QUADRANT_UM / 2
     dark = np.array([_square(_QUADRANT_UM, x, y) for x in (-off, off) for y in (-off, off)])
     window = _CROSS_UM + 2 * _FINDER_MARGIN_UM
-    return _seen("finder", first, plate, _cross(_CROSS_UM, _ARM_UM), dark, window, dbu_m)
+    return _seen("finder", first, photomask, _cross(_CROSS_UM, _ARM_UM), dark, window, dbu_m)
 
 
-def _box(mark: BoxMark, first: Photomask, plate: Photomask, dbu_m: float) -> Part:
-    """Draw a frame on the wafer and a box in it on the plate, centred."""
+def _box(mark: BoxMark, first: Photomask, photomask: Photomask, dbu_m: float) -> Part:
+    """Draw a frame on the wafer and a box in it on the photomask, centred."""
     opening = mark.box_um + 2 * mark.gap_um
     outer = opening + 2 * mark.bar_um
     frame, dark = without([_square(outer)], [_square(opening)]), np.array([_square(mark.box_um)])
-    return _seen(f"box {mark.gap_um:g} um", first, plate, frame, dark, outer + 2 * max(mark.gap_um, _MARGIN_UM), dbu_m)
+    return _seen(
+        f"box {mark.gap_um:g} um", first, photomask, frame, dark, outer + 2 * max(mark.gap_um, _MARGIN_UM), dbu_m
+    )
 
 
 def _comb(pitch_um: float, direction: int) -> Boxes:
@@ -102,7 +104,7 @@ def _comb(pitch_um: float, direction: int) -> Boxes:
     return np.array(lines)
 
 
-def _vernier(axis: str, first: Photomask, plate: Photomask, dbu_m: float) -> Part:
+def _vernier(axis: str, first: Photomask, photomask: Photomask, dbu_m: float) -> Part:
     """Draw the two combs of a vernier, centred; the numbers count micrometres."""
     wafer, mask = _comb(_PITCH_UM, -1), _comb(_PLATE_PITCH_UM, 1)
     reach = f"{_LAST * VERNIER_STEP_M / UM:g}"
@@ -111,50 +113,50 @@ def _vernier(axis: str, first: Photomask, plate: Photomask, dbu_m: float) -> Par
         part = centred(written(first, text, 3, dbu_m))
         along, across = n * _PITCH_UM * UM, -90 * UM
         parts.append(moved(part, along, across) if axis == "x" else moved(part, across, along))
-    for layer, comb in ((first.on(1), wafer), (plate.on(1), mask)):
+    for layer, comb in ((first.on(1), wafer), (photomask.on(1), mask)):
         parts.append(block(layer, comb if axis == "x" else turned(comb), dbu_m))
     part = joined(parts)
-    return Part(dbu_m, part.shapes, {f"vernier {axis}, {plate.name}": (0.0, 0.0)})
+    return Part(dbu_m, part.shapes, {f"vernier {axis}, {photomask.name}": (0.0, 0.0)})
 
 
-def _letter_f(plate: Photomask, stroke_um: float, dbu_m: float) -> Part:
-    """Draw the F and, below it, the plate's code; the lower left corner of the F is the origin."""
-    f = block(plate.on(1), letter_boxes("F") * stroke_um, dbu_m)
-    code = moved(written(plate, plate.code, stroke_um / 2, dbu_m), 0, -HEIGHT * stroke_um * UM)
-    return Part(dbu_m, joined([f, code]).shapes, {f"F, {plate.name}": (0.0, 0.0)})
+def _letter_f(photomask: Photomask, stroke_um: float, dbu_m: float) -> Part:
+    """Draw the F and, below it, the photomask's code; the lower left corner of the F is the origin."""
+    f = block(photomask.on(1), letter_boxes("F") * stroke_um, dbu_m)
+    code = moved(written(photomask, photomask.code, stroke_um / 2, dbu_m), 0, -HEIGHT * stroke_um * UM)
+    return Part(dbu_m, joined([f, code]).shapes, {f"F, {photomask.name}": (0.0, 0.0)})
 
 
 def _at(part: Part, x_um: float, y_um: float) -> Part:
     return moved(part, x_um * UM, y_um * UM)
 
 
-def _site_slot(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
-    """Draw the slot of one plate at a site of the wafer, 0.9 mm x 1 mm."""
+def _site_slot(first: Photomask, photomask: Photomask, dbu_m: float) -> Part:
+    """Draw the slot of one photomask at a site of the wafer, 0.9 mm x 1 mm."""
     centres = ((200, 200), (500, 115), (460, 295), (572, 273), (572, 360))
-    boxes = [_at(_box(mark, first, plate, dbu_m), *at) for mark, at in zip(BOXES, centres, strict=True)]
+    boxes = [_at(_box(mark, first, photomask, dbu_m), *at) for mark, at in zip(BOXES, centres, strict=True)]
     return joined(
         [
             *boxes,
-            _at(_finder(first, plate, dbu_m), 300, 700),
-            _at(_vernier("x", first, plate, dbu_m), 770, 115),
-            _at(_vernier("y", first, plate, dbu_m), 760, 370),
-            _at(_letter_f(plate, 16, dbu_m), 640, 680),
-            _at(written(first, plate.code, 12, dbu_m), 640, 880),
+            _at(_finder(first, photomask, dbu_m), 300, 700),
+            _at(_vernier("x", first, photomask, dbu_m), 770, 115),
+            _at(_vernier("y", first, photomask, dbu_m), 760, 370),
+            _at(_letter_f(photomask, 16, dbu_m), 640, 680),
+            _at(written(first, photomask.code, 12, dbu_m), 640, 880),
         ]
     )
 
 
-def _die_slot(first: Photomask, plate: Photomask, dbu_m: float) -> Part:
-    """Draw the slot of one plate beside a die, 0.55 mm x 0.3 mm."""
+def _die_slot(first: Photomask, photomask: Photomask, dbu_m: float) -> Part:
+    """Draw the slot of one photomask beside a die, 0.55 mm x 0.3 mm."""
     centres = ((70, 250), (190, 250), (274, 250))
-    boxes = [_at(_box(mark, first, plate, dbu_m), *at) for mark, at in zip(BOXES[2:], centres, strict=True)]
+    boxes = [_at(_box(mark, first, photomask, dbu_m), *at) for mark, at in zip(BOXES[2:], centres, strict=True)]
     return joined(
         [
             *boxes,
-            _at(_vernier("x", first, plate, dbu_m), 132, 110),
-            _at(_vernier("y", first, plate, dbu_m), 475, 150),
-            _at(_letter_f(plate, 6, dbu_m), 320, 250),
-            _at(written(first, plate.code, 4, dbu_m), 290, 100),
+            _at(_vernier("x", first, photomask, dbu_m), 132, 110),
+            _at(_vernier("y", first, photomask, dbu_m), 475, 150),
+            _at(_letter_f(photomask, 6, dbu_m), 320, 250),
+            _at(written(first, photomask.code, 4, dbu_m), 290, 100),
         ]
     )
 
@@ -179,44 +181,44 @@ def _brackets(first: Photomask, box: tuple[int, int, int, int], dbu_m: float) ->
     return block(first.on(1), without(bars), dbu_m)
 
 
-def alignment_site(plates: Sequence[Photomask], dbu_m: float) -> Part:
+def alignment_site(photomasks: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw a site of the wafer where all masks are aligned; the first photomask in order of use makes the marks.
 
-    Marks are on datatype 1 and lettering on datatype 3 of each plate, centred on the origin; brackets, a cross and a
-    title of the first plate show where the site is. Places: the centre of every mark, such as "vernier x, mask 3", "box
-    5 um, chrome", "finder, mask 1", and the lower left corner of each "F, mask 2".
+    Marks are on datatype 1 and lettering on datatype 3 of each photomask, centred on the origin; brackets, a cross and
+    a title of the first one show where the site is. Places: the centre of every mark, such as "vernier x, mask 3",
+    "box 5 um, chrome", "finder, mask 1", and the lower left corner of each "F, mask 2".
     """
-    first, others = plates[0], plates[1:]
+    first, others = photomasks[0], photomasks[1:]
     title = f"REF {first.code} " + ("CHROME" if first.bit is None else first.depth.upper())
     f = block(first.on(1), letter_boxes("F") * 30.0, dbu_m)
     f = Part(dbu_m, f.shapes, {f"F, {first.name}": (0.0, 0.0)})
     head = row([block(first.on(1), _cross(600, 80), dbu_m), f, written(first, title, 16, dbu_m)], 150 * UM)
-    slots = [_grid([_site_slot(first, plate, dbu_m) for plate in others])] if others else []
+    slots = [_grid([_site_slot(first, photomask, dbu_m) for photomask in others])] if others else []
     body = centred(column([head, *slots], 150 * UM))
     return joined([body, _brackets(first, body.box, dbu_m)])
 
 
-def die_marks(plates: Sequence[Photomask], dbu_m: float) -> Part:
+def die_marks(photomasks: Sequence[Photomask], dbu_m: float) -> Part:
     """Draw the smaller marks beside a die, to measure overlay there: boxes, verniers and F of `alignment_site`."""
-    first, others = plates[0], plates[1:]
-    slots = [_die_slot(first, plate, dbu_m) for plate in others]
+    first, others = photomasks[0], photomasks[1:]
+    slots = [_die_slot(first, photomask, dbu_m) for photomask in others]
     f = _letter_f(first, 16, dbu_m)
     return centred(row([f, _grid(slots)], 60 * UM) if slots else f)
 
 
-def _what_happens(first: Photomask, plate: Photomask) -> str:
-    """Describe what working on a plate does to the marks in its slot, and to the others."""
-    dark_field = plate.tone == "clear"
+def _what_happens(first: Photomask, photomask: Photomask) -> str:
+    """Describe what working on a photomask does to the marks in its slot, and to the others."""
+    dark_field = photomask.tone == "clear"
     others = "The slots of all other masks stay under resist."
-    if plate.makes == "etch":
+    if photomask.makes == "etch":
         if not dark_field:
             place, kept = "in its squares", "the wafer's marks stay under resist"
         elif first.makes == "zero layer":
             place, kept = "in its windows", "the wafer's chrome marks shield the glass below them and stay"
         else:
             place, kept = "in its windows", "floor and rim of the wafer's marks go down together, so the steps stay"
-        return f"The glass is etched {plate.depth} {place}; {kept}. {others}"
-    if plate.makes == "liftoff":
+        return f"The glass is etched {photomask.depth} {place}; {kept}. {others}"
+    if photomask.makes == "liftoff":
         place = "in its windows, over the wafer's marks" if dark_field else "in its squares only"
         return f"Chrome is laid down {place}. Read the overlay in the resist, before the deposition. {others}"
     place = "in its windows, over the wafer's marks" if dark_field else "in its squares"
@@ -227,21 +229,22 @@ def _what_happens(first: Photomask, plate: Photomask) -> str:
     )
 
 
-def alignment_notes(plates: Sequence[Photomask]) -> tuple[str, ...]:
-    """Describe how each mask is aligned and what happens to the marks, a paragraph per plate."""
-    first = plates[0]
+def alignment_notes(photomasks: Sequence[Photomask]) -> tuple[str, ...]:
+    """Describe how each mask is aligned and what happens to the marks, a paragraph per photomask."""
+    first = photomasks[0]
     etched = first.makes == "etch"
     made = f"etched {first.depth} deep" if etched else "of chrome"
     notes = [f"{first.name.capitalize()}: makes the marks that all other masks are aligned to, {made}."]
-    if etched and first.depth_m < _FAINT_M and len(plates) > 1:
+    if etched and first.depth_m < _FAINT_M and len(photomasks) > 1:
         notes[0] += " Warning: such shallow marks are hard to see. Etch the deepest mask first, or add a zero layer."
-    for plate in plates[1:]:
-        if plate.tone == "clear":
+    for photomask in photomasks[1:]:
+        if photomask.tone == "clear":
             seen = "dark field with clear windows: bring the wafer's crosses and frames around the dark squares in them"
         else:
             seen = "clear field: bring the wafer's crosses and frames around its dark squares"
         notes.append(
-            f"{plate.name.capitalize()}: aligned to the {first.code} marks in slot {plate.code}. The plate is {seen}. "
-            f"{_what_happens(first, plate)}"
+            f"{photomask.name.capitalize()}: aligned to the {first.code} marks in slot {photomask.code}. "
+            f"The plate is {seen}. "
+            f"{_what_happens(first, photomask)}"
         )
     return tuple(notes)

@@ -1,11 +1,11 @@
-"""Parts: what is drawn beside the DOE (marks, test structures, lettering), and the plates it is drawn for.
+"""Parts: what is drawn beside the DOE (marks, test structures, lettering), and the photomasks it is drawn for.
 
 A part is small, lies about its own origin and lists the points that people measure at. It is moved and joined with
-others, never turned or mirrored, because a mirrored mark would say that a plate is the right way round when it is not.
+others, never turned or mirrored: a mirrored mark would say that a photomask is the right way round when it is not.
 
-A plate is one mask: its layer, and what its polygons are on the plate. On an etch layer a polygon means "etched here",
-on the chrome and the zero layer "chrome here". With "clear" polygons the plate is dark field: chrome all over, and
-polygons let light through. With "dark" polygons it is clear field: glass all over, and polygons are chrome.
+A photomask is its layer, and what its polygons are on it. On an etch layer a polygon means "etched here", on the chrome
+and the zero layer "chrome here". With "clear" polygons the photomask is dark field: chrome all over, and polygons let
+light through. With "dark" polygons it is clear field: glass all over, and polygons are chrome.
 """
 
 import math
@@ -43,7 +43,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Photomask:
-    """One mask of the set: its layer, what polygons are on the plate, and what it makes.
+    """One mask of the set: its layer, what polygons are on the photomask, and what it makes.
 
     Marks are datatype 1 of the layer, test structures 2, lettering 3. An etch mask has its bit of the levels and the
     depth that it etches (metres); one that makes chrome has None and 0.

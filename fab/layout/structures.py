@@ -53,7 +53,7 @@ def _group(width_um: float, gaps: bool) -> list[Boxes]:
     return cells
 
 
-def cd_bars(plate: Photomask, dbu_m: float) -> Part:
+def cd_bars(photomask: Photomask, dbu_m: float) -> Part:
     """Draw the bars by which line widths are measured, a row per width, thinnest on top: lines left, gaps right.
 
     Each is five side by side and one alone along y, then along x. Places: the middle of the lone one along y, "CD 2 um
@@ -62,16 +62,16 @@ def cd_bars(plate: Photomask, dbu_m: float) -> Part:
     parts = []
     for number, width in enumerate(BAR_WIDTHS_UM):
         y = -160.0 * number
-        parts.append(moved(written(plate, f"{width:g}", 4, dbu_m), -90 * UM, (y + 36) * UM))
+        parts.append(moved(written(photomask, f"{width:g}", 4, dbu_m), -90 * UM, (y + 36) * UM))
         for name, x in (("line", 0.0), ("gap", 520.0)):
             cells = np.concatenate(_group(width, name == "gap"))
-            part = block(plate.on(2), cells + np.array([x, y, x, y]), dbu_m)
+            part = block(photomask.on(2), cells + np.array([x, y, x, y]), dbu_m)
             place = ((x + 130) * UM, (y + _BAR_UM / 2) * UM)
-            parts.append(Part(dbu_m, part.shapes, {f"CD {width:g} um {name}, {plate.name}": place}))
+            parts.append(Part(dbu_m, part.shapes, {f"CD {width:g} um {name}, {photomask.name}": place}))
     return joined(parts)
 
 
-def depth_pads(plate: Photomask, dbu_m: float) -> Part:
+def depth_pads(photomask: Photomask, dbu_m: float) -> Part:
     """Draw the squares by which a depth is measured, in a row on y = 0 with 0.15 mm of blank glass between them.
 
     Places: the middles, "depth pad 100 um, mask 3", and a flat spot beside them, "flat by the pads, mask 3".
@@ -79,10 +79,10 @@ def depth_pads(plate: Photomask, dbu_m: float) -> Part:
     boxes, places, x = [], {}, 0.0
     for side in PAD_SIDES_UM:
         boxes.append((x, -side / 2, x + side, side / 2))
-        places[f"depth pad {side:g} um, {plate.name}"] = ((x + side / 2) * UM, 0.0)
+        places[f"depth pad {side:g} um, {photomask.name}"] = ((x + side / 2) * UM, 0.0)
         x += side + _PAD_GAP_UM
-    places[f"flat by the pads, {plate.name}"] = ((boxes[-1][0] - _PAD_GAP_UM / 2) * UM, 0.0)
-    return Part(dbu_m, block(plate.on(2), boxes, dbu_m).shapes, places)
+    places[f"flat by the pads, {photomask.name}"] = ((boxes[-1][0] - _PAD_GAP_UM / 2) * UM, 0.0)
+    return Part(dbu_m, block(photomask.on(2), boxes, dbu_m).shapes, places)
 
 
 def codes_by_depth(levels: Levels, bits: Sequence[int]) -> list[int]:
@@ -144,10 +144,12 @@ def _framed(
     return Part(dbu_m, joined(pieces).shapes, {f"grating {name}": (width * dbu_m / 2, height * dbu_m / 2)})
 
 
-def _gratings(levels: Levels, plates: Sequence[Photomask], stripe: int, dbu_m: float) -> Part:
+def _gratings(levels: Levels, photomasks: Sequence[Photomask], stripe: int, dbu_m: float) -> Part:
     """Draw the gratings, of 1 mm or a little more, and the empty window if there is chrome to frame it."""
-    deepest = max((plate for plate in plates if plate.bit is not None), key=lambda plate: plate.depth_m)
-    chrome = next((plate for plate in plates if plate.name == "chrome"), None)
+    deepest = max(
+        (photomask for photomask in photomasks if photomask.bit is not None), key=lambda photomask: photomask.depth_m
+    )
+    chrome = next((photomask for photomask in photomasks if photomask.name == "chrome"), None)
     bits = range(levels.bits)
     high = round(_GRATING_M / dbu_m)
     # The blazed grating rises toward +x, as heights do: the deepest floor of each period comes first.
@@ -164,7 +166,7 @@ def _gratings(levels: Levels, plates: Sequence[Photomask], stripe: int, dbu_m: f
 
 
 def process_monitor(
-    levels: Levels, plates: Sequence[Photomask], pitch_m: float, dbu_m: float, minimum_line_m: float
+    levels: Levels, photomasks: Sequence[Photomask], pitch_m: float, dbu_m: float, minimum_line_m: float
 ) -> Part:
     """Draw all test structures of a job, centred on the origin, about 4.5 mm x 5 mm for 16 levels.
 
@@ -173,20 +175,23 @@ def process_monitor(
     "grating binary", "grating blazed" and "grating blank" (an empty window in the same chrome frame, if there is
     chrome).
     """
-    tested = sorted((plate for plate in plates if plate.makes != "zero layer"), key=lambda plate: plate.layer)
+    tested = sorted(
+        (photomask for photomask in photomasks if photomask.makes != "zero layer"),
+        key=lambda photomask: photomask.layer,
+    )
     cells = []
-    for plate in tested:
-        title = f"{plate.code} {plate.depth.upper()}" if plate.bit is not None else "CR"
-        bars = column([written(plate, title, 8, dbu_m), cd_bars(plate, dbu_m)], 40 * UM)
-        cells.append(row([bars, depth_pads(plate, dbu_m)], _PAD_GAP_UM * UM))
+    for photomask in tested:
+        title = f"{photomask.code} {photomask.depth.upper()}" if photomask.bit is not None else "CR"
+        bars = column([written(photomask, title, 8, dbu_m), cd_bars(photomask, dbu_m)], 40 * UM)
+        cells.append(row([bars, depth_pads(photomask, dbu_m)], _PAD_GAP_UM * UM))
     lines = [row(cells[i : i + 2], 150 * UM) for i in range(0, len(cells), 2)]
-    deepest_first = sorted((p for p in tested if p.bit is not None), key=lambda plate: -plate.depth_m)
-    bits = [plate.bit for plate in deepest_first if plate.bit is not None]
+    deepest_first = sorted((p for p in tested if p.bit is not None), key=lambda photomask: -photomask.depth_m)
+    bits = [photomask.bit for photomask in deepest_first if photomask.bit is not None]
     stairs = [staircase(levels, bits, STEP_M, dbu_m)]
     if levels.bits > 2:
         stairs.append(staircase(levels, bits[:2], 3 * STEP_M, dbu_m))
     for stair in stairs:
         name = next(iter(stair.places)).partition(",")[0].upper()
         lines.append(column([written(deepest_first[0], name, 6, dbu_m), stair], 40 * UM))
-    lines.append(_gratings(levels, plates, _stripe(pitch_m, dbu_m, minimum_line_m), dbu_m))
+    lines.append(_gratings(levels, photomasks, _stripe(pitch_m, dbu_m, minimum_line_m), dbu_m))
     return centred(column(lines, 150 * UM))

@@ -123,8 +123,8 @@ class SplitEntry:
 
 
 @dataclass(frozen=True, config=_STRICT)
-class PlateEntry:
-    """One mask as the shop makes it, in the order of use: what polygons are on the plate, and how it is read."""
+class PhotomaskEntry:
+    """One mask as the shop makes it, in the order of use: what polygons are on the photomask, and how it is read."""
 
     mask: str
     makes: str
@@ -202,7 +202,7 @@ class Manifest:
     combined_oasis: str
     preview: str
     doe_cell: str
-    plates: list[PlateEntry]
+    plates: list[PhotomaskEntry]
     wafer: WaferEntry
     rules: dict[str, Any]
     masks: list[MaskEntry]

@@ -1,4 +1,4 @@
-"""Entries of the manifest of an order: its masks, its chrome, its plates, its wafer and its splits."""
+"""Entries of the manifest of an order: its masks, its chrome, its photomasks, its wafer and its splits."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from fab.manifest.records import (
     ChromeEntry,
     DrawnEntry,
     MaskEntry,
-    PlateEntry,
+    PhotomaskEntry,
     SplitEntry,
     WaferEntry,
     plane_digest,
@@ -65,17 +65,17 @@ def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
     )
 
 
-def plate_entry(order: Order, plate: Photomask) -> PlateEntry:
+def photomask_entry(order: Order, photomask: Photomask) -> PhotomaskEntry:
     """Return the manifest's entry of a mask as the shop makes it."""
-    dark_field = plate.tone == "clear"
-    return PlateEntry(
-        mask=plate.name,
-        makes=plate.makes,
-        layer=plate.layer,
-        bit=plate.bit,
-        depth_nm=None if plate.bit is None else round(plate.depth_m / NM, 9),
-        file=f"{order.plate_stem(plate)}.gds",
-        polygons=f"digitised data {plate.tone}: polygons are {'clear' if dark_field else 'chrome'} on the plate",
+    dark_field = photomask.tone == "clear"
+    return PhotomaskEntry(
+        mask=photomask.name,
+        makes=photomask.makes,
+        layer=photomask.layer,
+        bit=photomask.bit,
+        depth_nm=None if photomask.bit is None else round(photomask.depth_m / NM, 9),
+        file=f"{order.photomask_stem(photomask)}.gds",
+        polygons=f"digitised data {photomask.tone}: polygons are {'clear' if dark_field else 'chrome'} on the plate",
         field="dark field" if dark_field else "clear field",
         reading=order.wafer.reading,
     )

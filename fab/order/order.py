@@ -39,7 +39,7 @@ class Order:
 
     Attributes:
         rules: the level map to draw, checked against what the process prints.
-        process: in which order the masks are etched, and what their polygons are on the plates.
+        process: in which order the masks are etched, and what their polygons are on the photomasks.
         wafer: what the masks are filled with.
         chrome: how the chrome is drawn.
         source: where the level map came from, for the manifest; JSON values only.
@@ -61,7 +61,7 @@ class Order:
         return self.rules.level_map
 
     @cached_property
-    def plates(self) -> tuple[Photomask, ...]:
+    def photomasks(self) -> tuple[Photomask, ...]:
         """The masks in the order in which they are used."""
         process, wafer = self.process, self.wafer
         return photomasks_of(self.level_map.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
@@ -91,11 +91,11 @@ class Order:
         title = f"{self.stem}: {self.level_map.levels}, level map {self.level_map.digest[:12]}"
         return plot_masks(self.level_map, self.chrome.radii_m(self.level_map), title, ax)
 
-    def plate_stem(self, plate: Photomask) -> str:
+    def photomask_stem(self, photomask: Photomask) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
-        if plate.bit is not None:
-            return self.mask_stem(plate.bit)
-        return f"{self.stem}_{'ZERO' if plate.makes == 'zero layer' else 'CHROME'}"
+        if photomask.bit is not None:
+            return self.mask_stem(photomask.bit)
+        return f"{self.stem}_{'ZERO' if photomask.makes == 'zero layer' else 'CHROME'}"
 
     @property
     def stem(self) -> str:

@@ -35,7 +35,7 @@ from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import CONVENTIONS, FORMAT, CellEntry, FileEntry, Manifest, read_manifest
-from fab.order.entries import chrome_entry, describe_edges, mask_entry, plate_entry, split_entries, wafer_entry
+from fab.order.entries import chrome_entry, describe_edges, mask_entry, photomask_entry, split_entries, wafer_entry
 from fab.order.order import OnViolation, Order, plan_order
 from fab.process import Process
 from fab.solids.model import DoeModel
@@ -86,8 +86,8 @@ def _write_masks(
     write_gds(folder / gds, layout)
     review = (layout.top.name, doe_layers, _around(order, layout))
     entries = [_file_entry(folder / gds, "GDSII", *review)]
-    for plate in order.plates:
-        name, layer = order.plate_stem(plate), Layer(plate.layer)
+    for photomask in order.photomasks:
+        name, layer = order.photomask_stem(photomask), Layer(photomask.layer)
         one = mask_file(layout, layer, name)
         write_gds(folder / f"{name}.gds", one)
         on = [layer] if layer in doe_layers else []
@@ -110,7 +110,7 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
     dbu_m = drawn.dbu_m
     frame = draw_frame(
         order.wafer,
-        order.plates,
+        order.photomasks,
         level_map,
         splits=order.splits,
         stem=order.stem,
@@ -156,7 +156,7 @@ def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
         combined_oasis=oasis,
         preview=preview,
         doe_cell=doe_cell,
-        plates=[plate_entry(order, plate) for plate in order.plates],
+        plates=[photomask_entry(order, photomask) for photomask in order.photomasks],
         wafer=wafer_entry(order, frame),
         rules=order.rules.as_record(),
         masks=masks,

@@ -5,5 +5,5 @@ height  a height map: whole, cell by cell, and the share of area at every height
 masks   heights, chrome and etch masks of a mask set
 rules   where masks break the rules of a process
 marks   marks and test structures, all masks over each other
-wafer   a whole mask plate
+wafer   a whole photomask
 """

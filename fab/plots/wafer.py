@@ -1,4 +1,4 @@
-"""The picture of a whole mask plate: blank, wafer, dies, alignment sites, test structures and labels."""
+"""The picture of a whole photomask: blank, wafer, dies, alignment sites, test structures and labels."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ _SITES = {"SITE": "alignment site", "TEST": "test structures"}
 def plot_wafer(
     wafer: "Wafer", frame: "Frame", aperture_m: float, dbu_m: float, title: str = "", ax: "Axes | None" = None
 ) -> "Axes":
-    """Draw where everything lies on a mask plate, seen from the etched side.
+    """Draw where everything lies on a photomask, seen from the etched side.
 
     The cells around the DOE are the frame (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
     number. Diameter of the clear aperture and database unit are metres.

@@ -22,7 +22,7 @@ class MaskMeasured(NamedTuple):
     """Measurements of one etch mask; metres, None where there is none.
 
     Attributes:
-        overlay_x_m: how far the mask lies toward +x of the first plate's marks, at the die.
+        overlay_x_m: how far the mask lies toward +x of the first photomask's marks, at the die.
         overlay_y_m: the same toward +y.
         edges_m: how far edges of etched areas lie outward of the test structure's drawing, mean over the measured bars.
         edge_move_m: how far the edges of the DOE, not those of the bars, were moved outward on the mask.

@@ -41,7 +41,7 @@ class Action(NamedTuple):
 class Step(NamedTuple):
     """Actions with one photomask up to the developed resist and after it, and the deepest floor (metres) then."""
 
-    plate: Photomask
+    photomask: Photomask
     before: tuple[Action, ...]
     after: tuple[Action, ...]
     deepest_m: float
@@ -64,9 +64,9 @@ def next_target_m(target_m: float, measured_m: float, next_m: float) -> float:
     return next_m - (measured_m - target_m)
 
 
-def lifts_off(plate: Photomask) -> bool:
-    """Return whether the chrome of a plate is lifted off: clear polygons leave holes in a positive resist."""
-    return plate.makes == "liftoff" or (plate.makes == "zero layer" and plate.tone == "clear")
+def lifts_off(photomask: Photomask) -> bool:
+    """Return whether the chrome of a photomask is lifted off: clear polygons leave holes in a positive resist."""
+    return photomask.makes == "liftoff" or (photomask.makes == "zero layer" and photomask.tone == "clear")
 
 
 def spread_of(process: Process, bit: int, common: str, own: str) -> Normal:
@@ -75,15 +75,15 @@ def spread_of(process: Process, bit: int, common: str, own: str) -> Normal:
     return Normal(sum(part.mean for part in parts), math.hypot(*(part.sigma for part in parts)))
 
 
-def tone_words(plate: Photomask) -> str:
+def tone_words(photomask: Photomask) -> str:
     """Return in words what the polygons of a photomask are on the glass."""
-    if plate.tone == "clear":
+    if photomask.tone == "clear":
         return "polygons are CLEAR: chrome all over, light passes in the polygons (dark-field plate)"
     return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
 
 
-def _printing(plate: Photomask, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
-    """List the actions from the resist to the developed pattern, the same for every plate."""
+def _printing(photomask: Photomask, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
+    """List the actions from the resist to the developed pattern, the same for every photomask."""
     return (
         Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
         Action(
@@ -98,8 +98,8 @@ def _printing(plate: Photomask, file: str, align: str, thickness_m: float, why: 
         ),
         Action(
             "Load the mask",
-            f"{plate.name.capitalize()}, file {file}. The chrome of the plate faces the resist. On the plate: "
-            f"{tone_words(plate)}.",
+            f"{photomask.name.capitalize()}, file {file}. The chrome of the plate faces the resist. On the plate: "
+            f"{tone_words(photomask)}.",
             ("plate number",),
         ),
         Action("Align", align),
@@ -108,16 +108,16 @@ def _printing(plate: Photomask, file: str, align: str, thickness_m: float, why: 
     )
 
 
-def _etch_actions(plate: Photomask, process: Process) -> tuple[Action, ...]:
-    depth_m, bit = plate.depth_m, plate.bit or 0
+def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
+    depth_m, bit = photomask.depth_m, photomask.bit or 0
     sigma = spread_of(process, bit, "common_depth_scale", "depth_scale").sigma
     usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
     return (
         Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
         Action(
             "Etch",
-            f"Reactive ions (CHF3 or alike) into the glass, TARGET {plate.depth}{usual}. Find the rate on a test piece "
-            f"of the same glass, the same chamber and the same day. Time = target / rate.",
+            f"Reactive ions (CHF3 or alike) into the glass, TARGET {photomask.depth}{usual}. Find "
+            f"the rate on a test piece of the same glass, the same chamber and the same day. Time = target / rate.",
             ("rate (nm/min)", "time (min:s)", "recipe"),
         ),
         Action(
@@ -130,9 +130,9 @@ def _etch_actions(plate: Photomask, process: Process) -> tuple[Action, ...]:
     )
 
 
-def _chrome_actions(plate: Photomask, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
+def _chrome_actions(photomask: Photomask, chrome_m: float, deposition: Deposition) -> tuple[Action, ...]:
     thickness = format_length(chrome_m)
-    if lifts_off(plate):
+    if lifts_off(photomask):
         return (
             Action("Descum", "Oxygen plasma, short. Metal holds on clean glass only.", ("time (s)",)),
             Action("Deposit", f"Chrome, {thickness}, {deposition}. Keep the wafer cool.", ("thickness (nm)",)),
@@ -144,17 +144,17 @@ def _chrome_actions(plate: Photomask, chrome_m: float, deposition: Deposition) -
     )
 
 
-def least_resist(plate: Photomask, chrome_m: float, deposition: Deposition) -> tuple[float, str]:
+def least_resist(photomask: Photomask, chrome_m: float, deposition: Deposition) -> tuple[float, str]:
     """Return the least thickness of the resist, metres, and why.
 
     For lift-off it is five times the metal if that is evaporated and ten times if it is sputtered, because sputtered
     metal also covers the walls; for an etch twice what it uses up at a selectivity of 3, and at least 1 um.
     """
-    if plate.makes == "etch":
-        used = format_length(float(f"{plate.depth_m / _SELECTIVITY:.3g}"))
+    if photomask.makes == "etch":
+        used = format_length(float(f"{photomask.depth_m / _SELECTIVITY:.3g}"))
         why = f"At a selectivity of {_SELECTIVITY:g} the etch uses up {used} of it; thicker resist prints coarser."
-        return max(_THINNEST_M, 2 * plate.depth_m / _SELECTIVITY), why
-    if lifts_off(plate):
+        return max(_THINNEST_M, 2 * photomask.depth_m / _SELECTIVITY), why
+    if lifts_off(photomask):
         fold, thickness = _LIFTOFF_FOLD[deposition], format_length(chrome_m)
         why = f"For lift-off of {deposition} chrome: at least {fold} times its {thickness}, with overhanging edges."
         return fold * chrome_m, why
@@ -165,18 +165,22 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
     """List the steps of a job, one per photomask in order of use."""
     chrome_m, deposition, process = sheet.chrome_m, sheet.deposition, sheet.process
     steps, deepest_m = [], 0.0
-    for number, (plate, note) in enumerate(zip(sheet.plates, alignment_notes(sheet.plates), strict=True)):
-        deepest_m += plate.depth_m
+    for number, (photomask, note) in enumerate(zip(sheet.photomasks, alignment_notes(sheet.photomasks), strict=True)):
+        deepest_m += photomask.depth_m
         align = note if number else f"To the flat of the wafer, by eye, middle on middle. {note}"
-        thickness_m, why = least_resist(plate, chrome_m, deposition)
+        thickness_m, why = least_resist(photomask, chrome_m, deposition)
         how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
         if number == 0:
             how = f"Check thickness, flat and both polished faces, and mark the side to be etched. {how}"
         before = [Action("Clean", how, ("wafer number",) if number == 0 else ())]
-        if plate.makes != "etch" and not lifts_off(plate):
+        if photomask.makes != "etch" and not lifts_off(photomask):
             how = f"Chrome all over, {format_length(chrome_m)}, {deposition}."
             before.append(Action("Deposit", how, ("thickness (nm)",)))
-        before += _printing(plate, sheet.files[plate.name].file, align, thickness_m, why)
-        after = _etch_actions(plate, process) if plate.makes == "etch" else _chrome_actions(plate, chrome_m, deposition)
-        steps.append(Step(plate, tuple(before), after, deepest_m))
+        before += _printing(photomask, sheet.files[photomask.name].file, align, thickness_m, why)
+        after = (
+            _etch_actions(photomask, process)
+            if photomask.makes == "etch"
+            else _chrome_actions(photomask, chrome_m, deposition)
+        )
+        steps.append(Step(photomask, tuple(before), after, deepest_m))
     return tuple(steps)

@@ -96,7 +96,7 @@ class RunSheet:
     Attributes:
         stem: what all files of the order begin with.
         level_map: the DOE; its digest tells one design from another.
-        plates: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
+        photomasks: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
         files: the file of every photomask, by its name.
         process: what the lab does and how far it strays.
         opening_m: diameter of the opening in the chrome, metres.
@@ -116,7 +116,7 @@ class RunSheet:
 
     stem: str
     level_map: LevelMap
-    plates: tuple[Photomask, ...]
+    photomasks: tuple[Photomask, ...]
     files: Mapping[str, PhotomaskFile]
     process: Process
     opening_m: float
@@ -129,10 +129,10 @@ class RunSheet:
     predictions: Predictions | None = None
 
     def __post_init__(self) -> None:
-        if missing := [plate.name for plate in self.plates if plate.name not in self.files]:
-            cure = "Give the file of every plate."
-            raise InputError("run sheet", "every plate must have a file", f"none for {missing[0]}", cure)
-        bits = tuple(plate.bit for plate in self.plates if plate.bit is not None)
+        if missing := [photomask.name for photomask in self.photomasks if photomask.name not in self.files]:
+            cure = "Give the file of every photomask."
+            raise InputError("run sheet", "every photomask must have a file", f"none for {missing[0]}", cure)
+        bits = tuple(photomask.bit for photomask in self.photomasks if photomask.bit is not None)
         if bits != self.process.order:
             rule = f"the etches must come in the order of the process, {self.process.order}"
             raise InputError("run sheet", rule, bits, "List the plates by the order of the process.")

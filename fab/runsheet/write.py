@@ -50,26 +50,26 @@ def _mm(place_m: tuple[float, float]) -> dict[str, float]:
     return {"x_mm": round(place_m[0] / MM, 6), "y_mm": round(place_m[1] / MM, 6)}
 
 
-def _named(sheet: RunSheet, what: str, plate: Photomask) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the places of a plate whose own name begins with `what`: where ("" if not said), and coordinates."""
-    ending = f", {plate.name}"
+def _named(sheet: RunSheet, what: str, photomask: Photomask) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the places of a photomask whose own name begins with `what`: where ("" if not said), and coordinates."""
+    ending = f", {photomask.name}"
     for name, place in sheet.places.items():
         where, _, own = name.rpartition(": ")
         if own.startswith(what) and own.endswith(ending):
             yield where, _mm(place)
 
 
-def _first_place(sheet: RunSheet, what: str, plate: Photomask) -> dict[str, Any]:
-    where, place = next(_named(sheet, f"{what}, ", plate), ("", {"x_mm": None, "y_mm": None}))
+def _first_place(sheet: RunSheet, what: str, photomask: Photomask) -> dict[str, Any]:
+    where, place = next(_named(sheet, f"{what}, ", photomask), ("", {"x_mm": None, "y_mm": None}))
     return {"where": where, **place}
 
 
-def _width_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
-    """List the CD bars of a plate: drawn width, the width at which the DOE comes out as designed, and tolerance."""
-    move_m = sheet.files[plate.name].edge_move_m
+def _width_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
+    """List the CD bars of a photomask: drawn width, the width at which the DOE comes out as designed, and tolerance."""
+    move_m = sheet.files[photomask.name].edge_move_m
     sigma = Normal().sigma
-    if plate.bit is not None:
-        sigma = spread_of(sheet.process, plate.bit, "common_cd_bias_m", "cd_bias_m").sigma
+    if photomask.bit is not None:
+        sigma = spread_of(sheet.process, photomask.bit, "common_cd_bias_m", "cd_bias_m").sigma
     rows = []
     for name, drawn_m in BARS.items():
         outward = 1 if name.endswith("line") else -1
@@ -82,53 +82,57 @@ def _width_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
                 # Both edges of a bar move.
                 "tolerance_um": round(2 * _TWO_SIGMA * sigma / UM, 3) or None,
                 "below_process": bool(drawn_m < smallest * (1 - 1e-9)),
-                **_first_place(sheet, f"CD {name}", plate),
+                **_first_place(sheet, f"CD {name}", photomask),
             }
         )
     return rows
 
 
-def _depth_rows(sheet: RunSheet, plate: Photomask) -> list[dict[str, Any]]:
+def _depth_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
     lag = sheet.process.spreads.get("etch_lag", Normal()).mean
     return [
         {
             "pad": name,
-            "target_nm": _nm(plate.depth_m),
+            "target_nm": _nm(photomask.depth_m),
             # A pad loses the share lag x depth / width of its depth.
-            "expected_nm": round(plate.depth_m * (1 - lag * plate.depth_m / side_m) / NM, 2),
-            **_first_place(sheet, f"depth pad {name}", plate),
+            "expected_nm": round(photomask.depth_m * (1 - lag * photomask.depth_m / side_m) / NM, 2),
+            **_first_place(sheet, f"depth pad {name}", photomask),
         }
         for name, side_m in PADS.items()
     ]
 
 
-def _marks(sheet: RunSheet, plate: Photomask, key: str, *kinds: str, prefix: str = "") -> list[dict[str, Any]]:
-    """List where the marks of a plate are, except for the first one, to which all others are aligned."""
-    found = ((kind, _named(sheet, f"{prefix}{kind}, ", plate)) for kind in kinds if plate is not sheet.plates[0])
+def _marks(sheet: RunSheet, photomask: Photomask, key: str, *kinds: str, prefix: str = "") -> list[dict[str, Any]]:
+    """List where the marks of a photomask are, except for the first one, to which all others are aligned."""
+    found = (
+        (kind, _named(sheet, f"{prefix}{kind}, ", photomask)) for kind in kinds if photomask is not sheet.photomasks[0]
+    )
     return [{key: kind, "where": where, **place} for kind, places in found for where, place in places]
 
 
 def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> dict[str, Any]:
     """Describe the depth of one etch: times, pads, and what to do if it is off."""
-    plate, following = step.plate, later[0] if later else None
+    photomask, following = step.photomask, later[0] if later else None
     corrections = []
     if following:
         corrections = [
             {
                 "off_by_nm": miss,
-                "next_target_nm": _nm(next_target_m(plate.depth_m, plate.depth_m + miss * NM, following.depth_m)),
+                "next_target_nm": _nm(
+                    next_target_m(photomask.depth_m, photomask.depth_m + miss * NM, following.depth_m)
+                ),
             }
             for miss in _MISSES_NM
         ]
     return {
-        "target_nm": _nm(plate.depth_m),
+        "target_nm": _nm(photomask.depth_m),
         "deepest_floor_nm": _nm(step.deepest_m),
         "time_formula": "time = target / rate",
         "times": [
-            {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(plate.depth_m / rate)}
+            {"rate_nm_per_min": round(rate * 60 / NM, 6), "time_s": round(photomask.depth_m / rate)}
             for rate in RATES_M_PER_S
         ],
-        "pads": _depth_rows(sheet, plate),
+        "pads": _depth_rows(sheet, photomask),
         "next": following.name if following else None,
         "corrections": corrections,
     }
@@ -139,45 +143,45 @@ def _actions(actions: tuple[Action, ...]) -> list[dict[str, Any]]:
 
 
 def _step_record(sheet: RunSheet, number: int, step: Step) -> dict[str, Any]:
-    plate = step.plate
-    later = tuple(other for other in sheet.plates[number:] if other.bit is not None)
-    titles = {"etch": f"etch {plate.depth}", "zero layer": "chrome marks", "liftoff": "the aperture, by lift-off"}
-    structures = plate.makes != "zero layer"
-    overlay = spread_of(sheet.process, plate.bit, "", "overlay_x_m") if plate.bit is not None else Normal()
+    photomask = step.photomask
+    later = tuple(other for other in sheet.photomasks[number:] if other.bit is not None)
+    titles = {"etch": f"etch {photomask.depth}", "zero layer": "chrome marks", "liftoff": "the aperture, by lift-off"}
+    structures = photomask.makes != "zero layer"
+    overlay = spread_of(sheet.process, photomask.bit, "", "overlay_x_m") if photomask.bit is not None else Normal()
     return {
         "number": number,
-        "plate": plate.name,
-        "code": plate.code,
-        "title": f"{plate.name.capitalize()}: {titles.get(plate.makes, 'the aperture, by wet etch')}",
-        "makes": plate.makes,
-        "file": sheet.files[plate.name].file,
+        "plate": photomask.name,
+        "code": photomask.code,
+        "title": f"{photomask.name.capitalize()}: {titles.get(photomask.makes, 'the aperture, by wet etch')}",
+        "makes": photomask.makes,
+        "file": sheet.files[photomask.name].file,
         "before": _actions(step.before),
         "after": _actions(step.after),
-        "marks": _marks(sheet, plate, "mark", "finder", *(f"box {mark.gap_um:g} um" for mark in BOXES)),
-        "widths": _width_rows(sheet, plate) if structures else [],
-        "overlay": _marks(sheet, plate, "axis", "x", "y", prefix="vernier "),
+        "marks": _marks(sheet, photomask, "mark", "finder", *(f"box {mark.gap_um:g} um" for mark in BOXES)),
+        "widths": _width_rows(sheet, photomask) if structures else [],
+        "overlay": _marks(sheet, photomask, "axis", "x", "y", prefix="vernier "),
         "overlay_tolerance_um": round(_TWO_SIGMA * overlay.sigma / UM, 3) or None,
-        "etch": _etch_record(sheet, step, later) if plate.makes == "etch" else None,
+        "etch": _etch_record(sheet, step, later) if photomask.makes == "etch" else None,
     }
 
 
 def _order_record(sheet: RunSheet) -> list[dict[str, Any]]:
     return [
         {
-            "plate": plate.name,
-            "code": plate.code,
-            "file": sheet.files[plate.name].file,
-            "sha256": sheet.files[plate.name].sha256,
-            "cell": sheet.files[plate.name].cell,
-            "layer": f"{plate.layer}/0",
-            "bit": plate.bit,
-            "depth_nm": _nm(plate.depth_m) if plate.bit is not None else None,
-            "polygons_mean": "chrome here" if plate.bit is None else "etched here",
-            "tone": tone_words(plate),
+            "plate": photomask.name,
+            "code": photomask.code,
+            "file": sheet.files[photomask.name].file,
+            "sha256": sheet.files[photomask.name].sha256,
+            "cell": sheet.files[photomask.name].cell,
+            "layer": f"{photomask.layer}/0",
+            "bit": photomask.bit,
+            "depth_nm": _nm(photomask.depth_m) if photomask.bit is not None else None,
+            "polygons_mean": "chrome here" if photomask.bit is None else "etched here",
+            "tone": tone_words(photomask),
             "reading": sheet.wafer.reading,
-            "edge_move_nm": _nm(sheet.files[plate.name].edge_move_m),
+            "edge_move_nm": _nm(sheet.files[photomask.name].edge_move_m),
         }
-        for plate in sheet.plates
+        for photomask in sheet.photomasks
     ]
 
 
@@ -207,11 +211,11 @@ def _blanks(sheet: RunSheet) -> dict[str, Any]:
     widths = {"cd_bias_um": None, "cd_um": dict.fromkeys(BARS)}
     mask = {**overlay, **widths, "times_etched": None, "depth_nm": None, "depth_by_pad_nm": dict.fromkeys(PADS)}
     chrome = {**overlay, **widths, "opening_diameter_um": None}
-    etched = [plate for plate in sheet.plates if plate.bit is not None]
-    named = {plate.name: dict(mask) for plate in sorted(etched, key=lambda plate: plate.layer)}
-    for key in overlay if sheet.plates[0].bit is not None else ():
-        del named[sheet.plates[0].name][key]  # its marks are what the others are measured against
-    if any(plate.name == "chrome" for plate in sheet.plates):
+    etched = [photomask for photomask in sheet.photomasks if photomask.bit is not None]
+    named = {photomask.name: dict(mask) for photomask in sorted(etched, key=lambda photomask: photomask.layer)}
+    for key in overlay if sheet.photomasks[0].bit is not None else ():
+        del named[sheet.photomasks[0].name][key]  # its marks are what the others are measured against
+    if any(photomask.name == "chrome" for photomask in sheet.photomasks):
         named["chrome"] = chrome
     corners = {"corner_radius_um": None, "sidewall_deg": None}
     light = {"grating_binary": None, "grating_blazed": None}
@@ -247,7 +251,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "dies": [{"name": die.name, **_mm((die.x_m, die.y_m)), "note": die.note} for die in sheet.dies],
         "chrome": {"thickness_nm": _nm(sheet.chrome_m), "deposition": sheet.deposition},
         "vernier_step_um": _um(VERNIER_STEP_M),
-        "reference": sheet.plates[0].name,
+        "reference": sheet.photomasks[0].name,
         "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps_of(sheet), start=1)],
         "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},

@@ -155,12 +155,12 @@ def _doe_problems(
         shapes = doe.shapes.get(chrome, Shapes())
         problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
         problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, expected.edges.dbu_m)
-    # A split has the layers of the plate itself, so its problems need its name.
+    # A split has the layers of the DOE itself, so its problems need its name.
     return problems if name == expected.manifest.doe_cell else [f"cell {name}: {problem}" for problem in problems]
 
 
 def cell_problems(cells: Iterable[Cell], entry: FileEntry, dbu_m: float) -> list[str]:
-    """Compare the cells around the DOE (marks, labels, dies, plate) with the manifest; one sentence per difference."""
+    """Compare the cells around the DOE (marks, labels, dies, photomask) with the manifest; a sentence each."""
     found = {cell.name: cell_entry(cell, dbu_m) for cell in cells}
     stated = {cell.cell: cell for cell in entry.cells}
     problems = [f"cell {name} should not be there" for name in sorted(set(found) - set(stated))]
@@ -189,8 +189,8 @@ def _entry_problems(found: CellEntry, stated: CellEntry) -> list[str]:
 def reading_problems(reading: LayerReading, entry: FileEntry, expected: Expected) -> list[str]:
     """Compare one layer, as the other library found it, with what it should hold; one sentence per difference."""
     problems = _reading_problems(reading, expected.etch_layers(entry)[reading.cell].get(reading.layer), expected)
-    plate = reading.cell == expected.manifest.doe_cell
-    return problems if plate else [f"cell {reading.cell}: {problem}" for problem in problems]
+    whole = reading.cell == expected.manifest.doe_cell
+    return problems if whole else [f"cell {reading.cell}: {problem}" for problem in problems]
 
 
 def _reading_problems(reading: LayerReading, mask: Drawn | None, expected: Expected) -> list[str]:

@@ -69,7 +69,7 @@ def sheet(
     given = {"level_map": doe(levels), "opening_m": 4.43e-3, **rest}
     dies = (Die("A1", 0.0, 0.0), Die("A2", 10e-3, 0.0, 'edges of <all> masks "+50 nm"'))
     return RunSheet(
-        stem=STEM, plates=plates, files=files, process=process, wafer=wafer, places=places, dies=dies,
+        stem=STEM, photomasks=plates, files=files, process=process, wafer=wafer, places=places, dies=dies,
         **given,
     )  # fmt: skip
 

@@ -59,7 +59,7 @@ def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, ze
     made = sheet(levels, tuple(reversed(range(levels.bits))), tone, chrome, zero_layer)
     page = page_of(record(made))
     assert (page.wrong, page.open) == ([], [])
-    for number, plate in enumerate(made.plates, start=1):
+    for number, plate in enumerate(made.photomasks, start=1):
         assert f"{number}. {plate.name.capitalize()}: " in page.text
         assert made.files[plate.name].file in page.text
         assert made.files[plate.name].sha256 in page.text
@@ -135,7 +135,7 @@ def test_steps_come_in_the_order_of_use_and_say_how_to_align():
 
 
 def test_resist_is_thick_enough():
-    plates = {plate.name: plate for plate in sheet(Levels(64, 75 * NM)).plates}
+    plates = {plate.name: plate for plate in sheet(Levels(64, 75 * NM)).photomasks}
     # A published rule: five times evaporated metal, ten times sputtered.
     assert least_resist(plates["chrome"], 100 * NM, "evaporated")[0] == pytest.approx(0.5 * UM)
     assert least_resist(plates["chrome"], 100 * NM, "sputtered")[0] == pytest.approx(1.0 * UM)
@@ -210,4 +210,4 @@ def test_a_sheet_without_its_files_or_in_another_order_is_refused():
     with pytest.raises(InputError, match="file"):
         replace(made, files={})
     with pytest.raises(InputError, match="order of the process"):
-        replace(made, plates=other.plates)
+        replace(made, photomasks=other.photomasks)
