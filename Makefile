@@ -20,7 +20,7 @@ train-demo: $(VENV)/.base
 	$(BIN)/python examples/train_demo.py
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 -m slow

@@ -61,6 +61,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 # Above this, a test process forgets the programs it compiled when a module of tests is done; jax itself never does.
 RESIDENT_BYTES = 1.3e9
+# By so much it may grow from test to test before pictures are looked for that nothing holds but themselves.
+GROWTH_BYTES = 0.2e9
+COLLECTED = pytest.StashKey[float]()  # resident bytes after the last search
 
 
 def resident_bytes() -> int:
@@ -69,13 +72,19 @@ def resident_bytes() -> int:
     return int(pages.read_text().split()[1]) * resource.getpagesize() if pages.exists() else 0
 
 
-@pytest.fixture(scope="module", autouse=True)
-def modest_memory() -> Iterator[None]:
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Keep the memory of a test process modest."""
     yield
-    if "jax" in sys.modules and resident_bytes() > RESIDENT_BYTES:
+    now = resident_bytes()
+    module_is_done = nextitem is None or nextitem.path != item.path
+    forgets = module_is_done and now > RESIDENT_BYTES and "jax" in sys.modules
+    if forgets:
         sys.modules["jax"].clear_caches()
+    if forgets or now > max(RESIDENT_BYTES, item.config.stash.get(COLLECTED, 0.0) + GROWTH_BYTES):
         gc.collect()
         getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)
+        item.config.stash[COLLECTED] = resident_bytes()
 
 
 @pytest.fixture

@@ -178,6 +178,7 @@ def test_one_colour_of_a_mosaic_is_enough(tmp_path: Path):
     assert half.explained
 
 
+@pytest.mark.slow
 def test_a_known_brightness_measures_the_throughput(tmp_path: Path):
     design, process = small()
     lights = light_of(design, process, FEW, (NEAR_M,))
@@ -239,6 +240,7 @@ def scores_near_the_truth(objective: FitObjective) -> np.ndarray:
     return np.concatenate([unknowns.scores(values) + 0.05, np.full(len(objective.motions), 0.02)])
 
 
+@pytest.mark.slow
 def test_slopes_of_the_objective(objective: FitObjective):
     """Gauss-Newton's half gradient is that of the objective."""
     weights = tuple(measured_weights(target, 0.01) for target in objective.targets)

@@ -224,6 +224,7 @@ def test_the_design_stands_on_the_chosen_levels() -> None:
     assert np.array_equal(quantise(design.height_m, design.levels), design.level_map.level)
 
 
+@pytest.mark.slow
 def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN, "optimize.quantisation=none"])
     problem, _ = problem_of(spec, {})

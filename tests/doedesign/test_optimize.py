@@ -34,8 +34,8 @@ def run(
     return jax.tree.map(np.asarray, state), history
 
 
-@pytest.mark.parametrize("parametrization", ["freeform", "radial"])
-@pytest.mark.parametrize("quantisation", ["straight_through", "annealed", "none"])
+@pytest.mark.parametrize("parametrization", ["freeform", pytest.param("radial", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("quantisation", ["straight_through", "annealed", pytest.param("none", marks=pytest.mark.slow)])
 def test_loss_falls(parametrization: str, quantisation: str) -> None:
     overrides = [*SMALL, f"optimize.parametrization={parametrization}", f"optimize.quantisation={quantisation}"]
     _, history = run(load_spec(EXAMPLES / "quick.toml", [*overrides, "optimize.steps=30"]))
@@ -63,6 +63,7 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_resumed_run_has_the_same_bits() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", SMALL)
     whole, history = run(spec)

@@ -77,6 +77,7 @@ def test_no_other_etch_makes_up_for_a_wrong_depth():
     assert leaking > 1e-3
 
 
+@pytest.mark.slow
 def test_the_outlook_is_the_prediction_of_one_depth(design):
     spreads = {"common_depth_scale": Normal(0.03, 0.01), "overlay_x_m[3]": Normal(0.1 * UM, 0.3 * UM)}
     process = Process(LEVELS, spreads=spreads)

@@ -33,7 +33,9 @@ from tests.doedesign.test_simulate_command import SPEC
 from tests.pictures import leave_out_pictures
 
 
-@pytest.mark.parametrize("model", ["paper", "radiometric", "reciprocal"])
+@pytest.mark.parametrize(
+    "model", ["paper", *(pytest.param(m, marks=pytest.mark.slow) for m in ("radiometric", "reciprocal"))]
+)
 def test_light_comes_in_over_the_edges(rng: np.random.Generator, tmp_path: Path, model: Model):
     """The middle of a large scene is the same whether its surroundings are real or invented farther out."""
     (tmp_path / "small.toml").write_text(SPEC)

@@ -182,6 +182,7 @@ def test_the_papers_models_are_named_where_they_are_used(run: Path, images: Path
     assert model in result["said"]
 
 
+@pytest.mark.slow
 def test_a_plate_as_fabricated(run: Path, images: Path, tmp_path: Path):
     drawn = simulate(run, tmp_path / "a", images, "--count", 1)
     simulate(run, tmp_path / "b", images, "--count", 1, "--fabricated", "--plate-seed", 3)
@@ -200,6 +201,7 @@ def test_a_mosaic(run: Path, images: Path, tmp_path: Path):
     assert found["conventional"].shape == (3, 32, 32)
 
 
+@pytest.mark.slow
 def test_one_colour(images: Path, tmp_path: Path):
     text = SPEC.replace('["656 nm", "589 nm", "486 nm"]', '["550 nm"]').replace('"small"', '"single"')
     result = simulate(finished_run(tmp_path, text), tmp_path / "out", images, "--count", 1)

@@ -57,6 +57,7 @@ def test_unusual_maps_are_drawn(levels: Levels | None):
     require_whole(plot_height(HeightMap(flat, Grid((7, 7), 1e-6), 5e-6), levels, "t" * 500))
 
 
+@pytest.mark.slow
 def test_maps_and_reports_draw_themselves(rng: np.random.Generator):
     level_map = random_map(rng)
     height = HeightMap(level_map.height_m, GRID, 116e-6)

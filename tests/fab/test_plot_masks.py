@@ -11,7 +11,7 @@ from tests.fab.maps import level_map_from
 from tests.pictures import dots_of, panel, require_place_of_axes, require_whole
 
 
-@pytest.mark.parametrize(("count", "shape"), [(2, (3, 5)), (64, (70, 64))])
+@pytest.mark.parametrize(("count", "shape"), [(2, (3, 5)), pytest.param(64, (70, 64), marks=pytest.mark.slow)])
 def test_the_bytes_depend_on_the_masks_alone(count, shape):
     level = np.random.default_rng(1).integers(0, count, shape)
     level_map = level_map_from(level, Levels(count, 75 * NM), UM, 3 * UM)

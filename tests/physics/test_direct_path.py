@@ -55,7 +55,7 @@ def test_square_opening(kernel: Kernel, distance_m: float):
     assert got.sum(dtype=np.float64) == pytest.approx(wanted.sum(), rel=2e-3)
 
 
-@pytest.mark.parametrize("zones", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("zones", [1.0, 2.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_circular_opening_on_the_axis(zones: float):
     """4 sin²(pi N / 2) times the open wave for Fresnel number N: bright for odd, dark for even numbers of zones."""
     radius = 0.15e-3
@@ -73,7 +73,7 @@ def smooth_plate(cells: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("depth_m", [np.inf, 0.05])
-@pytest.mark.parametrize("defocus_m", [0.0, 1e-4])
+@pytest.mark.parametrize("defocus_m", [1e-4, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_far_field_agrees_with_the_direct_path(depth_m: float, defocus_m: float):
     camera = make_camera(800, 0.4e-3, 8e-3, 3.7e-6, 64, defocus_m=defocus_m)
     height = smooth_plate(800)

@@ -142,7 +142,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("lag", "each mask its own") else n for n in CASES]
+)
 def test_intensities_are_those_of_a_raster(name: str):
     case = CASES[name]
     level = noise_map(case.levels.count)
@@ -205,7 +207,7 @@ ALIKE_M = float(np.sqrt(32 / (1 - np.pi / 4))) * F
         ),
         pytest.param(SIXTEEN, TOGETHER, 0.08, 0.14, id="the same corner in several masks", marks=pytest.mark.slow),
         # Where another mask's edge runs through the area, the area is taken to lie on one side of it.
-        pytest.param(SIXTEEN, OVERLAY, 0.18, 0.24, id="corners of different masks apart"),
+        pytest.param(SIXTEEN, OVERLAY, 0.18, 0.24, id="corners of different masks apart", marks=pytest.mark.slow),
         pytest.param(SIXTEEN, HALF_CELL, 0.14, 0.2, id="half a cell apart", marks=pytest.mark.slow),
         # Worst case: several edges run through every area. Measured 0.74 and 0.88; the change is 3e-3 of the light.
         pytest.param(SIXTEEN, CLOSE, 0.85, 1.0, id="corners of different masks close together", marks=pytest.mark.slow),

@@ -118,6 +118,7 @@ def test_a_stopped_run_chooses_the_same(tiny, cli, chosen, content, tmp_path, mo
     assert levels_in(run) == levels_in(chosen[0])
 
 
+@pytest.mark.slow
 def test_given_depths_go_all_the_way(tiny, cli, tmp_path):
     run, order = tmp_path / "run", tmp_path / "order"
     given = ("--set", 'process.etch_depths=["520 nm", "260 nm"]')

@@ -48,6 +48,7 @@ def test_an_ideal_process_gives_the_quantised_design_to_the_last_bit(copy_of_run
     assert np.array_equal(energies(copy_of_run), drawn)
 
 
+@pytest.mark.slow
 def test_a_seed_is_repeated_and_its_variation_file_gives_the_same_plate(copy_of_run, cli, process, tmp_path):
     assert cli("psf", copy_of_run, "--fabricated", "--process", process, "--seed", 5).code == 0
     first = energies(copy_of_run)

@@ -37,7 +37,7 @@ def test_a_freeform_design_is_ordered_with_a_flat_plate(finished):
     ("option", "names"),
     [
         ("--patch", {"PATCH.step", "PATCH.3mf", "PATCH.glb", "PATCH_MM.stl"}),
-        ("--mesh-patch", {"PATCH.3mf", "PATCH.glb", "PATCH_MM.stl"}),
+        pytest.param("--mesh-patch", {"PATCH.3mf", "PATCH.glb", "PATCH_MM.stl"}, marks=pytest.mark.slow),
     ],
 )
 def test_a_patch_is_written_on_request(finished, cli, tmp_path, option, names):

@@ -33,8 +33,9 @@ def wait_for(path: Path, process) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "code"),
-    [(signal.SIGKILL, -signal.SIGKILL), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)],
+    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)],
 )
+@pytest.mark.slow
 def test_killed_after_a_checkpoint(tiny, cli, content, uninterrupted, start_process, tmp_path, kind, code):
     folder = tmp_path / "run"
     process = start_process("optimize", tiny, "--out", folder, *LONG)
@@ -50,6 +51,7 @@ def test_killed_after_a_checkpoint(tiny, cli, content, uninterrupted, start_proc
     assert content(folder) == uninterrupted
 
 
+@pytest.mark.slow
 def test_a_second_process_is_kept_out(tiny, cli, start_process, tmp_path):
     folder = tmp_path / "run"
     process = start_process("optimize", tiny, "--out", folder, *LONG)

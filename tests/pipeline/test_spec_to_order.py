@@ -123,6 +123,7 @@ def test_a_finished_run_is_found_again_at_once(finished, tiny, cli, content):
     assert {path: path.stat().st_mtime_ns for path in finished.run.rglob("*")} == times
 
 
+@pytest.mark.slow
 def test_two_runs_of_a_spec_have_the_same_bytes(finished, tiny, cli, content, tmp_path):
     assert cli("optimize", tiny, "--out", tmp_path / "run").code == 0
     assert cli("masks", tmp_path / "run", "--out", tmp_path / "order").code == 0
@@ -131,6 +132,7 @@ def test_two_runs_of_a_spec_have_the_same_bytes(finished, tiny, cli, content, tm
     assert content(tmp_path / "order") == content(finished.order)
 
 
+@pytest.mark.slow
 def test_masks_and_psf_replace_their_earlier_results(copied, cli, content):
     before = content(copied.run), content(copied.order)
     assert cli("masks", copied.run, "--out", f"{copied.order}/").code == 0
@@ -190,6 +192,7 @@ def test_fewer_levels_come_from_the_continuous_design(finished, cli, tmp_path):
     assert np.abs(off[inside]).max() <= 150e-9 * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_paths_may_lead_through_links_and_upwards(finished, cli, tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to(finished.order)
     (tmp_path / "deep").mkdir()

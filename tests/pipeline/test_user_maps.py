@@ -100,7 +100,9 @@ def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
     assert manifest["aperture_mm"] == pytest.approx(37 * PITCH_UM * 1e-3)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 90), (90, 3)])
+@pytest.mark.parametrize(
+    "shape", [(1, 1), pytest.param((2, 90), marks=pytest.mark.slow), pytest.param((90, 3), marks=pytest.mark.slow)]
+)
 def test_odd_shapes(cli, tmp_path, rng, shape):
     np.save(tmp_path / "odd.npy", rng.uniform(0, FULL_M, shape))
     options = ("--levels", LEVELS, "--step", "75 nm", "--pitch-um", 20, "--out", tmp_path / "order")
@@ -113,9 +115,9 @@ def test_odd_shapes(cli, tmp_path, rng, shape):
     ("stem", "folder", "order_id"),
     [
         ("My lens (v2)", "My_lens__v2", "MY_LENS_V2"),
-        ("Linse-Größe", "Linse_Gr__e", "LINSE_GR_E"),
+        pytest.param("Linse-Größe", "Linse_Gr__e", "LINSE_GR_E", marks=pytest.mark.slow),
         ("плата", "height", "HEIGHT"),
-        ("…", "height", "HEIGHT"),
+        pytest.param("…", "height", "HEIGHT", marks=pytest.mark.slow),
     ],
 )
 def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):

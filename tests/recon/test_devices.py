@@ -214,7 +214,9 @@ class _TakenError(Exception):
     """The step would begin now."""
 
 
-@pytest.mark.parametrize("changes", [(), ('train.precision="mixed"', "train.checkpointing=true")])
+@pytest.mark.parametrize(
+    "changes", [(), pytest.param(('train.precision="mixed"', "train.checkpointing=true"), marks=pytest.mark.slow)]
+)
 def test_a_step_is_lowered_for_a_gpu(monkeypatch: pytest.MonkeyPatch, changes: tuple[str, ...]) -> None:
     # Nothing in it may be a processor's own: XLA would find out on the machine that has the GPU, and not before.
     given: list[Any] = []

@@ -205,6 +205,7 @@ def test_the_result_is_a_model(whole: Path, pairs: Path, tmp_path: Path, capsys:
     assert before.near_m == pytest.approx(2 / (1 / 0.05 + 1 / 0.12))
 
 
+@pytest.mark.slow
 def test_it_learns_what_the_camera_does(model: Path, pairs: Path, tmp_path: Path):
     """Half of the light and a veil: undone on pairs that were never trained on."""
     code, said = tuned(model, pairs, tmp_path / "out", steps=150, learning_rate=1e-2)

@@ -57,7 +57,12 @@ def test_the_paper_size_has_two_point_three_million_parameters() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{}, {"wiener": False}, {"features": False}, {"near_estimate": False}, {"refine": False}, {"variant": "release"}],
+    [
+        {},
+        {"features": False},
+        {"variant": "release"},
+        *(pytest.param({name: False}, marks=pytest.mark.slow) for name in ("wiener", "near_estimate", "refine")),
+    ],
 )
 def test_every_block_can_be_left_out(change: dict[str, Any]) -> None:
     layout = replace(TINY, **change)
@@ -108,6 +113,7 @@ def test_checkpointing_changes_memory_and_no_number() -> None:
         np.testing.assert_allclose(a, b, atol=1e-5 * max(float(jnp.abs(a).max()), 1e-3))
 
 
+@pytest.mark.slow
 def test_half_precision_stays_close() -> None:
     network = Network.make(SMALL, 1)
     whole, half = (CALL(network, capture(), psfs(), psfs(), half=flag) for flag in (False, True))

@@ -5,6 +5,8 @@ import sys
 import textwrap
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 BLOCKED = ("cadquery", "OCP", "gdstk", "klayout", "manifold3d", "nlopt", "trimesh")
 SCRIPT = f"""
@@ -30,6 +32,7 @@ def failure_of(script: str) -> str:
     return f"exit {done.returncode}: {done.stderr}" if done.returncode else ""
 
 
+@pytest.mark.slow
 def test_without_what_only_drawing_needs() -> None:
     assert failure_of(SCRIPT) == ""
 

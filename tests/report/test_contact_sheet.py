@@ -1,6 +1,7 @@
 """The contact sheet: it is drawn, the same each time, and shows what it is given the right way up."""
 
 import numpy as np
+import pytest
 
 from doedesign.report.sheet import ContactRow, plot_contact
 from fab.figure import png_bytes
@@ -30,6 +31,7 @@ def test_sheet():
     assert values.shape[1] > 1000
 
 
+@pytest.mark.slow
 def test_many_rows_are_cut():
     few, many = (plot_contact([row(str(k), 8) for k in range(count)], "", "") for count in (12, 30))
     assert png_bytes(few) == png_bytes(many)

@@ -97,7 +97,14 @@ def plot(name: str, ax: Axes | None = None) -> Axes | FigureBase:
             return plot_budget(budget(name), ax)
 
 
-@pytest.mark.parametrize("name", ["histograms", "yield", "one_at_a_time", "sobol", "bare", "found", "beyond"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "histograms",
+        "found",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("yield", "one_at_a_time", "sobol", "bare", "beyond")),
+    ],
+)
 def test_a_picture_is_whole_and_the_same_whatever_the_user_has_set(name: str):
     require_whole(plot(name))
     require_place_of_axes(lambda ax: plot(name, ax))

@@ -129,6 +129,7 @@ def test_displaced_coverage_has_derivatives():
     assert slope[0] == pytest.approx(np.pi * 41.3 / 4, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_middle_of_the_circle_has_no_kink():
     """A cell in the very middle is at distance zero, where a root has no slope; the circle does not care."""
     grid = Grid((5, 5), 1e-6)

@@ -69,6 +69,7 @@ def test_pieces_are_open_where_a_pixel_within_the_bias_is(errors: list[tuple[flo
             assert bool(seen.any() if bias[mask] >= 0 else seen.all()) == expected
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(shifts, biases), min_size=1, max_size=4))
 def test_the_lines_are_the_masks_edges(errors: list[tuple[float, float]]):
     shift, bias = (np.array(part) for part in zip(*errors, strict=True))

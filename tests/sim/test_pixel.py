@@ -63,7 +63,7 @@ def test_a_pixel_beyond_the_samples_is_refused(centre: float):
         pixel_weights(np.array([centre]), 3.0, 0.5, 60)
 
 
-@settings(max_examples=20)  # every example is compiled anew
+@settings(max_examples=10)  # every example is compiled anew
 @given(st.integers(1, 200), st.integers(1, 90), st.integers(1, 70), st.integers(0, 12), st.integers(0, 2**32 - 1))
 def test_banded_is_the_dense_product(inputs: int, outputs: int, tile: int, half_width: int, seed: int):
     rng = np.random.default_rng(seed)

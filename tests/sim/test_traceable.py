@@ -152,7 +152,7 @@ def layers(rng: np.random.Generator) -> tuple[Any, ...]:
     return background, 0.2 + 0.5 * rng.uniform(0, 1, SHAPE), radiance, np.float64(10.0)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [*(pytest.param(model, marks=pytest.mark.slow) for model in MODELS[:-1]), MODELS[-1]])
 def test_image_formation(rng: np.random.Generator, model: Model):
     """PSFs, images, mask and depth at once; from the bank through `Optics.of`, as a user goes."""
     bank = psf(HEIGHT_M, CAMERA, DEPTHS_M)
