@@ -38,7 +38,7 @@ from jaxtyping import Array, Complex, Float, Inexact, PyTree
 from scipy.fft import next_fast_len
 
 from sim.camera import Camera
-from sim.propagation.pixel import Banded, pixel_weights, sampling_for
+from sim.propagation.pixel import Banded, PixelWeights, pixel_weights, sampling_for
 from sim.propagation.pupil import PupilRows, block_size, cis, in_blocks
 
 TOLERANCE = 2e-3  # predicted relative L2 error of pixel energies, unless a plan says otherwise
@@ -114,7 +114,7 @@ def plan_far_field(
     samples = 64 * int(np.ceil(2 * half / 64))
     kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + _FIELD_TAPS + 2) / 64))
     positions = (np.arange(samples) - samples // 2) * fine
-    weights = pixel_weights(camera.axis_m() / fine + samples // 2, width, aperture * fine / scale, samples)
+    weights = _pixel_rule(camera, width, fine, aperture * fine / scale, samples)
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for fine².
     amount = pitch**2 / scale * fine / np.sqrt(np.pi * aperture**2 / 4)
     envelope = np.sinc(positions * pitch / scale) ** 2 if cell and bare else np.ones(samples)
@@ -137,6 +137,12 @@ def plan_far_field(
         spacing_m=spacing,
         expected_error=np.hypot(np.sqrt(2) * weights.expected_error, 2 * np.sqrt(2) * missed),
     )
+
+
+@lru_cache(maxsize=32)
+def _pixel_rule(camera: Camera, width: float, fine: float, cutoff: float, samples: int) -> PixelWeights:
+    """`pixel_weights` for samples `fine` metres apart; kept, for every depth of a wavelength has the same."""
+    return pixel_weights(camera.axis_m() / fine + samples // 2, width, cutoff, samples)
 
 
 def field_weights(
