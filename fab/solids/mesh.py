@@ -10,6 +10,7 @@ The origin is the centre of the clear aperture, z = 0 the blank surface and +z a
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -31,12 +32,12 @@ class Mesh:
     triangles: NDArray[np.int32]
     about: str = ""
 
-    @property
+    @cached_property
     def corners_m(self) -> tuple[NDArray[np.float64], ...]:
         """First, second and third corner of every triangle, ``(m, 3)``."""
         return tuple(self.vertices_m[self.triangles[:, corner]] for corner in range(3))
 
-    @property
+    @cached_property
     def areas_m2(self) -> NDArray[np.float64]:
         """Areas of the triangles as seen from +z, negative from below, ``(m,)``."""
         a, b, c = self.corners_m

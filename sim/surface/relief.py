@@ -129,7 +129,7 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
         slope=jnp.tan(single(variation.sidewall_rad)),
         lag=single(variation.etch_lag),
         bowl=single(variation.radial_nonuniformity) / radius**2,
-        tilt=tilt / radius,
+        tilt=tilt * (np.float32(1) / np.float32(radius)),
         rough_m=rough_m,
         height_m=np.float32(levels.count - 1) * np.float32(levels.step_m)
         if levels.is_binary
