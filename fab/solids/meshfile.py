@@ -124,6 +124,9 @@ def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
     write_atomic(path, b"".join([header, struct.pack("<I", len(facets)), facets.tobytes()]))
 
 
+_CHUNK = 1 << 20  # bytes; by itself the parser asks for two thousand at a time
+
+
 def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float]:
     """Read the one object of a 3MF file as a stream; a tree of millions of elements would take gigabytes."""
     numbers, corners, seen = array("d"), array("i"), {"object": 0, "unit": ""}
@@ -143,7 +146,9 @@ def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float
     parser = ParserCreate()
     parser.StartElementHandler = start
     with zipfile.ZipFile(path) as archive, archive.open("3D/3dmodel.model") as model:
-        parser.ParseFile(model)
+        for text in iter(lambda: model.read(_CHUNK), b""):
+            parser.Parse(text)
+    parser.Parse(b"", True)
     if seen["object"] != 1:
         raise ValueError(f"{seen['object']} objects instead of one")
     scale = {said: _UNIT_M[unit] for unit, said in _3MF_UNITS.items()}[str(seen["unit"])]
