@@ -96,9 +96,9 @@ def sampling_for(pixel: float, tolerance: float) -> float:
     return _SAMPLINGS[-1]
 
 
-# A matrix of up to this many outputs is one batch of tiles, which compiles in half the time; a larger one takes its
-# tiles one by one, which spares a copy of their inputs and is a quarter faster.
-_BATCH = 768
+# A matrix of up to this many elements is one batch of tiles, which compiles in half the time; a larger one takes its
+# tiles one by one, which spares copies of its inputs and is a quarter faster.
+_BATCH = 2**19
 
 
 class Banded(eqx.Module):
@@ -120,7 +120,7 @@ class Banded(eqx.Module):
         columns = range(0, outputs, tile)
         used = [np.flatnonzero(np.any(matrix[:, at : at + tile] != 0, axis=1)) for at in columns]
         spans = [(int(rows[0]), int(rows[-1]) + 1) if rows.size else (0, 1) for rows in used]
-        size = len(spans) if outputs <= _BATCH else 1
+        size = len(spans) if matrix.size <= _BATCH else 1
         batches, starts = [], []
         for first in range(0, len(spans), size):
             window = max(high - low for low, high in spans[first : first + size])
