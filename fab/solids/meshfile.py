@@ -48,13 +48,19 @@ def _decimals(picometres: NDArray[np.int64], decimals: int) -> NDArray[Any]:
     return np.array(texts, dtype=object)[where]
 
 
+def _rows(row: str, values: NDArray[Any]) -> str:
+    """Fill in a row of text for every row of an array, thousands at a time."""
+    parts = (values[start : start + 2**14] for start in range(0, len(values), 2**14))
+    return "".join(row * len(part) % tuple(part.ravel().tolist()) for part in parts)
+
+
 def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
     """Write a mesh as 3MF, which states its unit (``"mm"`` or ``"um"``); numbers are rounded to a picometre."""
     decimals = {"mm": 9, "um": 6}[unit]
     picometres = np.rint(mesh.vertices_m * 1e12).astype(np.int64)
-    corners = zip(*(_decimals(axis, decimals) for axis in picometres.T), strict=True)
-    vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>\n' for x, y, z in corners)
-    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>\n' for a, b, c in mesh.triangles.tolist())
+    corners = np.stack([_decimals(axis, decimals) for axis in picometres.T], axis=1)
+    vertices = _rows('<vertex x="%s" y="%s" z="%s"/>\n', corners)
+    triangles = _rows('<triangle v1="%d" v2="%d" v3="%d"/>\n', mesh.triangles)
     head = (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         f'<model unit="{_3MF_UNITS[unit]}" xml:lang="en-US" xmlns="{_CORE}">\n'
