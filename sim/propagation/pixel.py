@@ -115,7 +115,7 @@ class Banded(eqx.Module):
     @staticmethod
     def from_dense(matrix: Inexact[np.ndarray, "i o"], tile: int = 64) -> "Banded":
         """Cut a real or complex matrix `[input, output]` into tiles of `tile` outputs and the inputs they use."""
-        parts = np.stack([matrix.real, matrix.imag] if np.iscomplexobj(matrix) else [matrix])
+        parts = np.stack([np.real(matrix), np.imag(matrix)] if np.iscomplexobj(matrix) else [matrix])
         inputs, outputs = matrix.shape
         columns = range(0, outputs, tile)
         used = [np.flatnonzero(np.any(matrix[:, at : at + tile] != 0, axis=1)) for at in columns]

@@ -131,9 +131,7 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
         bowl=single(variation.radial_nonuniformity) / radius**2,
         tilt=tilt * (np.float32(1) / np.float32(radius)),
         rough_m=rough_m,
-        height_m=np.float32(levels.count - 1) * np.float32(levels.step_m)
-        if levels.is_binary
-        else single(levels.total_m),
+        height_m=single(levels.count - 1) * single(levels.step_m) if levels.is_binary else single(levels.total_m),
     )
 
 
