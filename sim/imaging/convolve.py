@@ -14,7 +14,7 @@ kept, which saves a fifth of the two-dimensional transforms. Spectra are `[fx, f
 """
 
 from collections.abc import Iterator, Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -105,7 +105,9 @@ def spectrum(image: Images, otf: Otf) -> Complex[Array, "*b fx fy"]:
     # Filled to the transform's length, for what lies beyond the margin is not used.
     before = [margins(n)[0] for n in otf.window]
     y, x = ((b, long - b - n) for b, long, n in zip(before, otf.length, otf.shape, strict=True))
-    return _filled_and_transformed(jnp.asarray(image), y, x, otf.border)
+    kept = [(0, 0)] * (image.ndim - 1)
+    rows = jnp.fft.rfft(jnp.pad(jnp.asarray(image), [*kept, x], mode=otf.border))
+    return jnp.fft.fft(jnp.pad(jnp.swapaxes(rows, -1, -2), [*kept, y], mode=otf.border))
 
 
 def landed(product: Complex[Array, "*c fx fy"], otf: Otf) -> Float[Array, "*c v u"]:
@@ -116,16 +118,6 @@ def landed(product: Complex[Array, "*c fx fy"], otf: Otf) -> Float[Array, "*c v 
     return jnp.fft.irfft(rows, otf.length[1])[..., second : second + x]
 
 
-# Both are compiled as a whole: one by one their operations take a second to compile.
-@partial(jax.jit, static_argnames=("y", "x", "border"))
-def _filled_and_transformed(image: Array, y: Window, x: Window, border: Border) -> Array:
-    """Transform `[..., fx, fy]` of images with so many samples of their border before and after them."""
-    kept = [(0, 0)] * (image.ndim - 1)
-    rows = jnp.fft.rfft(jnp.pad(image, [*kept, x], mode=border))
-    return jnp.fft.fft(jnp.pad(jnp.swapaxes(rows, -1, -2), [*kept, y], mode=border))
-
-
-@partial(jax.jit, static_argnames="length")
 def _transformed(image: Array, length: Window) -> Array:
     """Transform `[..., fx, fy]` of images with zeros after them."""
     return jnp.fft.fft(jnp.swapaxes(jnp.fft.rfft(image, length[1]), -1, -2), length[0])
