@@ -27,7 +27,7 @@ short integration rule needs for a predicted error of 2e-3. At 1 the transform i
 of the work, enough to estimate energies when the image moves by a fraction of a pixel from call to call (`displaced`).
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, cast
 
 import equinox as eqx
@@ -124,11 +124,13 @@ def plan_far_field(
         curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
         slope = curvature * pitch**2 / wavelength_m if cell else None
         refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope)
+    # Bare transforms are those of long optimisations, compiled once.
+    banded = partial(Banded.from_dense, batched=not bare)
     return FarField(
-        gather=Banded.from_dense(matrix),
-        spread=Banded.from_dense(matrix.T, 256),
-        refine=None if refine is None else Banded.from_dense(refine),
-        coarsen=None if refine is None else Banded.from_dense(refine.T),
+        gather=banded(matrix),
+        spread=banded(matrix.T, 256),
+        refine=None if refine is None else banded(refine),
+        coarsen=None if refine is None else banded(refine.T),
         tilt=None,
         cells=nx,
         length=length,

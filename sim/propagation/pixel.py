@@ -96,8 +96,8 @@ def sampling_for(pixel: float, tolerance: float) -> float:
     return _SAMPLINGS[-1]
 
 
-# A matrix of up to this many elements is one batch of tiles, which compiles in half the time; a larger one takes its
-# tiles one by one, which spares copies of its inputs and is a quarter faster.
+# A matrix of up to this many elements may be one batch of tiles, which compiles in half the time; a larger one takes
+# its tiles one by one, which spares copies of its inputs and is a quarter faster.
 _BATCH = 2**19
 
 
@@ -113,14 +113,17 @@ class Banded(eqx.Module):
     parts: int = eqx.field(static=True)  # 1 for real weights, 2 for complex ones
 
     @staticmethod
-    def from_dense(matrix: Inexact[np.ndarray, "i o"], tile: int = 64) -> "Banded":
-        """Cut a real or complex matrix `[input, output]` into tiles of `tile` outputs and the inputs they use."""
+    def from_dense(matrix: Inexact[np.ndarray, "i o"], tile: int = 64, batched: bool = False) -> "Banded":
+        """Cut a real or complex matrix `[input, output]` into tiles of `tile` outputs and the inputs they use.
+
+        With `batched`, the tiles of a small matrix are one batch; products then differ in the last bits at most.
+        """
         parts = np.stack([np.real(matrix), np.imag(matrix)] if np.iscomplexobj(matrix) else [matrix])
         inputs, outputs = matrix.shape
         columns = range(0, outputs, tile)
         used = [np.flatnonzero(np.any(matrix[:, at : at + tile] != 0, axis=1)) for at in columns]
         spans = [(int(rows[0]), int(rows[-1]) + 1) if rows.size else (0, 1) for rows in used]
-        size = len(spans) if matrix.size <= _BATCH else 1
+        size = len(spans) if batched and matrix.size <= _BATCH else 1
         batches, starts = [], []
         for first in range(0, len(spans), size):
             window = max(high - low for low, high in spans[first : first + size])

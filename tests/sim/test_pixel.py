@@ -77,5 +77,5 @@ def test_banded_is_the_dense_product(inputs: int, outputs: int, tile: int, half_
     # Sums of at most 25 (complex: 50) float32 products of order 1.
     np.testing.assert_allclose(got, x @ dense[0], atol=1e-4)
     weights = dense[0] + 1j * dense[1]
-    real, imaginary = np.asarray(Banded.from_dense(weights, tile).of_complex(jnp.asarray(x)))
+    real, imaginary = np.asarray(Banded.from_dense(weights, tile, batched=True).of_complex(jnp.asarray(x)))
     np.testing.assert_allclose(real + 1j * imaginary, (x[0] + 1j * x[1]) @ weights, atol=2e-4)
