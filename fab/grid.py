@@ -47,14 +47,22 @@ class Grid:
 
     def inside_circle(self, diameter_m: float) -> NDArray[np.bool_]:
         """Return ``[y, x]`` true where a pixel's centre lies inside a centred circle (diameter in metres) or on it."""
-        y_squared = self.axis_m("y") ** 2
-        x_squared = self.axis_m("x") ** 2
-        # The slack of one part in 1e12 keeps pixels whose centre is exactly on the circle.
-        limit = (diameter_m / 2) ** 2 * (1 + 1e-12)
+        x_squared, rests = self._circle(diameter_m)
         inside = np.empty(self.shape, dtype=np.bool_)
-        for row, rest in enumerate(limit - y_squared):
+        for row, rest in enumerate(rests):
             np.less_equal(x_squared, rest, out=inside[row])
         return inside
+
+    def count_inside_circle(self, diameter_m: float) -> int:
+        """Return the number of pixels `inside_circle`, without drawing them."""
+        x_squared, rests = self._circle(diameter_m)
+        return int(np.searchsorted(np.sort(x_squared), rests, side="right").sum())
+
+    def _circle(self, diameter_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return squared x of every column, and the greatest inside the circle for every row."""
+        # The slack of one part in 1e12 keeps pixels whose centre is exactly on the circle.
+        limit = (diameter_m / 2) ** 2 * (1 + 1e-12)
+        return self.axis_m("x") ** 2, limit - self.axis_m("y") ** 2
 
 
 def fewest_pixels(length_m: float, pitch_m: float) -> int:

@@ -306,7 +306,7 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, aperture_m = level_map.grid, level_map.aperture_m
-    area = int(np.count_nonzero(grid.inside_circle(aperture_m)))
+    area = grid.count_inside_circle(aperture_m)
     words = bits.pack(level_map.level, levels.bits)
     with ThreadPoolExecutor() as pool:
         tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]

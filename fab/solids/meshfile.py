@@ -9,6 +9,8 @@ import json
 import struct
 import zipfile
 from array import array
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 from xml.parsers.expat import ParserCreate
@@ -48,10 +50,10 @@ def _decimals(picometres: NDArray[np.int64], decimals: int) -> NDArray[Any]:
     return np.array(texts, dtype=object)[where]
 
 
-def _rows(row: str, values: NDArray[Any]) -> str:
+def _rows(row: str, values: NDArray[Any]) -> Iterator[str]:
     """Fill in a row of text for every row of an array, thousands at a time."""
     parts = (values[start : start + 2**14] for start in range(0, len(values), 2**14))
-    return "".join(row * len(part) % tuple(part.ravel().tolist()) for part in parts)
+    return (row * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
 
 def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
@@ -68,14 +70,16 @@ def write_3mf(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
         '<resources><object id="1" type="model" name="DOE"><mesh>\n<vertices>\n'
     )
     tail = '</triangles>\n</mesh></object></resources>\n<build><item objectid="1"/></build>\n</model>\n'
-    model = f"{head}{vertices}</vertices>\n<triangles>\n{triangles}{tail}"
+    model = chain([head], vertices, ["</vertices>\n<triangles>\n"], triangles, [tail])
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, part in (("[Content_Types].xml", _TYPES), ("_rels/.rels", _RELATIONS), ("3D/3dmodel.model", model)):
+        members = {"[Content_Types].xml": [_TYPES], "_rels/.rels": [_RELATIONS], "3D/3dmodel.model": model}
+        for name, parts in members.items():
             info = zipfile.ZipInfo(name, _ZIP_TIME)
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w", force_zip64=True) as member:
-                member.write(part.encode())
+                for part in parts:
+                    member.write(part.encode())
     write_atomic(path, stream.getvalue())
 
 

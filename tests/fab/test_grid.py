@@ -27,6 +27,13 @@ def test_a_circle_has_the_area_and_the_symmetry_of_a_circle(count):
     assert np.array_equal(inside, inside[::-1])
 
 
+@pytest.mark.parametrize("diameter_m", [0.0, 1.0, 4.0, 7.3, 9.0, np.inf])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 8), (9, 4)])
+def test_pixels_in_a_circle_are_counted_as_they_are_drawn(shape, diameter_m):
+    grid = Grid(shape, 1.0)
+    assert grid.count_inside_circle(diameter_m) == np.count_nonzero(grid.inside_circle(diameter_m))
+
+
 @pytest.mark.parametrize(("shape", "pitch_m"), [((0, 3), 1.0), ((3, 0), 1.0), ((3, 3), 0.0), ((3, 3), float("nan"))])
 def test_impossible_grids_are_refused(shape, pitch_m):
     with pytest.raises(InputError, match="grid"):
