@@ -20,7 +20,6 @@ from fab.errors import CheckFailed, InputError
 from fab.solids.columns import Columns
 from fab.units import UM, format_length
 
-
 # Triangles of which a sum is taken together, few enough for a processor's cache.
 _TOGETHER = 2**16
 
