@@ -41,6 +41,7 @@ from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process, Variation
 from sim.imaging.occlusion import follows_light
+from sim.optic import HeightOptic
 from sim.surface import as_fabricated
 
 FORMAT = "doedesign simulation 1"
@@ -128,8 +129,8 @@ def simulate_files(
     size_words = f"{view.shape[1]} x {view.shape[0]} pixels"
     _log.info("%d items of %s, %s, %s; %s", count, size_words, settings["obstruction"], model.occlusion, words)
 
-    process, errors = (Process(design.levels), Variation()) if plate is None else plate[:2]
-    make = partial(as_fabricated, design.level_map.level, model.camera, process, errors)
+    drawn = partial(HeightOptic.of, model.camera, design.level_map.height_m)
+    make = partial(as_fabricated, design.level_map.level, model.camera, *plate[:2]) if plate else drawn
     psfs = psfs_by_depth(make, model.camera), flat_psfs(model.camera)
     names = _write_captures(folder, data, count, model, psfs, settings, png)
     if skips := pictures.skips():

@@ -22,7 +22,6 @@ from doedesign.spec import Spec
 from fab.errors import InputError
 from fab.figure import bare, html_of, length_text, panels
 from fab.pictures import read_display
-from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.imaging.formation import lost_share
 from sim.imaging.occlusion import Model
@@ -31,7 +30,7 @@ from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
-from sim.surface import FabricatedDoe, as_fabricated
+from sim.surface import FabricatedDoe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -145,8 +144,8 @@ def simulate(
         shown, name = display_values(picture), "picture"
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 0)))
     sample = NamedScene(name, draw_scene(shown, stage.kind, stage.view, stage.far_m, rng))
-    camera, ideal = stage.model.camera, (Process(design.levels), Variation())
-    made = psfs_by_depth(lambda: fabricated or as_fabricated(design.level_map.level, camera, *ideal), camera)
+    camera = stage.model.camera
+    made = psfs_by_depth(lambda: fabricated or HeightOptic.of(camera, design.level_map.height_m), camera)
     return photograph(sample, stage.model, made, flat_psfs(camera), jax.random.fold_in(jax.random.key(seed), 0))
 
 

@@ -59,14 +59,15 @@ def effective_bias(relief: EtchParameters) -> Float[Array, " mask"]:
     return relief.bias_m - relief.depth_m * relief.slope / 2
 
 
-# Cells by which a mask may lie off; under a derivative the errors are not known when the halo is chosen.
-_MOST, _TRACED_REACH = 8, 3
+# Cells by which a mask may lie off, and the usual halo: all plates whose masks lie off by less than a cell share one
+# compiled program, and under a derivative the errors are not known when the halo is chosen.
+_MOST, _USUAL_REACH = 8, 3
 
 
 def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> TilePlan:
     """Plan the terms that these errors need; all of them, where the errors are not known yet (`traced`)."""
     grid = camera.grid
-    reach = _TRACED_REACH
+    reach = _USUAL_REACH
     cut = corners = walls = True
     if not traced:
         corners, walls = variation.corner_radius_m > 0, variation.sidewall_rad > 0
@@ -74,7 +75,7 @@ def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: 
         widened = bool(variation.common_cd_bias_m) or any(variation.cd_bias_m)
         cut = bool(shifts.max() > 0 or widened or corners or walls)
         # Half a cell for the bias, and a cell more for corners seen from the next one.
-        reach = int(np.ceil(shifts.max() / grid.pitch_m)) + 2
+        reach = max(_USUAL_REACH, int(np.ceil(shifts.max() / grid.pitch_m)) + 2)
         if reach > _MOST + 2:
             rule = f"masks may lie off by at most {_MOST} cells, {format_length(_MOST * grid.pitch_m)}"
             raise InputError("variation.overlay", rule, format_length(float(shifts.max())), "Align better.")
