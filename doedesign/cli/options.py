@@ -44,6 +44,7 @@ _PLACES = {
     "sensor.pattern": "sensor.bayer",
 }
 _OPTIONS = {
+    "overrides: ": "--set: ",
     "Give the pitch of a pixel": "Add --pitch-um",
     "Give the scale": "Add --scale",
     "Give `levels`.": "Add --levels 16.",

@@ -182,7 +182,7 @@ def _override(raw: dict[str, Any], text: str) -> str:
     """Change one value of the tables that were read; return its dotted key."""
     found = _OVERRIDE.fullmatch(text)
     if not found:
-        raise InputError("--set", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
+        raise InputError("overrides", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
     value = found[2].strip()
     try:
         table = tomllib.loads(f"value = {value}")
@@ -205,4 +205,5 @@ def _index(place: Any, part: str, key: str) -> int:
     if isinstance(place, list) and part.isdecimal() and int(part) < len(place):
         return int(part)
     count = f"a list of {len(place)}" if isinstance(place, list) else "a single value"
-    raise InputError(f"--set: {key}", f"`{part}` must be an entry of what the spec holds there", count, "Fix the key.")
+    rule = f"`{part}` must be an entry of what the spec holds there"
+    raise InputError(f"overrides: {key}", rule, count, "Fix the key.")

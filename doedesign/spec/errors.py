@@ -63,7 +63,7 @@ def validated(
         model: the model of the whole file.
         raw: the tables as they were read.
         source: where they came from, for the message.
-        overridden: dotted keys whose value came from the command line, not from the file.
+        overridden: dotted keys whose value was given beside the file.
         si: whether keys are attributes and lengths numbers in SI units, as in JSON, instead of those of TOML.
     """
     try:
@@ -79,7 +79,7 @@ def validated(
 def spec_error(source: str, mistakes: Sequence[InputError], overridden: Collection[str] = ()) -> InputError:
     """Return the error to raise for at least one mistake; see `validated` for the other arguments."""
     named = [
-        InputError(f"{'--set' if _covers(overridden, m.where) else source}: {m.where}", m.rule, m.got, m.cure)
+        InputError(f"{'overrides' if _covers(overridden, m.where) else source}: {m.where}", m.rule, m.got, m.cure)
         for m in mistakes
     ]
     return named[0] if len(named) == 1 else SpecError(named)

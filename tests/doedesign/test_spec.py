@@ -177,8 +177,8 @@ def test_overrides_change_single_values():
         ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
         ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 3"),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
-        ("process.levls=8", "--set: process.levls: must be a known key of [process], but got `levls`. Did you mean"),
-        ("process.levels=8\nname='x'", "--set: process.levels: must be a whole number"),
+        ("process.levls=8", "overrides: process.levls: must be a known key of [process], but got `levls`. Did"),
+        ("process.levels=8\nname='x'", "overrides: process.levels: must be a whole number"),
     ],
 )
 def test_a_wrong_override_is_named(override: str, message: str):

@@ -271,7 +271,7 @@ REFUSED = [
 @pytest.mark.parametrize(("key", "value", "parts"), REFUSED, ids=[f"{key}={value}" for key, value, _ in REFUSED])
 def test_a_mistake_is_named_with_key_rule_value_and_cure(key: str, value: str, parts: list[str]):
     message = refusal(load_spec, AUTOMOTIVE, [f"{key}={value}"])
-    assert message.startswith(("--set: ", str(AUTOMOTIVE)))
+    assert message.startswith(("overrides: ", str(AUTOMOTIVE)))
     for part in parts:
         assert part in message
     assert len(message.splitlines()) == 1

@@ -81,7 +81,7 @@ def test_what_is_refused(changes: list[str], words: list[str]):
         assert load_spec(QUICK, changes)
         return
     message = refusal(*changes)
-    for word in ("--set", *words):
+    for word in ("overrides", *words):
         assert word in message
 
 
