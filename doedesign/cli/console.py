@@ -12,6 +12,7 @@ from typing import Any
 from cyclopts import CycloptsError
 
 from doedesign.cli.options import in_options
+from doedesign.runtime.stopping import interruptible
 from fab.errors import CheckFailed, InputError
 
 
@@ -69,7 +70,7 @@ def print_results(folder: Path, as_json: bool, **more: Any) -> None:
 def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
     """Run a command and return its exit code; a mistake of the user becomes one message instead of a traceback."""
     try:
-        with shown_log():
+        with interruptible(), shown_log():
             work()
     except InputError as error:
         say(f"doedesign: {in_options(error, options)}")

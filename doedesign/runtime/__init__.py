@@ -1,6 +1,6 @@
 """Support of long work.
 
 progress      a bar with rate and time left, or plain lines
-stopping      SIGINT and SIGTERM
+stopping      SIGINT, SIGTERM and SIGHUP
 compiling     compiled steps that take little memory
 """

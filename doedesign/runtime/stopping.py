@@ -1,8 +1,8 @@
-"""SIGINT and SIGTERM during long work: the end between two steps."""
+"""Signals that end work: SIGINT (Ctrl-C), SIGTERM (kill) and SIGHUP (the terminal is closed), all alike."""
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,14 +39,31 @@ class StopRequest:
 
 @contextmanager
 def stoppable() -> Iterator[StopRequest]:
-    """Handle SIGINT and SIGTERM by a `StopRequest`; both raise KeyboardInterrupt outside of its `gently`."""
+    """Handle the signals by a `StopRequest`; all of them raise KeyboardInterrupt outside of its `gently`."""
     stop = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread receives signals
-        return
-    before = {number: signal.signal(number, stop.ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with _handled(stop.ask):
         yield stop
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let all the signals raise KeyboardInterrupt, as SIGINT does by default, so that work cleans up behind itself."""
+    with _handled(StopRequest().ask):
+        yield
+
+
+@contextmanager
+def _handled(handler: Callable[..., None]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread receives signals
+        return
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    # Who starts a command with nohup means it to outlive the terminal. Windows has no such signal.
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

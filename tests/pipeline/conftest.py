@@ -92,12 +92,22 @@ def cli() -> Cli:
     return run_here
 
 
+# A shell in the background, or nohup, lets its children ignore signals.
+_COMMAND = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+from doedesign.cli import main
+sys.exit(main())
+"""
+
+
 @pytest.fixture
 def start_process() -> Callable[..., subprocess.Popen[str]]:
     """Start one command in a process of its own."""
 
     def start(*arguments: object) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "doedesign.cli", *map(str, arguments)]
+        command = [sys.executable, "-c", _COMMAND, *map(str, arguments)]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     return start

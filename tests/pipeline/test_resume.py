@@ -33,7 +33,7 @@ def wait_for(path: Path, process) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "code"),
-    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)],
+    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGHUP, 130)],
 )
 @pytest.mark.slow
 def test_killed_after_a_checkpoint(tiny, cli, content, uninterrupted, start_process, tmp_path, kind, code):
@@ -49,6 +49,25 @@ def test_killed_after_a_checkpoint(tiny, cli, content, uninterrupted, start_proc
     assert done.code == 0
     assert "resuming after step" in done.err
     assert content(folder) == uninterrupted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_order_that_is_ended_leaves_nothing_behind(copied, start_process, tmp_path, kind):
+    out = tmp_path / "orders" / "order"
+    out.parent.mkdir()
+    process = start_process("masks", copied.run, "--out", out)
+    end = time.monotonic() + 60
+    while not any(out.parent.iterdir()):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    process.send_signal(kind)
+    out_text, err = process.communicate(timeout=60)
+    assert (process.returncode, out_text) == (130, "")
+    assert "doedesign: interrupted" in err
+    assert "Traceback" not in err
+    assert not any(out.parent.iterdir())
 
 
 @pytest.mark.slow
