@@ -39,7 +39,7 @@ def session(folder: Path) -> None:
         ["train", run, "--images", images, *(word for change in TRAINING for word in ("--set", change))],
         ["optimize", quick, "--out", small, *EXAMPLE, *stock],
         ["masks", small, "--out", str(folder / "example-masks")],
-        ["masks", bare, "--levels", "16", "--step", "75 nm", "--pitch-um", "1.85", "--out", str(folder / "bare-masks")],
+        ["masks", bare, "--levels", "16", "--step", "75 nm", "--pitch", "1.85 um", "--out", str(folder / "bare-masks")],
         ["verify", str(folder / "quick-masks")],
     ]
     for command in commands:

@@ -11,6 +11,8 @@ from .capture.folder import simulate_files as simulate_files
 from .capture.simulate import SimulatedCapture as SimulatedCapture
 from .capture.simulate import simulate as simulate
 from .design.design import Design as Design
+from .design.objectives import PsfSet as PsfSet
+from .design.objectives import import_objectives as import_objectives
 from .lab.as_built import AsBuiltPrediction as AsBuiltPrediction
 from .lab.as_built import as_built as as_built
 from .lab.order import write_masks as write_masks

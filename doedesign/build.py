@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from doedesign.spec import DefectsSpec, ProcessSpec, Spec, WaferSpec, load_process, process_from_json
 from fab.errors import InputError
@@ -78,6 +78,11 @@ def wafer_from_spec(spec: WaferSpec) -> Wafer:
     return Wafer(**spec.model_dump())
 
 
+def is_process_file(given: object) -> TypeGuard[str | Path]:
+    """Whether a process is given by its file: a path, or a name that is no stock process's."""
+    return isinstance(given, Path) or (isinstance(given, str) and given not in STOCK)
+
+
 def resolve_process(
     given: "Process | ProcessSpec | str | Path | None", levels: Levels, default: ProcessSpec | None = None
 ) -> Process:
@@ -85,14 +90,14 @@ def resolve_process(
 
     None stands for the `default`, the process of the design's spec, or else for the ideal process.
     """
-    where, given = "process", default if given is None else given
-    if isinstance(given, Path) or (isinstance(given, str) and given not in STOCK):
-        where, given = str(given), load_process(given)
-    if isinstance(given, ProcessSpec):
-        given = process_from_spec(given, levels)
-        if given.levels != levels:
-            raise InputError(where, f"must be for {levels}", given.levels, "Give a process for this design.")
-    return process_from(given, levels)
+    source = default if given is None else given
+    read: Any = load_process(source, levels) if is_process_file(source) else source
+    if isinstance(read, ProcessSpec):
+        read = process_from_spec(read, levels)
+        if read.levels != levels:
+            where = str(source) if is_process_file(source) else "process"
+            raise InputError(where, f"must be for {levels}", read.levels, "Give a process for this design.")
+    return process_from(read, levels)
 
 
 def with_edge_moves(process: Process, edge_moves_m: Sequence[float]) -> Process:

@@ -1,7 +1,7 @@
 """Optimisation of a spec into a design, in memory or in a run folder."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
+from doedesign.design.objectives import Objective, source_digests
 from doedesign.design.optimize import (
     OptimizationState,
     finished_design,
@@ -52,7 +53,13 @@ from sim.transfer import mtf
 log = logging.getLogger("doedesign")
 
 
-def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, overrides: Sequence[str] = ()) -> Design:
+def optimize(
+    spec: Spec | str | Path,
+    out: str | Path | None = None,
+    *,
+    overrides: Sequence[str] = (),
+    objectives: Mapping[str, Objective] | None = None,
+) -> Design:
     """Optimise the design of a spec.
 
     Args:
@@ -60,6 +67,8 @@ def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, override
         out: run folder, in which a stopped optimisation goes on where it was stopped and to which results and pictures
             are written; without one everything stays in memory.
         overrides: changes to the spec, "table.key=value".
+        objectives: objectives of your own, by the names "module:function" that the spec gives them
+            (`doedesign.import_objectives` imports them). A run records the files they are in.
 
     Returns:
         the design: its level map, the heights before rounding (metres), and the history of its loss.
@@ -73,20 +82,27 @@ def optimize(spec: Spec | str | Path, out: str | Path | None = None, *, override
         log.warning(warning)
     files = input_files(spec)
     if out is not None:
-        return _optimize_in(Path(out), spec, files, overrides)
-    problem, sources = problem_of(spec, files)
+        return _optimize_in(Path(out), spec, files, overrides, objectives or {})
+    problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(problem, sources, spec, state, [])
     return finished_design(spec, problem, state, history)
 
 
-def _optimize_in(folder: Path, spec: Spec, files: dict[str, Path], overrides: Sequence[str]) -> Design:
-    with claim_run(folder, spec, input_digests(files), overrides) as run:
+def _optimize_in(
+    folder: Path,
+    spec: Spec,
+    files: dict[str, Path],
+    overrides: Sequence[str],
+    objectives: Mapping[str, Objective],
+) -> Design:
+    inputs = input_digests(files) | source_digests(spec, objectives)
+    with claim_run(folder, spec, inputs, overrides) as run:
         if run.done:
             log.info(f"{folder} already holds the finished run of this spec")
             return open_design(folder, False)
         log.info("preparing sources and propagation")
-        problem, sources = problem_of(spec, files)
+        problem, sources = problem_of(spec, files, objectives)
         state, history = _resume(run, problem, sources, files)
         begin_run(run)
         state, history = _iterate(problem, sources, spec, state, history, run)

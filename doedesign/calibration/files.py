@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from doedesign.build import spec_from_process
+from doedesign.build import is_process_file, spec_from_process
 from doedesign.calibration.plots import plot_check, plot_estimates, plot_explanations, plot_fitted_psfs
 from doedesign.design.design import Design
 from doedesign.spec import load_process, process_to_toml, variation_to_toml
 from fab.figure import save
 from fab.files import canonical_json
 from fab.process import Process
-from fab.stock import STOCK
 
 if TYPE_CHECKING:
     from doedesign.calibration.estimate import Calibration
@@ -34,8 +33,8 @@ def write_calibration(
     record = {"run": design.name, "measurement_sha256": digests, **_record(result)}
     (folder / "calibration.json").write_bytes(canonical_json(record))
     like = design.spec and design.spec.process
-    if isinstance(process, str | Path) and process not in STOCK:
-        like = load_process(process)
+    if is_process_file(process):
+        like = load_process(process, design.levels)
     # Where the estimate comes from and how far it may be relied on.
     comments = [
         "Estimated from measured PSFs by doedesign calibrate.",

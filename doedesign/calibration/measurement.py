@@ -54,7 +54,7 @@ def _seconds(value: Any) -> float:
         seconds = float(f"{float(found[1]) * _SECONDS[found[2]]:.15g}")
         if seconds > 0:
             return seconds
-    raise broken('must be a time with its unit, such as "10 ms"', "Write the unit inside the quotes.")
+    raise broken('must be a time with its unit, such as "10 ms"', "Use s, ms, us or ns.")
 
 
 Exposure = Annotated[float, BeforeValidator(_seconds)]

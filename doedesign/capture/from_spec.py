@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from doedesign.spec import Spec
 from doedesign.spec.scene import OCCLUSION_MODELS
-from doedesign.spec.values import nearest
+from doedesign.spec.values import nearest, unit_cure
 from fab.errors import InputError
 from fab.units import parse_angle, parse_length
 from sim.camera import Camera
@@ -142,7 +142,7 @@ def _parsed(name: str, value: Any, where: str) -> Any:
         return parse_length(value) if name.endswith("_m") else parse_angle(value)
     except ValueError as error:
         rule, _, got = str(error).partition(", but got ")
-        raise InputError(where, rule, got, "Write the unit inside the quotes.") from error
+        raise InputError(where, rule, got, unit_cure("m" if name.endswith("_m") else "rad", value)) from error
 
 
 def plain_parameters(kind: Any) -> dict[str, Any]:

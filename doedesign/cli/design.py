@@ -5,22 +5,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 from doedesign.cli.console import print_paths, print_results, print_text, say
-from doedesign.cli.options import AsJson, Overrides, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, length_of
 from fab.errors import InputError
 
 
-def optimize(spec: Path, *, out: Path | None = None, set_: Overrides = (), json_: AsJson = False) -> None:
+def optimize(
+    spec: Path, *, out: Path | None = None, set_: Overrides = (), allow_code: Flag = False, json_: AsJson = False
+) -> None:
     """Optimise a spec into a run folder, or resume it where it was stopped.
 
     Args:
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
+        allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
     """
+    from doedesign.design.objectives import import_objectives
     from doedesign.optimization import optimize as work
     from doedesign.spec import load_spec
 
-    folder = out or Path("runs") / load_spec(spec, set_).name
-    work(spec, folder, overrides=set_)
+    read = load_spec(spec, set_)
+    folder = out or Path("runs") / read.name
+    work(spec, folder, overrides=set_, objectives=import_objectives(read) if allow_code else None)
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -31,7 +36,7 @@ def masks(
     out: Path | None = None,
     step: str | None = None,
     etch_depths: str | None = None,
-    pitch_um: float | None = None,
+    pitch: str | None = None,
     scale: str | None = None,
     aperture: str | None = None,
     on_violation: Literal["warn", "fail", "fix"] = "warn",
@@ -54,7 +59,7 @@ def masks(
         out: Order folder; masks/NAME by default.
         step: Height of one level, such as "75 nm"; for a bare height map.
         etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.
-        pitch_um: Pixel pitch of a bare height map in micrometres.
+        pitch: Pixel pitch of a bare height map, such as "1.85 um".
         scale: Height of one count of an integer map, such as "1 nm".
         aperture: Diameter of the relief; the map's shorter side by default.
         on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
@@ -90,7 +95,7 @@ def masks(
         wafer=wafer,
         step_m=length_of("--step", step),
         etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
-        pitch_m=None if pitch_um is None else pitch_um * 1e-6,
+        pitch_m=length_of("--pitch", pitch),
         scale_m=length_of("--scale", scale),
         aperture_m=length_of("--aperture", aperture),
     )

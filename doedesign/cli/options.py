@@ -35,7 +35,7 @@ _PLACES = {
     "step_m": "--step",
     "depths_m": "--depths",
     "etch_depths_m": "--etch-depths",
-    "pitch_m": "--pitch-um",
+    "pitch_m": "--pitch",
     "scale_m": "--scale",
     "aperture_m": "--aperture",
     "tile, overlap": "--tile, --overlap",
@@ -45,7 +45,7 @@ _PLACES = {
 }
 _OPTIONS = {
     "overrides: ": "--set: ",
-    "Give the pitch of a pixel": "Add --pitch-um",
+    "Give the pitch of a pixel": 'Add --pitch "1.85 um" with the pitch of a pixel',
     "Give the scale": "Add --scale",
     "Give `levels`.": "Add --levels 16.",
     "Give `step`.": 'Add --step "75 nm".',
@@ -57,6 +57,7 @@ _OPTIONS = {
     "or its masks.": "or its masks (--order).",
     "Give `obstruction`,": "Add [obstruction] to the spec, or give --obstruction,",
     "Give `occlusion`:": "Add occlusion to [scene], or give --occlusion:",
+    "Give the function by `objectives`, if you trust it.": "Add --allow-code, if you trust the spec.",
     "leave `images` out": "leave --images out",
     "Choose another folder": "Choose another --out",
     "take fewer workers.": "take fewer workers (--workers).",

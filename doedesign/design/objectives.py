@@ -1,7 +1,8 @@
 """Objectives: small functions from PSFs to one number that is minimised.
 
 An objective takes a `PsfSet` and its options and returns a scalar. A built-in one is listed, under its name, in
-`doedesign.spec.values.OBJECTIVES`; a user's own is named `module:function` in the spec and has the same signature:
+`doedesign.spec.values.OBJECTIVES`; a user's own is named `module:function` in the spec and has the same signature. A
+spec alone never runs code: the function is given to `doedesign.optimize`, or imported by `import_objectives`.
 
     def dark_centre(psfs: PsfSet, *, power: float = 1.0) -> Array:
         return jnp.mean(jnp.sum(psfs.near, axis=(-2, -1))) ** power
@@ -25,8 +26,12 @@ from doedesign.design.patterns import target_image
 from doedesign.spec import Spec
 from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
+from fab.files import sha256_file
 from sim.camera import Camera
 from sim.metrics import disc_weights, mean_wavelength_m, participation, spot_radius_m
+
+Objective = Callable[..., Array]
+"""Function of a `PsfSet` and options to a number that is minimised."""
 
 
 class PsfSet(eqx.Module):
@@ -112,25 +117,69 @@ def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     return jnp.mean(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
 
 
-BUILT_IN: dict[str, Callable[..., Array]] = {name: globals()[name] for name in OBJECTIVES}
+BUILT_IN: dict[str, Objective] = {name: globals()[name] for name in OBJECTIVES}
 
 
-def terms_from_spec(spec: Spec, camera: Camera, files: Mapping[str, Path]) -> tuple[Term, ...]:
-    """Return a spec's objectives, with options bound and images read from its `doedesign.spec.input_files`."""
-    terms = []
+def terms_from_spec(
+    spec: Spec, camera: Camera, files: Mapping[str, Path], functions: Mapping[str, Objective] | None = None
+) -> tuple[Term, ...]:
+    """Return a spec's objectives, with options bound.
+
+    Args:
+        spec: the spec.
+        camera: optics and sensor.
+        files: images, by key (`doedesign.spec.input_files`).
+        functions: objectives of the user's own, by the names that the spec gives them.
+
+    Raises:
+        InputError: an objective of the user's own that is not given, or options that are not the function's.
+    """
+    known, terms = {**(functions or {}), **BUILT_IN}, []
     for i, objective in enumerate(spec.objectives):
         where = f"objective[{i}] {objective.name}"
         options: dict[str, Any] = dict(objective.options)
         if objective.name == "target_pattern":
             options = {"target": target_image(camera, options, files.get(f"objective[{i}].options.image"), where)}
-        function = BUILT_IN[objective.name] if objective.name in BUILT_IN else _imported(objective.name, where)
+        if objective.name not in known:
+            rule, cure = "a spec runs no code by itself", "Give the function by `objectives`, if you trust it."
+            raise InputError(where, rule, "a function of the user's own", cure)
+        function = known[objective.name]
         _require_options(function, options, where)
         terms.append(Term(objective.name, objective.weight, partial(function, **options)))
     return tuple(terms)
 
 
-def _imported(name: str, where: str) -> Callable[..., Array]:
-    """Return a user's objective from "module:function"."""
+def import_objectives(spec: Spec) -> dict[str, Objective]:
+    """Import the objectives of the user's own that a spec names `module:function`: this runs code that it names.
+
+    Raises:
+        InputError: no such module or function.
+    """
+    named = {f"objective[{i}]": one.name for i, one in enumerate(spec.objectives) if one.name not in BUILT_IN}
+    return {name: _imported(name, where) for where, name in named.items()}
+
+
+def source_digests(spec: Spec, functions: Mapping[str, Objective]) -> dict[str, str]:
+    """SHA-256 of the files in which a spec's objectives of the user's own are written, by key of the spec.
+
+    Raises:
+        InputError: a function that is in no file.
+    """
+    digests = {}
+    for i, objective in enumerate(spec.objectives):
+        if objective.name in functions and objective.name not in BUILT_IN:
+            try:
+                file = Path(inspect.getsourcefile(functions[objective.name]) or "")
+            except TypeError:
+                file = Path()
+            if not file.is_file():
+                rule, cure = "must be in a file, which a run records", "Write it into a module of its own."
+                raise InputError(f"objectives: {objective.name}", rule, "none", cure)
+            digests[f"objective[{i}].name"] = sha256_file(file)
+    return digests
+
+
+def _imported(name: str, where: str) -> Objective:
     module_name, function_name = name.split(":")
     try:
         function = getattr(importlib.import_module(module_name), function_name)
@@ -140,10 +189,10 @@ def _imported(name: str, where: str) -> Callable[..., Array]:
         raise InputError(where, rule, f'"{name}" ({error})', cure) from error
     if not callable(function):
         raise InputError(where, "a user's objective must be a function", f'"{name}"', "Name a function.")
-    return cast("Callable[..., Array]", function)
+    return cast("Objective", function)
 
 
-def _require_options(function: Callable[..., Array], options: Mapping[str, Any], where: str) -> None:
+def _require_options(function: Objective, options: Mapping[str, Any], where: str) -> None:
     """Check before a long run that the function takes one `PsfSet` and the given options."""
     signature = inspect.signature(function)
     try:

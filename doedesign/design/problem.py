@@ -1,6 +1,7 @@
 """The optimisation problem of a spec: from parameters to the loss of one step, ready to differentiate."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from doedesign.build import camera_from_spec, levels_from_spec
-from doedesign.design.objectives import PsfSet, Term, terms_from_spec
+from doedesign.design.objectives import Objective, PsfSet, Term, terms_from_spec
 from doedesign.design.parametrize import LevelParametrization
 from doedesign.spec import Spec
 from fab.levels import Levels
@@ -95,9 +96,12 @@ class SourceSet(NamedTuple):
         return StepSources(near_waves, far_waves, jnp.asarray(self.lens[:, near]), offset_m)
 
 
-def problem_of(spec: Spec, files: Mapping[str, Path]) -> tuple[Problem, SourceSet]:
-    """Prepare plans, sources and objectives of a spec."""
-    problem = plans_of(spec, files)
+def problem_of(
+    spec: Spec, files: Mapping[str, Path], functions: Mapping[str, Objective] | None = None
+) -> tuple[Problem, SourceSet]:
+    """Prepare plans, sources and objectives of a spec; for the arguments see `terms_from_spec`."""
+    terms = terms_from_spec(spec, camera_from_spec(spec), files, functions)
+    problem = replace(plans_of(spec), terms=terms)
     camera, optic = problem.camera, problem.optic
     sources: Any = optic.source
     near, far = (
@@ -118,19 +122,18 @@ def _is_sparse(spec: Spec) -> bool:
     return optimize.sampling == "sparse" and transformed
 
 
-def plans_of(spec: Spec, files: Mapping[str, Path]) -> Problem:
-    """Prepare plans and objectives alone, for those who bring sources of their own; see `problem_of`."""
+def plans_of(spec: Spec) -> Problem:
+    """Prepare plans alone, for those who bring sources and objectives of their own; see `problem_of`."""
     camera, process = camera_from_spec(spec), spec.process
     # Depths that are to be chosen begin at 2^k steps.
     levels = levels_from_spec(process, Levels(process.levels, process.level_step_m))
-    terms = terms_from_spec(spec, camera, files)
     radial = spec.optimize.parametrization == "radial"
     optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else HeightOptic.of(camera)
     propagation = "far_field" if radial else spec.optics.propagation
     sampling = 1.0 if _is_sparse(spec) else None
     return Problem(
         parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
-        terms=terms,
+        terms=(),
         plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),
         waves_per_metre=tuple(jnp.float32(camera.waves_per_metre(line.wavelength_m)) for line in optic.lines),
         optic=optic,

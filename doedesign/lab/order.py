@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.build import camera_from_spec, process_from_spec, resolve_process, wafer_from_spec
+from doedesign.build import camera_from_spec, is_process_file, process_from_spec, resolve_process, wafer_from_spec
 from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
-from doedesign.spec import ProcessSpec, WaferSpec, load_wafer
+from doedesign.spec import ProcessSpec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
 from fab.figure import save
 from fab.files import sha256_file
@@ -74,7 +74,7 @@ def write_masks(
         level_map,
         process=made_by,
         wafer=wafer,
-        chrome=Chrome() if spec is None else Chrome(overlap_m=spec.process.chrome_overlap_m),
+        chrome=_chrome(process, level_map.levels, spec and spec.process),
         patch=patch,
         source=origin,
         on_violation=on_violation,
@@ -151,6 +151,15 @@ def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessS
         return made
     lithography = {key: getattr(made, key) for key in ("tone", "minimum_line_m", "minimum_space_m")}
     return Process(levels, name=made.name, **lithography)
+
+
+def _chrome(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Chrome:
+    """The chrome of a process file that says how far it reaches, or of the usual process."""
+    if is_process_file(given):
+        read = load_process(given, levels)
+        if usual is None or "chrome_overlap_m" in read.model_fields_set:
+            return Chrome(overlap_m=read.chrome_overlap_m)
+    return Chrome() if usual is None else Chrome(overlap_m=usual.chrome_overlap_m)
 
 
 def _psf_cost(design: Design, repaired: LevelMap) -> list[dict[str, Any]]:

@@ -1,5 +1,6 @@
 """Level maps and designs from a run, its mask files, or a height map of the user's own."""
 
+import logging
 from collections.abc import Sequence
 from math import isclose
 from pathlib import Path
@@ -20,6 +21,8 @@ from fab.level_map import LevelMap, read_level_map, write_level_map
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.units import NM, format_length
+
+log = logging.getLogger("doedesign")
 
 
 class Drawing(NamedTuple):
@@ -43,6 +46,9 @@ def read_any_height(
     """
     if path.is_dir():
         raise InputError(str(path), f"a height map is a file ({', '.join(HEIGHT_FILES)})", "a folder", "Give the file.")
+    if path.suffix.lower() not in HEIGHT_FILES:
+        rule = f"a height map must be one of {', '.join(HEIGHT_FILES)}"
+        raise InputError(str(path), rule, path.suffix or "no suffix", "Convert it first.")
     if path.suffix.lower() != ".exr":
         return read_height(path, pitch_m, scale_m, aperture_m)
     from sim.store import read_height as read_exr
@@ -181,12 +187,24 @@ def drawing_from(
     # Mask shops take ASCII names; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
     try:
-        level_map = LevelMap.from_height(height, levels, name)
+        level_map = LevelMap.from_height(height, levels, name, wrapped=_is_wrapped(height, levels))
     except InputError as error:
         part = "" if error.where in ("level map", "height map") else f": {error.where}"
         raise InputError(f"{source}{part}", error.rule, error.got, error.cure) from error
     origin = {"kind": "height map", "name": source.name, "height_sha256": sha256_file(source)}
     return Drawing(level_map, origin, None)
+
+
+def _is_wrapped(height: HeightMap, levels: Levels) -> bool:
+    """Whether heights beyond the top level stay within one wave, as those of a phase do; say what becomes of them."""
+    top_m = levels.total_m + levels.step_m / 2
+    beyond = height.height_m > top_m * (1 + 1e-6)
+    if not beyond.any() or height.height_m.max() > levels.period_m * (1 + 1e-6):
+        return False
+    wave, top = format_length(levels.period_m), format_length(top_m)
+    words = "heights repeat after one wave, %s: %.2g %% of the pixels lie above %s and are drawn as nearly 0"
+    log.info(words, wave, 100 * beyond.mean(), top)
+    return True
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:

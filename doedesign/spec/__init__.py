@@ -48,9 +48,10 @@ from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError
 from fab.files import explain_os_error
+from fab.levels import Levels
 from fab.process import Variation
 
-_OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+)*)\s*=(.*)", re.DOTALL)
+_OVERRIDE = re.compile(r"\s*([A-Za-z_][\w-]*(?:\.[\w-]+|\[\d+\])*)\s*=(.*)", re.DOTALL)
 
 
 # What a file should hold and an example of it, for messages.
@@ -74,7 +75,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     Args:
         path: the file.
         overrides: changes such as ``"process.levels=8"`` or ``"sensor.pitch=1.85 um"``: a dotted key (list entries
-            by their number) and a TOML value; quotes round text may be left out.
+            by their number, ``objective[0].weight`` or ``objective.0.weight``) and a TOML value; quotes round text may
+            be left out.
         values: further changes, as they read best in Python: a key of ``[optimize]`` (``steps=60``), one of another
             table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``), or a whole table.
 
@@ -102,9 +104,18 @@ def spec_from_json(data: Mapping[str, Any], source: str) -> Spec:
     return _checked(Spec, data, source, si=True)
 
 
-def load_process(path: str | Path) -> ProcessSpec:
-    """Read a process from the `[process]` table of a TOML file; other tables of a spec are passed over."""
-    return _load(ProcessFile, path, "process").process
+def load_process(path: str | Path, levels: Levels | None = None) -> ProcessSpec:
+    """Read a process from the `[process]` table of a TOML file; other tables of a spec are passed over.
+
+    What the table leaves out of `levels`, `level_step` and `etch_depths` is that of a staircase, if one is given.
+    """
+    return _load(ProcessFile, path, "process", {} if levels is None else {"process": _staircase(levels)}).process
+
+
+def _staircase(levels: Levels) -> dict[str, Any]:
+    """Keys of `[process]` that say which levels there are."""
+    depths = {} if levels.is_binary else {"etch_depths": [f"{depth!r} m" for depth in levels.depths_m]}
+    return {"levels": levels.count, "level_step": f"{levels.step_m!r} m", **depths}
 
 
 def load_wafer(path: str | Path) -> WaferSpec:
@@ -122,11 +133,20 @@ def load_variation(path: str | Path) -> Variation:
     return _load(VariationFile, path).value()
 
 
-def _load(model: type[Table], path: str | Path, table: str | None = None) -> Table:
-    """Read a file; with a `table`, pass over the other tables of a spec."""
+def _load(
+    model: type[Table],
+    path: str | Path,
+    table: str | None = None,
+    usual: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Table:
+    """Read a file; with a `table`, pass over the other tables of a spec. `usual` stands for keys that are left out."""
     raw = read_toml(Path(path), *_FILES[model])
     others = {toml_key(name) for name in Spec.model_fields if table} - {table}
-    return _checked(model, {key: value for key, value in raw.items() if key not in others}, str(path))
+    raw = {key: value for key, value in raw.items() if key not in others}
+    for name, keys in (usual or {}).items():
+        if isinstance(raw.get(name), dict):
+            raw[name] = {**keys, **raw[name]}
+    return _checked(model, raw, str(path))
 
 
 def _checked(
@@ -183,14 +203,15 @@ def _override(raw: dict[str, Any], text: str) -> str:
     found = _OVERRIDE.fullmatch(text)
     if not found:
         raise InputError("overrides", "an override must be KEY=VALUE", f'"{text}"', "For example process.levels=8.")
-    value = found[2].strip()
+    # Messages name the entries of lists so: objective[0].weight.
+    key, value = re.sub(r"\[(\d+)\]", r".\1", found[1]), found[2].strip()
     try:
         table = tomllib.loads(f"value = {value}")
     except tomllib.TOMLDecodeError:
         table = {}
     # Anything that is no TOML value is text, so that `sensor.pitch=1.85 um` needs no quotes.
-    _put(raw, found[1], table["value"] if len(table) == 1 else value)
-    return found[1]
+    _put(raw, key, table["value"] if len(table) == 1 else value)
+    return key
 
 
 def _put(raw: dict[str, Any], key: str, value: Any) -> None:

@@ -59,12 +59,19 @@ def angle_text(angle_rad: float) -> str:
 
 # Name, reader and writer of the quantities of a spec by their SI unit.
 UNITS = {"m": ("metres", parse_length, format_length), "rad": ("radians", parse_angle, angle_text)}
+_CURES = {"m": "Use a unit of length: nm, um, mm or m.", "rad": "Use a unit of angle: deg, mrad or rad."}
 
 
 def _range_rule(low: float, high: float, text: Callable[[float], str]) -> str:
     if math.isinf(high):
         return "must be finite" if math.isinf(low) else "must be finite and not negative"
     return f"must lie between {text(low)} and {text(high)}"
+
+
+def unit_cure(unit: str, value: Any) -> str:
+    """Cure for a value that is no text with a unit of length ("m") or angle ("rad")."""
+    has_unit = isinstance(value, str) and any(letter.isalpha() for letter in value)
+    return _CURES[unit] if has_unit else "Write it as text, number and unit in quotes."
 
 
 def _read(unit: str, value: Any, context: Any) -> float:
@@ -77,7 +84,7 @@ def _read(unit: str, value: Any, context: Any) -> float:
     try:
         parsed = parse(value)
     except ValueError as error:
-        raise broken(str(error).partition(", but got")[0], "Write the unit inside the quotes.") from error
+        raise broken(str(error).partition(", but got")[0], unit_cure(unit, value)) from error
     number, _, name = value.strip().partition(" ")
     # `parse` rounds to fifteen digits because of prefixes; without a prefix every digit counts.
     return float(number) if name.strip() == unit else parsed

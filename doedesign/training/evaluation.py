@@ -6,6 +6,7 @@ same picture: hold out another film, in a folder of its own.) Their scenes are t
 obstruction and one noise each. Another seed of the training deals the same obstructions out to other pictures.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ from doedesign.training.perceptual import Lpips
 from doedesign.training.scores import scores
 from fab.errors import InputError
 from fab.files import explain_os_error, sha256_file
+
+_log = logging.getLogger("doedesign")
 
 SCENE_SEED = 0
 
@@ -38,17 +41,20 @@ def split_pictures(images: Path | None, validation: Path | None, count: int, see
     """Find pictures to train on, and a number to hold out.
 
     Pictures are those of a folder, or scikit-image's samples, and the held-out ones come from a `validation` folder, if
-    there is one, and are all of it if it has fewer.
+    there is one, and are all of it if it has fewer. Otherwise at most half of the pictures are held out.
 
     Raises:
-        InputError: a folder that cannot be used, or nothing left to train on.
+        InputError: a folder that cannot be used, or nothing left to train on or to hold out.
     """
     files = picture_files(images)
     pool = files if validation is None else picture_files(validation)
     where = str(images or "scikit-image's pictures")
-    if validation is None and len(files) <= count:
-        cure = f"Set train.validation below {len(files)}, or give the pictures to hold out a folder of their own."
-        raise InputError(where, f"must hold more than the {count} pictures of train.validation", len(files), cure)
+    if validation is None and count > len(files) // 2:
+        count = len(files) // 2
+        if not count:
+            cure = "Add pictures, or give those to hold out a folder of their own."
+            raise InputError(where, "must hold one picture to train on and one to hold out", len(files), cure)
+        _log.info("%d of the %d pictures are held out, as many as are trained on", count, len(files))
     order = np.random.default_rng((seed, _ORDER)).permutation(len(pool))[-count:]
     held_out = tuple(pool[k] for k in order)
     training = _without(files, held_out if validation is None else pool)

@@ -244,7 +244,7 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
 def _learnt_doe(spec: Spec, source: str) -> TrainingDoe:
     """A DOE that is learnt, or looked at off the axis, or with errors."""
     odd = spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
-    problem = plans_of(spec.model_copy(update={"sensor": odd}), {})
+    problem = plans_of(spec.model_copy(update={"sensor": odd}))
     optic = problem.optic
     if isinstance(optic, HeightOptic):  # one compiled step serves all depths and fields
         optic = replace(optic, source_kind=SeparableSource)

@@ -122,6 +122,9 @@ def plan_order(
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`."""
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
+    inside = level_map.level[level_map.grid.inside_circle(level_map.aperture_m)]
+    if inside.size and inside.min() == inside.max():
+        log.warning("every pixel of %s has level %d: it does to light what flat glass does", level_map.name, inside[0])
     for headline in report.headlines():
         log.warning(headline)
     if on_violation == "fail" and not report.printable:

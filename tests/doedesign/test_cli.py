@@ -102,7 +102,7 @@ def plate(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def draw(plate: Path, out: Path, *more: str) -> list[str]:
-    return ["masks", str(plate), "--levels", "2", "--step", "0.5 um", "--pitch-um", "9", "--out", str(out), *more]
+    return ["masks", str(plate), "--levels", "2", "--step", "0.5 um", "--pitch", "9 um", "--out", str(out), *more]
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """Objectives against PSFs whose value is known."""
 
+import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,14 +15,18 @@ from doedesign.design.objectives import (
     PsfSet,
     far_spot,
     handcrafted,
+    import_objectives,
     near_spread,
+    source_digests,
     terms_from_spec,
     window_loss,
 )
 from doedesign.design.patterns import target_image
+from doedesign.optimization import optimize
 from doedesign.spec import load_spec
 from doedesign.spec.values import NEAR_OBJECTIVES, OBJECTIVES
 from fab.errors import InputError
+from fab.files import sha256_file
 from fab.grid import Grid
 from fab.pictures import write_pixels
 from sim.camera import Camera, Colour
@@ -121,7 +127,9 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "users_objectives", module)
     overrides = ["objective.0.name=users_objectives:dark_centre", "objective.0.options.power=2.0"]
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
-    term = terms_from_spec(spec, CAMERA, {})[0]
+    with pytest.raises(InputError, match="a spec runs no code by itself"):
+        terms_from_spec(spec, CAMERA, {})
+    term = terms_from_spec(spec, CAMERA, {}, import_objectives(spec))[0]
     assert float(term.value(view(even(), point()))) == pytest.approx(1 / 64**4, rel=1e-5)
 
 
@@ -140,4 +148,29 @@ def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrong_objectives_are_named(overrides: list[str], words: str) -> None:
     spec = load_spec(EXAMPLES / "quick.toml", overrides)
     with pytest.raises(InputError, match=words):
-        terms_from_spec(spec, CAMERA, {})
+        terms_from_spec(spec, CAMERA, {}, import_objectives(spec))
+
+
+def test_a_spec_alone_runs_no_code() -> None:
+    """Neither is the function called nor its module imported."""
+    spec = load_spec(EXAMPLES / "quick.toml", ["objective.0.name=this:d", "objective.0.options={mode=0}"])
+    with pytest.raises(InputError, match=r"objective\[0\] this:d: a spec runs no code by itself"):
+        optimize(spec)
+    assert "this" not in sys.modules
+
+
+def test_a_run_records_the_file_of_an_objective(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "own_objective.py"
+    file.write_text("def dark(psfs):\n    return psfs.far.max()\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spec = load_spec(EXAMPLES / "quick.toml", ["objective.0.name=own_objective:dark", "optimize.steps=0"])
+    functions = import_objectives(spec)
+    assert source_digests(spec, functions) == {"objective[0].name": sha256_file(file)}
+    optimize(spec, tmp_path / "run", objectives=functions)
+    recorded = json.loads((tmp_path / "run" / "manifest.json").read_text())["inputs_sha256"]
+    assert recorded == {"objective[0].name": sha256_file(file)}
+    file.write_text("def dark(psfs):\n    return psfs.far.min()\n")
+    with pytest.raises(InputError, match="other input files"):
+        optimize(spec, tmp_path / "run", objectives=functions)
+    with pytest.raises(InputError, match="must be in a file"):
+        source_digests(spec, {"own_objective:dark": cast("Any", len)})

@@ -17,7 +17,7 @@ from sim.store import write_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 
-BARE = ("--levels", 16, "--step", "75 nm", "--pitch-um", 2)
+BARE = ("--levels", 16, "--step", "75 nm", "--pitch", "2 um")
 
 
 def refuse(done, *words, code=2):
@@ -83,7 +83,7 @@ def test_spec_that_is_none(cli, tmp_path, text, words):
         ("name=../up", ["name"]),
         ("nonsense", ["KEY=VALUE"]),
         ('scene.far=["1 mm"]', ["scene.near"]),
-        ('objective=[{name="no_such:thing"}]', ["no_such", "importable"]),
+        ('objective=[{name="no_such:thing"}]', ["no_such", "runs no code by itself", "--allow-code"]),
         ('objective=[{name="far_spot", options={reach=2}}]', ["far_spot"]),
         ('objective=[{name="target_pattern", options={image="none.png"}}]', ["none.png", "exist"]),
         ("optimize.start_options.pitch=3", ["start_options", "pitch"]),
@@ -91,6 +91,12 @@ def test_spec_that_is_none(cli, tmp_path, text, words):
 )
 def test_override_that_cannot_be(tiny, cli, tmp_path, override, words):
     refuse(cli("optimize", tiny, "--out", tmp_path / "run", "--set", override), *words)
+
+
+def test_code_that_is_allowed_must_be_there(tiny, cli, tmp_path):
+    override = 'objective=[{name="no_such:thing"}]'
+    done = cli("optimize", tiny, "--out", tmp_path / "run", "--allow-code", "--set", override)
+    refuse(done, "no_such", "importable module:function")
 
 
 def test_loss_without_end(tiny, cli, tmp_path):
@@ -329,22 +335,25 @@ def test_a_pickle_is_never_loaded(cli, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--step", "75 nm", "--pitch-um", 2), ["--levels"]),
-        (("--levels", 16, "--pitch-um", 2), ["--step"]),
-        (("--levels", 16, "--step", "75 nm"), ["--pitch-um"]),
-        (("--levels", 12, "--step", "75 nm", "--pitch-um", 2), ["power of two", "12"]),
-        (("--levels", 10**30, "--step", "75 nm", "--pitch-um", 2), ["power of two"]),
-        (("--levels", 16, "--step", "75", "--pitch-um", 2), ["--step", "unit"]),
-        (("--levels", 16, "--step", "75 s", "--pitch-um", 2), ["--step", "unit"]),
-        (("--levels", 16, "--step", "0 nm", "--pitch-um", 2), ["step", "positive"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 0), ["pitch", "positive"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", "nan"), ["pitch", "must be metres", "nan"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 1e-9), ["pixels"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 1e9), ["pixels"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 2, "--aperture", "1 km"), ["aperture"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 2, "--aperture", "0 m"), ["aperture"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 2, "--scale", "0 m"), ["scale"]),
-        (("--levels", 16, "--step", "75 nm", "--pitch-um", 2, "--colour", "red"), ["--colour"]),
+        (("--step", "75 nm", "--pitch", "2 um"), ["--levels"]),
+        (("--levels", 16, "--pitch", "2 um"), ["--step"]),
+        (("--levels", 16, "--step", "75 nm"), ["--pitch"]),
+        (("--levels", 12, "--step", "75 nm", "--pitch", "2 um"), ["power of two", "12"]),
+        (("--levels", 10**30, "--step", "75 nm", "--pitch", "2 um"), ["power of two"]),
+        (("--levels", 16, "--step", "75", "--pitch", "2 um"), ["--step", "unit"]),
+        (("--levels", 16, "--step", "75 s", "--pitch", "2 um"), ["--step", "unit"]),
+        (("--levels", 16, "--step", "0 nm", "--pitch", "2 um"), ["step", "positive"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "0 um"), ["pitch", "positive"]),
+        (
+            ("--levels", 16, "--step", "75 nm", "--pitch", "nan um"),
+            ["--pitch", "must be a length with a unit", "nan um"],
+        ),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "1e-9 um"), ["pixels"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "1e9 um"), ["pixels"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "2 um", "--aperture", "1 km"), ["aperture"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "2 um", "--aperture", "0 m"), ["aperture"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "2 um", "--scale", "0 m"), ["scale"]),
+        (("--levels", 16, "--step", "75 nm", "--pitch", "2 um", "--colour", "red"), ["--colour"]),
     ],
 )
 def test_geometry_that_cannot_be(cli, tmp_path, options, words):
@@ -364,7 +373,7 @@ def test_file_of_another_kind(cli, tmp_path, tiny):
 
 
 def test_a_run_brings_its_own_geometry(finished, cli):
-    for option, value in {"--step": "75 nm", "--pitch-um": 0, "--scale": "1 nm", "--aperture": "1 mm"}.items():
+    for option, value in {"--step": "75 nm", "--pitch": "1 um", "--scale": "1 nm", "--aperture": "1 mm"}.items():
         refuse(cli("masks", finished.run, option, value), option, "its own geometry")
     refuse(cli("masks", finished.run, "--levels", 0), "power of two")
 

@@ -154,7 +154,8 @@ def test_a_bare_map_takes_depths_from_the_command_line(cli, tmp_path):
     levels = Levels(4, 300e-9, (250e-9, 600e-9))
     level_map = np.random.default_rng(5).integers(0, 4, (24, 24)).astype(np.uint8)
     np.save(tmp_path / "map.npy", height_of(level_map, levels))
-    bare = ("masks", tmp_path / "map.npy", "--levels", 4, "--step", "300 nm", "--pitch-um", 2, "--out", tmp_path / "o")
+    geometry = ("--levels", 4, "--step", "300 nm", "--pitch", "2 um")
+    bare = ("masks", tmp_path / "map.npy", *geometry, "--out", tmp_path / "o")
     done = cli(*bare, "--etch-depths", "250 nm, 600 nm")
     assert done.code == 0, done.err
     manifest = read_manifest(tmp_path / "o")

@@ -22,7 +22,7 @@ def write_map(path: Path, height_m: np.ndarray, kind: str) -> tuple[str, ...]:
     counts = np.rint(height_m * 1e9).astype(np.uint16)
     levels, pitch, scale = (
         ("--levels", str(LEVELS), "--step", "75 nm"),
-        ("--pitch-um", str(PITCH_UM)),
+        ("--pitch", f"{PITCH_UM} um"),
         ("--scale", "1 nm"),
     )
     if kind == "npy":
@@ -105,7 +105,7 @@ def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
 )
 def test_odd_shapes(cli, tmp_path, rng, shape):
     np.save(tmp_path / "odd.npy", rng.uniform(0, FULL_M, shape))
-    options = ("--levels", LEVELS, "--step", "75 nm", "--pitch-um", 20, "--out", tmp_path / "order")
+    options = ("--levels", LEVELS, "--step", "75 nm", "--pitch", "20 um", "--out", tmp_path / "order")
     done = cli("masks", tmp_path / "odd.npy", *options)
     assert done.code == 0, done.err
     assert cli("verify", tmp_path / "order").code == 0
@@ -123,7 +123,7 @@ def test_odd_shapes(cli, tmp_path, rng, shape):
 def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / f"{stem}.npy", np.full((9, 9), FULL_M))
-    done = cli("masks", f"{stem}.npy", "--levels", LEVELS, "--step", "75 nm", "--pitch-um", 9)
+    done = cli("masks", f"{stem}.npy", "--levels", LEVELS, "--step", "75 nm", "--pitch", "9 um")
     assert done.code == 0, done.err
     assert done.out.splitlines()[0] == f"masks/{folder}"
     assert (tmp_path / "masks" / folder / f"DOE_{order_id}_ALL.gds").is_file()
@@ -132,7 +132,7 @@ def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):
 def test_a_map_may_say_more_than_its_file(cli, tmp_path):
     write_height(tmp_path / "plate.exr", np.full((20, 20), FULL_M), 2e-6, 40e-6)
     levels = ("--levels", LEVELS, "--step", "75 nm", "--out", tmp_path / "order")
-    assert cli("masks", tmp_path / "plate.exr", *levels, "--pitch-um", 3, "--aperture", "50 um").code == 0
+    assert cli("masks", tmp_path / "plate.exr", *levels, "--pitch", "3 um", "--aperture", "50 um").code == 0
     manifest = json.loads((tmp_path / "order" / "manifest.json").read_text())
     assert (manifest["pitch_um"], manifest["aperture_mm"]) == (3, 0.05)
 
@@ -170,9 +170,56 @@ def test_a_bare_map_may_have_a_process_and_a_wafer_of_its_own(cli, tmp_path):
     assert [layer["edge_move_nm"] for layer in manifest["splits"][0]["layers"]] == [-50] * 4
     # The rim of the aperture cuts blocks of 4 um down to single pixels.
     assert "narrower than the 3 um that the process prints" in done.err
-    refused = cli("masks", tmp_path / "a.npy", "--levels", 8, "--step", "150 nm", "--pitch-um", 2, *lab)
+    refused = cli("masks", tmp_path / "a.npy", "--levels", 8, "--step", "150 nm", "--pitch", "2 um", *lab)
     assert refused.code == 2
     assert "lab.toml: must be for 8 levels" in refused.err
+
+
+def test_a_process_file_may_leave_the_staircase_out_and_say_how_far_the_chrome_reaches(cli, tmp_path):
+    height = np.random.default_rng(3).integers(0, LEVELS, (60, 60)) * STEP_M
+    options = write_map(tmp_path / "a.npy", height, "npy")
+    (tmp_path / "lab.toml").write_text('[process]\nchrome_overlap = "0 um"\n')
+    for name, more in (("usual", ()), ("open", ("--process", tmp_path / "lab.toml"))):
+        done = cli("masks", tmp_path / "a.npy", *options, *more, "--out", tmp_path / name)
+        assert done.code == 0, done.err
+    opened = [json.loads((tmp_path / name / "manifest.json").read_text())["chrome"] for name in ("usual", "open")]
+    assert [one["opening_diameter_mm"] for one in opened] == [0.11, 0.12]
+
+
+def test_a_map_one_pixel_wide(cli, tmp_path):
+    options = write_map(tmp_path / "a.npy", np.arange(12.0)[None] * STEP_M, "npy")
+    (tmp_path / "lab.toml").write_text('[process]\nchrome_overlap = "0 um"\n')
+    done = cli("masks", tmp_path / "a.npy", *options, "--process", tmp_path / "lab.toml", "--out", tmp_path / "order")
+    assert done.code == 0, done.err
+
+
+def test_heights_within_one_wave_repeat_after_it(cli, tmp_path):
+    """15.4 and 15.6 steps of 16: the top level, and the lowest one a wave higher."""
+    height = np.array([[0.0, 1.0], [15.4, 15.6]]).repeat(20, 0).repeat(20, 1) * STEP_M
+    options = write_map(tmp_path / "a.npy", height, "npy")
+    done = cli("masks", tmp_path / "a.npy", *options, "--aperture", "40 um", "--out", tmp_path / "order")
+    assert done.code == 0, done.err
+    assert "heights repeat after one wave, 1.2 um: 25 % of the pixels lie above 1.1625 um" in done.err
+    levels = np.load(tmp_path / "order" / "DOE_A_LEVELS.npy")
+    assert [levels[18, 18], levels[18, 21], levels[21, 18], levels[21, 21]] == [0, 1, 15, 0]
+    geometry = ("--levels", 8, "--step", "75 nm", "--pitch", "2 um")
+    refused = cli("masks", tmp_path / "a.npy", *geometry, "--out", tmp_path / "two")
+    assert refused.code == 2
+    assert "more than half a step above the top level" in refused.err
+
+
+def test_a_flat_map_is_ordered_with_a_warning(cli, tmp_path):
+    options = write_map(tmp_path / "a.npy", np.full((30, 30), 3 * STEP_M), "npy")
+    done = cli("masks", tmp_path / "a.npy", *options, "--out", tmp_path / "order")
+    assert done.code == 0, done.err
+    assert "warning: every pixel of a has level 3: it does to light what flat glass does" in done.err
+
+
+def test_all_formats_are_named(cli, tmp_path):
+    (tmp_path / "a.bmp").write_bytes(b"BM")
+    done = cli("masks", tmp_path / "a.bmp", "--levels", 16, "--step", "75 nm", "--pitch", "2 um")
+    assert done.code == 2
+    assert "must be one of .exr, .npy, .tif, .tiff, .png, but got .bmp" in done.err
 
 
 def test_a_wafer_is_no_part_of_what_was_built(cli, tmp_path):

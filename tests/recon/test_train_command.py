@@ -521,6 +521,15 @@ def test_a_folder_of_their_own(images: Path, tmp_path: Path):
     assert {path.name[0] for path in split.training} == set("2345")
     with pytest.raises(InputError, match="only those held out"):
         split_pictures(own, own, 2, 0)
+    (own / "copy of 1a.png").unlink()
+    with pytest.raises(InputError, match="one picture to train on and one to hold out"):
+        split_pictures(own, None, 2, 0)
+
+
+def test_scikit_images_pictures_are_enough():
+    """Eight are held out by default, of which there are six."""
+    split = split_pictures(None, None, 8, 0)
+    assert len(split.training) == len(split.held_out) == 3
 
 
 @pytest.mark.slow
@@ -574,7 +583,6 @@ def _still(run: Path) -> Any:
         (["process.levels=8"], ["--set", "another process", "[network], [train]"]),
         (["sensor.binning=2"], ["--set", "sensor.binning"]),
         (["train.size=484"], ["train.size", "480 binned pixels"]),
-        (["train.validation=12"], ["more than the 12 pictures", "train.validation below 12", "folder of their own"]),
     ],
 )
 def test_what_is_refused(run: Path, images: Path, tmp_path: Path, changes: list[str], words: list[str]):
