@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fab.grid import Grid
+from sim.tracing import is_traced, single
 
 
 def circle_coverage(
@@ -43,16 +44,20 @@ def displaced_circle_coverage(
     Within a cell the circle is taken as straight: the area of a unit square on one side of a line is a closed form,
     and what the bow leaves out is pitch / (12 diameter) of an edge cell, 1e-7 of a circle of a thousand cells.
     """
+    # A known circle is NumPy's: one by one, jax's operations take a second to compile. They divide by a number as these
+    # do; under a trace the compiler folds it.
+    traced = is_traced(diameter_m, centre_m)
+    xp, per_pitch = (jnp if traced else np), np.float32(1) / np.float32(grid.pitch_m)
     radius = diameter_m / 2 / grid.pitch_m
-    y = (jnp.asarray(grid.axis_m("y"), jnp.float32) - centre_m[0])[:, None] / grid.pitch_m
-    x = (jnp.asarray(grid.axis_m("x"), jnp.float32) - centre_m[1])[None, :] / grid.pitch_m
-    distance = jnp.sqrt(jnp.maximum(y * y + x * x, 1e-6))
+    y, x = (single(grid.axis_m("y")) - centre_m[0])[:, None], (single(grid.axis_m("x")) - centre_m[1])[None, :]
+    y, x = (axis / grid.pitch_m if traced else axis * per_pitch for axis in (y, x))
+    distance = xp.sqrt(xp.maximum(y * y + x * x, 1e-6))
     # At least 0.7, but in the very middle of the circle, where nothing is to be divided by zero.
-    steep = jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(x)) / distance, 0.5)
-    flat = jnp.maximum(jnp.minimum(jnp.abs(y), jnp.abs(x)) / distance, 1e-4)
+    steep = xp.maximum(xp.maximum(xp.abs(y), xp.abs(x)) / distance, 0.5)
+    flat = xp.maximum(xp.minimum(xp.abs(y), xp.abs(x)) / distance, 1e-4)
     inward = radius - distance
     far, near = (steep + flat) / 2, (steep - flat) / 2
     # A line through opposite sides cuts a trapezoid; nearer to a corner, a triangle.
-    triangle = jnp.square(jnp.maximum(far - jnp.abs(inward), 0.0)) / (2 * steep * flat)
-    beyond = jnp.where(inward > 0, 1.0 - triangle, triangle)
-    return jnp.where(jnp.abs(inward) <= near, 0.5 + inward / steep, beyond)
+    triangle = xp.square(xp.maximum(far - xp.abs(inward), 0.0)) / (2 * steep * flat)
+    beyond = xp.where(inward > 0, 1.0 - triangle, triangle)
+    return jnp.asarray(xp.where(xp.abs(inward) <= near, 0.5 + inward / steep, beyond))
