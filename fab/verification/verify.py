@@ -10,14 +10,15 @@ only that a file changed but also what in the drawing is different:
 3. Does a library that had no part in the writing (gdstk) see the same?
 
 gdstk is not safe against broken streams. It is therefore given only GDSII files that the own reader
-accepts, and OASIS files whose bytes are those of the manifest; an altered OASIS file goes through KLayout,
-which refuses what is broken, and then through the own reader.
+accepts, and OASIS files whose bytes are those of the manifest, and those in a process of its own with limits
+of time and memory (`fab.verification.child`). An altered OASIS file, or one that gdstk cannot take, goes
+through KLayout, which refuses what is broken, and then through the own reader, in such a process, too.
 """
 
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,7 @@ from fab.level_map import level_digest
 from fab.levels import Levels
 from fab.manifest.records import FileEntry, Manifest, plane_digest, read_manifest
 from fab.solids.write import model_problems
+from fab.verification.child import Child, ChildFailed, child_process, limited
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
 from fab.verification.shop_checks import drawing_problems, number_problems
 
@@ -201,12 +203,32 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     return Check(entry.file, "gdstk, every pixel", tuple(problems))
 
 
-def _check_mask_file(folder: Path, entry: FileEntry, intact: bool, expected: Expected) -> list[Check]:
+def _check_oasis(child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected) -> Callable[[], Check]:
+    """Begin to check an OASIS file in a child process; return what waits for the result."""
+    size = path.stat().st_size
+    first, *others = (_library_check, _altered_oasis) if intact else (_altered_oasis,)
+    begun = child.begin(limited, size, first, path, entry, expected)
+
+    def wait() -> Check:
+        try:
+            return child.result(begun, size)
+        except ChildFailed as error:
+            problems = [f"it cannot be read: {error}"]
+        for other in others:
+            try:
+                found = child.result(child.begin(limited, size, other, path, entry, expected), size)
+                return replace(found, problems=(*problems, *found.problems))
+            except ChildFailed as error:
+                problems.append(f"nor by KLayout: {error}")
+        return Check(entry.file, "OASIS", tuple(problems))
+
+    return wait
+
+
+def _check_mask_file(folder: Path, entry: FileEntry, expected: Expected) -> list[Check]:
     path = folder / entry.file
     if not path.is_file():
         return []
-    if entry.format == _OASIS:
-        return [(_library_check if intact else _altered_oasis)(path, entry, expected)]
     own, fit = _own_check(path, entry, expected)
     return [own, _library_check(path, entry, expected)] if fit else [own]
 
@@ -241,9 +263,17 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
                 checks.append(Check(mask.file, question, ("it is not that of the level map",)))
         for file, problems in number_problems(expected).items():
             checks.append(Check(file, "numbers of the order form", tuple(problems)))
-        for entry in manifest.files:
-            if entry.format in (_GDS, _OASIS):
-                checks += _check_mask_file(folder, entry, byte_checks[entry.file].passed, expected)
+        with child_process() as child:
+            begun = {
+                entry.file: _check_oasis(child, folder / entry.file, entry, byte_checks[entry.file].passed, expected)
+                for entry in manifest.files
+                if entry.format == _OASIS and (folder / entry.file).is_file()
+            }
+            for entry in manifest.files:
+                if entry.format == _GDS:
+                    checks += _check_mask_file(folder, entry, expected)
+                elif entry.file in begun:
+                    checks.append(begun[entry.file]())
         for model in manifest.models:
             # Libraries of solids and pictures are given whole files only.
             if byte_checks[model.file].passed:

@@ -1,3 +1,4 @@
+import json
 import shutil
 from dataclasses import replace
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 
 from fab.errors import CheckFailed, InputError
-from fab.files import sha256_file
+from fab.files import canonical_json, sha256_bytes, sha256_file
 from fab.gds.reader import read_gds
 from fab.gds.writer import write_gds
 from fab.grid import Grid
@@ -227,6 +228,30 @@ def test_missing_cut_and_unlisted_files_are_named(order_folder):
     assert f"{MASKS[3]}: bytes as in the manifest: the file is missing" in differences
     assert any(d.startswith(MASKS[4]) and "cannot be read" in d for d in differences)
     assert any(d.startswith("EXTRA.GDS") for d in differences)
+
+
+def seal(folder, file):
+    """State the size and digest of a changed file in the manifest, and the digest of that."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (entry,) = [one for one in manifest["files"] if one["file"] == file]
+    entry |= {"bytes": (folder / file).stat().st_size, "sha256": sha256_file(folder / file)}
+    del manifest["sha256"]
+    manifest["sha256"] = sha256_bytes(canonical_json(manifest))
+    (folder / "manifest.json").write_bytes(canonical_json(manifest))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_damaged_oasis_file_whose_digest_matches_crashes_nothing(order_folder, seed, capfd):
+    """Nearly every changed byte of a packed cell crashes gdstk."""
+    rng, path = np.random.default_rng(seed), order_folder / "DOE_SMALL_ALL.oas"
+    data = bytearray(path.read_bytes())
+    data[rng.integers(len(data) // 4, len(data) // 2)] ^= 1 << int(rng.integers(8))
+    path.write_bytes(data)
+    seal(order_folder, path.name)
+    differences = verify(order_folder).differences
+    assert differences
+    assert {difference.split(":")[0] for difference in differences} == {path.name}
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_damaged_level_map_does_not_put_the_blame_on_the_masks(order_folder):

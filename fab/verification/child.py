@@ -1,0 +1,118 @@
+"""Work in a child process with limits, for libraries that a damaged file makes crash or grow without bounds."""
+
+import contextlib
+import faulthandler
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, TimeoutError
+from typing import Any
+
+from loky import ProcessPoolExecutor
+from loky.process_executor import BrokenProcessPool, TerminatedWorkerError
+
+# A sound file takes far less of either: gdstk about 350 bytes for a polygon of ten bytes in a packed file, and seconds
+# for a million of them.
+_SECONDS, _SECONDS_PER_BYTE = 5.0, 10e-6
+_BYTES, _BYTES_PER_BYTE = 1 << 30, 400
+_IDLE_S = 60  # after which a child without work ends
+
+
+class ChildFailed(Exception):
+    """The work could not be done within the limits; the text says why."""
+
+
+class Child:
+    """A process that does one piece of work after another; one that fails ends it, and the next starts another."""
+
+    def __init__(self) -> None:
+        self._executor: ProcessPoolExecutor | None = None
+        self._ready: Future[Any]
+
+    def begin(self, work: Callable[..., Any], *arguments: Any) -> "Future[Any]":
+        """Begin a piece of work; `result` waits for it."""
+        if self._executor is None:
+            self._executor = ProcessPoolExecutor(max_workers=1, timeout=_IDLE_S)
+        self._ready = self._executor.submit(_import, work.__module__)
+        return self._executor.submit(work, *arguments)
+
+    def result(self, begun: "Future[Any]", file_bytes: int) -> Any:
+        """Wait for a piece of work.
+
+        Args:
+            begun: the work.
+            file_bytes: size of the file that it reads, by which its time is limited.
+
+        Raises:
+            ChildFailed: the work failed, or its process died, had not enough memory, or took too long and is ended.
+        """
+        try:
+            self._ready.exception()  # what is imported for the first time does not count
+            return begun.result(_SECONDS + _SECONDS_PER_BYTE * file_bytes)
+        except TimeoutError as error:
+            self.end()
+            raise ChildFailed("it takes too long") from error
+        except MemoryError as error:
+            raise ChildFailed("it takes too much memory") from error
+        except (BrokenProcessPool, TerminatedWorkerError) as error:
+            self.end()
+            raise ChildFailed("the library that reads it crashes") from error
+        except Exception as error:  # whatever a library makes of a broken file
+            raise ChildFailed(str(error) or type(error).__name__) from error
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
+        if self._executor is not None:
+            self._executor.shutdown(kill_workers=True)
+            self._executor = None
+
+
+_CHILD = Child()
+
+
+@contextlib.contextmanager
+def child_process() -> Iterator[Child]:
+    """Provide the child process. It is kept for the next block for a while, unless this one is left by an error."""
+    try:
+        yield _CHILD
+    except BaseException:
+        _CHILD.end()
+        raise
+
+
+def _import(module: str) -> None:
+    importlib.import_module(module)
+
+
+def limited(file_bytes: int, work: Callable[..., Any], *arguments: Any) -> Any:
+    """Do work with no more memory than reading a file of so many bytes takes, beyond what is in use already.
+
+    For the child: neither it nor a library says anything on its own; who waits for the result is told.
+    """
+    faulthandler.disable()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
+    try:
+        import resource
+    except ImportError:  # Windows
+        return work(*arguments)
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    most = _in_use() + _BYTES + _BYTES_PER_BYTE * file_bytes
+    with contextlib.suppress(ValueError, OSError):  # a lower limit is there already
+        resource.setrlimit(resource.RLIMIT_DATA, (most, before[1]))
+    try:
+        return work(*arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def _in_use() -> int:
+    """Private memory of this process, bytes; 0 where the system does not tell."""
+    try:
+        with open("/proc/self/status") as stream:
+            lines = dict(line.split(":", 1) for line in stream)
+        return 1024 * int(lines["VmData"].split()[0])
+    except (OSError, KeyError):
+        return 0
