@@ -23,7 +23,7 @@ from doedesign.design.objectives import (
 )
 from doedesign.design.patterns import target_image
 from doedesign.optimization import optimize
-from doedesign.spec import load_spec
+from doedesign.spec import Spec, load_spec
 from doedesign.spec.values import NEAR_OBJECTIVES, OBJECTIVES
 from fab.errors import InputError
 from fab.files import sha256_file
@@ -159,18 +159,30 @@ def test_a_spec_alone_runs_no_code() -> None:
     assert "this" not in sys.modules
 
 
-def test_a_run_records_the_file_of_an_objective(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Spec]:
+    """A module with an objective, and a spec that names it."""
     file = tmp_path / "own_objective.py"
     file.write_text("def dark(psfs):\n    return psfs.far.max()\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    spec = load_spec(EXAMPLES / "quick.toml", ["objective.0.name=own_objective:dark", "optimize.steps=0"])
+    monkeypatch.delitem(sys.modules, "own_objective", raising=False)
+    return file, load_spec(EXAMPLES / "quick.toml", ["objective.0.name=own_objective:dark", "optimize.steps=0"])
+
+
+def test_the_file_of_an_objective_is_known_by_its_digest(own: tuple[Path, Spec]) -> None:
+    file, spec = own
+    assert source_digests(spec, import_objectives(spec)) == {"objective[0].name": sha256_file(file)}
+    with pytest.raises(InputError, match="must be in a file"):
+        source_digests(spec, {"own_objective:dark": cast("Any", len)})
+
+
+@pytest.mark.slow
+def test_a_run_records_the_file_of_an_objective(own: tuple[Path, Spec], tmp_path: Path) -> None:
+    file, spec = own
     functions = import_objectives(spec)
-    assert source_digests(spec, functions) == {"objective[0].name": sha256_file(file)}
     optimize(spec, tmp_path / "run", objectives=functions)
     recorded = json.loads((tmp_path / "run" / "manifest.json").read_text())["inputs_sha256"]
     assert recorded == {"objective[0].name": sha256_file(file)}
     file.write_text("def dark(psfs):\n    return psfs.far.min()\n")
     with pytest.raises(InputError, match="other input files"):
         optimize(spec, tmp_path / "run", objectives=functions)
-    with pytest.raises(InputError, match="must be in a file"):
-        source_digests(spec, {"own_objective:dark": cast("Any", len)})

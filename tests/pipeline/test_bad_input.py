@@ -442,6 +442,7 @@ def test_manifest_of_an_order_changed(copied, cli, text):
     refuse(cli("masks", copied.run, "--out", copied.order), manifest)
 
 
+@pytest.mark.slow
 def test_masks_of_another_run(copied, tiny, cli, content, tmp_path):
     """Another design on the same raster is a failed check; another raster or staircase cannot be compared at all."""
     other, order = tmp_path / "other", tmp_path / "other order"

@@ -76,7 +76,9 @@ def test_a_marked_place_stays_where_it_is(cli, tmp_path, kind, shape):
     assert cli("verify", tmp_path / "order").code == 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind in ("npy", "exr", "png") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+)
 def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
     shape = (37, 52)
     counts = rng.integers(0, round(FULL_M * 1e9) + 1, shape)
@@ -175,6 +177,7 @@ def test_a_bare_map_may_have_a_process_and_a_wafer_of_its_own(cli, tmp_path):
     assert "lab.toml: must be for 8 levels" in refused.err
 
 
+@pytest.mark.slow
 def test_a_process_file_may_leave_the_staircase_out_and_say_how_far_the_chrome_reaches(cli, tmp_path):
     height = np.random.default_rng(3).integers(0, LEVELS, (60, 60)) * STEP_M
     options = write_map(tmp_path / "a.npy", height, "npy")
