@@ -207,6 +207,7 @@ def _check_oasis(child: Child, path: Path, entry: FileEntry, intact: bool, expec
     """Begin to check an OASIS file in a child process; return what waits for the result."""
     size = path.stat().st_size
     first, *others = (_library_check, _altered_oasis) if intact else (_altered_oasis,)
+    path = path.absolute()  # the child may work in another folder
     begun = child.begin(limited, size, first, path, entry, expected)
 
     def wait() -> Check:
