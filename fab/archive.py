@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from fab.errors import InputError
-from fab.files import canonical_json, os_errors_explained, write_atomic
+from fab.files import canonical_json, read_bytes, write_atomic
 
 _HEADER, _DIGEST = "header", "sha256"
+_MOST_BYTES = 1 << 33
 
 
 def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -38,8 +39,7 @@ def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict
             that it must be a whole `what` ("checkpoint") and ends with `cure`.
     """
     rule = f"must be a whole {what}"
-    with os_errors_explained(path):
-        data = path.read_bytes()
+    data = read_bytes(path, _MOST_BYTES)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             # A compressed member was not written here, and could unfold to more than memory holds.

@@ -10,10 +10,12 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -157,9 +159,33 @@ def sha256_bytes(data: bytes | memoryview) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+@contextmanager
+def opened(path: str | Path) -> Iterator[FileIO]:
+    """Open a regular file to read it; an InputError for anything else, such as a pipe that nobody may ever write to."""
+    with os_errors_explained(path):
+        # Not to wait for the other end of a pipe.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        with os.fdopen(handle, "rb", buffering=0) as stream:
+            mode = os.fstat(handle).st_mode
+            if stat.S_ISDIR(mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            if not stat.S_ISREG(mode):
+                raise InputError(str(path), "must be a file", "a pipe, socket or device", "Copy its content to a file.")
+            yield stream
+
+
+def read_bytes(path: str | Path, most: int = 1 << 30) -> bytes:
+    """Read a whole file of at most `most` bytes."""
+    with opened(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > most:
+            raise InputError(str(path), f"must have at most {most} bytes", size, "Give the file that was meant.")
+        return stream.read()
+
+
 def sha256_file(path: str | Path) -> str:
     """Return the SHA-256 of a file's content, in lower-case hexadecimal."""
-    with os_errors_explained(path), open(path, "rb") as stream:
+    with opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -168,13 +194,28 @@ def canonical_json(value: object) -> bytes:
     return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
+def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a JSON object of pairs whose keys differ."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} stands twice")
+    return value
+
+
+def _no_number(word: str) -> None:
+    raise ValueError(f"{word} is no number of JSON")
+
+
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object."""
+    """Read a JSON file that holds one object; no key twice, no NaN, no infinity."""
     cure = "Write it again from its source."
-    with os_errors_explained(path):
-        text = Path(path).read_bytes()
+    text = read_bytes(path, 1 << 28)
     try:
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=_unlike, parse_constant=_no_number)
+    except RecursionError as error:
+        raise InputError(str(path), "the file must be JSON", "brackets without end", cure) from error
     except ValueError as error:
         raise InputError(str(path), "the file must be JSON", str(error), cure) from error
     if not isinstance(value, dict):
@@ -186,6 +227,8 @@ def read_npy(path: str | Path, most: int = 1 << 28) -> NDArray[Any]:
     """Read an array file of at most `most` elements; anything but one whole array of plain numbers is an InputError."""
     rule = f"the file must be a whole .npy file of 1 to {most} plain numbers"
     cure = "Write the file again from its source."
+    with opened(path):
+        pass  # numpy would wait for a pipe
     try:
         with warnings.catch_warnings():
             # A damaged header can look like one of an old version of Python.

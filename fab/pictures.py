@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error, write_atomic
+from fab.files import explain_os_error, read_bytes, write_atomic
 
 TIFF_FILES = (".tif", ".tiff")
 MOST_PIXELS = 1 << 28
@@ -68,9 +68,9 @@ def read_pixels(path: str | Path, *, most_pixels: int = MOST_PIXELS, others: str
         InputError: the file is missing, damaged, of another kind, too large, or not a single picture.
     """
     path = Path(path)
+    data = read_bytes(path)
     with decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of what is refused, or does not matter
-        data = path.read_bytes()
         if path.suffix.lower() in TIFF_FILES:
             return _tiff_pixels(path, data, most_pixels, others)[::-1]
         return _png_pixels(path, data, most_pixels, others)[::-1]

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
-from fab.files import canonical_json, explain_os_error, write_atomic
+from fab.files import canonical_json, read_bytes, write_atomic
 
 if TYPE_CHECKING:
     import sim.psf_bank
@@ -249,10 +249,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Channels `[y, x]` (row 0 at the lowest y) and text attributes of an EXR file."""
     import OpenEXR
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+    data = read_bytes(path)
     try:
         with _silence() as said:
             file = OpenEXR.File(io.BytesIO(data), separate_channels=True)

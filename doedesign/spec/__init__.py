@@ -47,7 +47,7 @@ from doedesign.spec.values import HEIGHT_FILES, STARTS, Options
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError
-from fab.files import explain_os_error
+from fab.files import read_bytes
 from fab.levels import Levels
 from fab.process import Variation
 
@@ -187,9 +187,7 @@ def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
     """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages."""
     cure = f"Give {what} such as {example}."
     try:
-        return tomllib.loads(path.read_bytes().decode())
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+        return tomllib.loads(read_bytes(path, 1 << 24).decode())
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
     except tomllib.TOMLDecodeError as error:

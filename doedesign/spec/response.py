@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import explain_os_error
+from fab.files import read_bytes
 from fab.units import NM
 
 RESPONSE_KEYS = ("spectral_response", "lines_per_colour")
@@ -98,9 +98,7 @@ def lines_of(response: Response, count: int) -> tuple[NDArray[np.float64], NDArr
 def read_responses(path: Path) -> list[Response]:
     """Read a response file."""
     try:
-        text = path.read_bytes().decode()
-    except OSError as error:
-        raise explain_os_error(error, path) from error
+        text = read_bytes(path, 1 << 24).decode()
     except UnicodeDecodeError as error:
         raise InputError(str(path), "must be a text file", f"a foreign byte at {error.start}", _CURE) from error
     kept = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]

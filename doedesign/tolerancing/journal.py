@@ -9,6 +9,7 @@ half of a line that a killed run left behind is cut off.
 
 import contextlib
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,8 +18,8 @@ from typing import Any
 from doedesign.runs.folder import alone_in
 from doedesign.tolerancing.pool import OutOfModel, Rows
 from fab.errors import InputError
-from fab.files import canonical_json, os_errors_explained, read_json, write_atomic
-from sim.metrics import without_infinities
+from fab.files import canonical_json, os_errors_explained, read_bytes, read_json, write_atomic
+from sim.metrics import METRICS, without_infinities
 
 STUDY_NAME, DRAWS_NAME = "study.json", "draws.jsonl"
 
@@ -49,7 +50,7 @@ class Journal:
             path = self.folder / DRAWS_NAME
             self.finished |= _read(path)
             with os_errors_explained(path):
-                self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+                self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             try:
                 yield
             finally:
@@ -94,10 +95,12 @@ class Journal:
 
 def _read(path: Path) -> dict[str, Rows | OutOfModel]:
     """Results by key; half a line at the end is cut off the file."""
+    if path.is_symlink():
+        raise InputError(str(path), "must be a file of its own", "a link to elsewhere", "Put the file in its place.")
     if not path.exists():
         return {}
     with os_errors_explained(path):
-        data = path.read_bytes()
+        data = read_bytes(path)
         whole = data.rfind(b"\n") + 1
         if whole < len(data):
             os.truncate(path, whole)
@@ -106,7 +109,7 @@ def _read(path: Path) -> dict[str, Rows | OutOfModel]:
         try:
             key, found = _draw(json.loads(line))
         # What a damaged line lacks shows in different ways.
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             cure = f"Remove {path} to compute all draws again."
             raise InputError(f"{path}, line {number}", "must be one finished draw", f'"{error}"', cure) from error
         finished[key] = found
@@ -114,6 +117,23 @@ def _read(path: Path) -> dict[str, Rows | OutOfModel]:
 
 
 def _draw(record: dict[str, Any]) -> tuple[str, Rows | OutOfModel]:
+    """The key of a draw and its result, or a ValueError, KeyError or TypeError for something else."""
+    key = record["key"]
     if "beyond" in record:
-        return record["key"], OutOfModel(record["beyond"])
-    return record["key"], [dict(row) for row in record["rows"]]
+        reason = record["beyond"]
+        if not (isinstance(key, str) and isinstance(reason, str)):
+            raise ValueError("a key and a reason must be text")
+        return key, OutOfModel(reason)
+    rows = [dict(row) for row in record["rows"]]
+    for row in rows:
+        numbers = [row["depth_m"], *(value for name, value in row.items() if name in METRICS)]
+        if not isinstance(row["colour"], str) or not all(map(_is_number, numbers)):
+            raise ValueError("a row must hold a colour, a depth and numbers")
+    if not isinstance(key, str) or not rows:
+        raise ValueError("a draw must have a key and rows")
+    return key, rows
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value of JSON is a finite number, or None, which stands for an infinite one."""
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))

@@ -5,6 +5,9 @@ own from 0; or, where the cluster tells (SLURM, Open MPI, Kubernetes, TPU pods),
 them see the same folders, and host 0 alone writes. A host that fails takes the others with it after some minutes: they
 miss it.
 
+Host 0 listens on that address alone. Whoever reaches it can take part in the training, and stop it: nothing is
+encrypted and nobody is asked for a password, so it has to lie in a network whose users are trusted.
+
 With one host, all of this does nothing and costs nothing.
 """
 
@@ -43,8 +46,11 @@ def join_hosts(coordinator: str | None, hosts: int | None = None, host: int | No
         if host:
             _require_listening(coordinator, wait_s)
     address = None if coordinator == _AUTO else coordinator
+    # Host 0 would listen on all of its addresses.
+    bound = address if host == 0 else None
+    how = {"initialization_timeout": wait_s, "coordinator_bind_address": bound}
     try:
-        jax.distributed.initialize(address, hosts, host, initialization_timeout=wait_s)
+        jax.distributed.initialize(address, hosts, host, **how)
     # A port in use, a cluster unknown to jax: each comes as an error of its own.
     except (RuntimeError, ValueError) as error:
         raise _not_found(coordinator, wait_s, f'"{str(error).splitlines()[0]}"') from error

@@ -88,7 +88,8 @@ def train(
         overrides: changes that led to the spec, for the record.
         tensorboard: write for TensorBoard, too.
         devices: number of devices; all if None.
-        coordinator: with several hosts, HOST:PORT of host 0, or "auto" (`doedesign.training.hosts`).
+        coordinator: with several hosts, HOST:PORT of host 0, or "auto" (`doedesign.training.hosts`); whoever reaches it
+            is trusted.
         hosts: their number.
         host: number of this one, from 0.
         options: changes to how the spec says to train, such as `steps=1000` (`doedesign.spec.training.TrainSpec`).

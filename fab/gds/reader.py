@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import os_errors_explained
+from fab.files import opened
 from fab.gds import writer as gds
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order
 from fab.units import UM
@@ -257,7 +257,7 @@ def read_gds(path: str | Path) -> Layout:
     Raises:
         InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the offset.
     """
-    with os_errors_explained(path), open(path, "rb", buffering=0) as file:
+    with opened(path) as file:
         stream, found, cells = _Stream(path, file), _Found(), []
         dbu_m = _read_unit(stream)
         while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:

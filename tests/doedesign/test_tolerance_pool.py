@@ -170,13 +170,39 @@ def test_a_folder_keeps_one_study(ask: Callable[..., Study], fakes: ModuleType, 
         ask(out=out).monte_carlo(2)
 
 
+DAMAGED = [
+    b"[1]",
+    b"[" * 100_000,
+    b"1" * 5000,
+    b'{"key": "normal/0", "rows": []}',
+    b'{"key": 1, "beyond": "far"}',
+    b'{"key": "normal/0", "rows": [{"colour": 7, "depth_m": 0.1}]}',
+    b'{"key": "normal/0", "rows": [{"colour": "green", "depth_m": "near"}]}',
+    b'{"key": "normal/0", "rows": [{"colour": "green", "depth_m": 0.1, "strehl": NaN}]}',
+    b'{"key": "normal/0", "rows": [{"colour": "green", "depth_m": 0.1, "strehl": [1e999]}]}',
+]
+
+
 def test_a_damaged_line_is_named(ask: Callable[..., Study], tmp_path: Path):
     (tmp_path / "out").mkdir()
     ask(out=tmp_path / "out").monte_carlo(1)
     path = tmp_path / "out" / "draws.jsonl"
-    path.write_bytes(b"[1]\n" + path.read_bytes())
-    with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished draw.*Remove"):
+    whole = path.read_bytes()
+    for line in DAMAGED:
+        path.write_bytes(line + b"\n" + whole)
+        with pytest.raises(InputError, match=r"draws\.jsonl, line 1: must be one finished draw.*Remove"):
+            ask(out=tmp_path / "out").monte_carlo(2)
+
+
+def test_draws_that_are_a_link_are_refused_and_left_alone(ask: Callable[..., Study], tmp_path: Path):
+    ask(out=tmp_path / "out").monte_carlo(1)
+    letter, path = tmp_path / "letter.txt", tmp_path / "out" / "draws.jsonl"
+    letter.write_text("mine, without an end of line")
+    path.unlink()
+    path.symlink_to(letter)
+    with pytest.raises(InputError, match=r"draws\.jsonl: must be a file of its own, but got a link"):
         ask(out=tmp_path / "out").monte_carlo(2)
+    assert letter.read_text() == "mine, without an end of line"
 
 
 SCRIPT = """

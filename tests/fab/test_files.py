@@ -14,6 +14,7 @@ from fab.errors import CheckFailed, InputError
 from fab.files import (
     atomic_folder,
     canonical_json,
+    read_bytes,
     read_json,
     read_npy,
     sha256_bytes,
@@ -168,6 +169,40 @@ def test_read_json_refuses_what_is_no_object(tmp_path, content):
         read_json(path)
     with pytest.raises(InputError, match="must exist"):
         read_json(tmp_path / "missing.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"a": 1, "a": 2}', "the key 'a' stands twice"),
+        ('{"a": {"b": NaN}}', "NaN is no number"),
+        ('{"a": -Infinity}', "Infinity is no number"),
+        ('{"a": ' + "[" * 100_000, "brackets without end"),
+        ('{"a": ' + "1" * 5000 + "}", "4300 digits"),
+    ],
+)
+def test_read_json_takes_nothing_ambiguous(tmp_path, text, words):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_json(path)
+
+
+@pytest.mark.parametrize("read", [read_bytes, read_json, read_npy, sha256_file])
+def test_what_is_no_file_is_refused_at_once(tmp_path, read):
+    """A pipe that nobody writes to would be waited for."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: must be a file, but got a pipe, socket or device"):
+        read(tmp_path / "pipe")
+    with pytest.raises(InputError, match="the path must be a file"):
+        read(tmp_path)
+
+
+def test_a_file_beyond_the_limit_is_refused(tmp_path):
+    (tmp_path / "large").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "large", 5) == b"12345"
+    with pytest.raises(InputError, match="must have at most 4 bytes, but got 5"):
+        read_bytes(tmp_path / "large", 4)
 
 
 def test_read_npy_round_trip(tmp_path):

@@ -198,6 +198,14 @@ def test_hosts_that_cannot_be(given: tuple[Any, ...], words: str) -> None:
         join_hosts(*given)
 
 
+def test_host_0_listens_on_the_address_it_was_given_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *arguments, **more: given.append((*arguments, more)))
+    join_hosts("127.0.0.1:1234", 2, 0, wait_s=5)
+    bound = {"coordinator_bind_address": "127.0.0.1:1234", "initialization_timeout": 5}
+    assert given == [("127.0.0.1:1234", 2, 0, bound)]
+
+
 def test_a_host_that_finds_nobody() -> None:
     """It says so, and does not wait for ever."""
     with socket.socket() as taken:
