@@ -8,6 +8,7 @@ What the operating system refuses is an `InputError` that names the path.
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 import stat
@@ -204,8 +205,13 @@ def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return value
 
 
-def _no_number(word: str) -> None:
-    raise ValueError(f"{word} is no number of JSON")
+def _non_finite(value: object, key: str = "") -> tuple[str, float] | None:
+    """Find the first NaN or infinity of a parsed JSON value, with the dotted key it stands at."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else (key, value)
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    found = (_non_finite(part, f"{key}.{name}" if key else str(name)) for name, part in inner)
+    return next((one for one in found if one is not None), None)
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -213,13 +219,16 @@ def read_json(path: str | Path) -> dict[str, Any]:
     cure = "Write it again from its source."
     text = read_bytes(path, 1 << 28)
     try:
-        value = json.loads(text, object_pairs_hook=_unlike, parse_constant=_no_number)
+        value = json.loads(text, object_pairs_hook=_unlike)
+        wrong = _non_finite(value)
     except RecursionError as error:
         raise InputError(str(path), "the file must be JSON", "brackets without end", cure) from error
     except ValueError as error:
         raise InputError(str(path), "the file must be JSON", str(error), cure) from error
     if not isinstance(value, dict):
         raise InputError(str(path), "the file must hold one JSON object", type(value).__name__, cure)
+    if wrong is not None:
+        raise InputError(f"{path}: {wrong[0]}", "must be a finite number", wrong[1], cure)
     return value
 
 
