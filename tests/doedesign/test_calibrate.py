@@ -211,6 +211,7 @@ def test_a_picture_the_wrong_way_up_is_noticed(tmp_path: Path):
     assert any("turned left by 2 more quarter turns" in remark for remark in result.remarks)
 
 
+@pytest.mark.slow
 def test_an_error_beyond_its_range_ends_at_the_end(tmp_path: Path):
     """Believed to a tenth of what it is, the error is looked for no further than five standard deviations."""
     design, _ = small()

@@ -167,6 +167,7 @@ def test_gradient_of_the_heights_by_the_depths(softness: float) -> None:
     np.testing.assert_allclose(through, weight * staircase.metres_per_radian, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_whole_chain_by_the_depths() -> None:
     spec = load_spec(QUICK, [*SMALL, *CHOSEN])
     problem, scene = problem_of(spec, {})

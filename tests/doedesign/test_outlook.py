@@ -123,6 +123,7 @@ def test_compensated_masks_bring_the_expected_plate_back(design):
     assert predict_sheet(design, process, 550e-9).predictions.expected[0].strehl < 0.99
 
 
+@pytest.mark.slow
 def test_the_largest_error_matters_most(design):
     spreads = {
         "overlay_x_m[3]": Normal(0.0, 0.4 * UM),

@@ -82,6 +82,7 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 ASKED: dict[str, Any] = {"obstruction": "dirt", "occlusion": "radiometric", "size": 32}
 
 
+@pytest.mark.slow
 def test_in_memory_and_in_files_the_same(run: Path, design: Design, picture: Path, monkeypatch: pytest.MonkeyPatch):
     """The function and the command take the same capture; so do a file and its values."""
     shot = simulate(picture, design, **ASKED, seed=3)

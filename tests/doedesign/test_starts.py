@@ -62,6 +62,7 @@ def test_random_is_seeded_and_uniform_over_one_wave() -> None:
     assert height.mean() / wave == pytest.approx(0.5, abs=0.006)
 
 
+@pytest.mark.slow
 def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
     depth = 0.2
 

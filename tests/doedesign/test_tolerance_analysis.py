@@ -199,6 +199,7 @@ def test_one_at_a_time_finds_slope_and_curvature(ask: Callable[..., Study]):
     assert changes["overlay_x_m[0]", "zeroth_order", None].variance == 0
 
 
+@pytest.mark.slow
 def test_shares_of_variance_agree_with_those_worked_out(ask: Callable[..., Study]):
     asked = ask()
     # The far spot is 0.4 - two depth errors of 0.02 - |z| 0.02.

@@ -98,7 +98,7 @@ def test_the_worst_place_is_inside_the_window_even_at_the_rim():
         assert rows.stop - rows.start == columns.stop - columns.start == 40
 
 
-@pytest.mark.parametrize("levels", [Levels(2, 600e-9), Levels(64, 20e-9)])
+@pytest.mark.parametrize("levels", [pytest.param(Levels(2, 600e-9), marks=pytest.mark.slow), Levels(64, 20e-9)])
 @pytest.mark.parametrize("shape", [(1, 1), (7, 30), (61, 44)])
 def test_any_number_of_masks_and_any_shape(levels, shape):
     level_map = np.random.default_rng(1).integers(0, levels.count, shape).astype(np.uint8)

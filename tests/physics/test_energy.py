@@ -32,6 +32,7 @@ def coverage_of(cells: int) -> np.ndarray:
     return circle_coverage(Grid((cells, cells), 1.0), float(cells))
 
 
+@pytest.mark.slow
 def test_no_period_of_the_spectrum_counts_twice():
     """Windows of one, two and three bands of a wrapped plate hold what Parseval leaves them."""
     cells, aperture, focal = 96, 0.192e-3, 0.3e-3

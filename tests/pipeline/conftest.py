@@ -4,7 +4,10 @@ Tests that change something work on a copy.
 """
 
 import contextlib
+import fcntl
 import io
+import json
+import os
 import shutil
 import subprocess
 import sys
@@ -121,10 +124,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="session")
-def finished(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """The results of optimize, masks, verify and psf. Not to be changed."""
-    folder = tmp_path_factory.mktemp("finished")
+def finish(tiny: Path, folder: Path) -> None:
+    """Make a run, its order and its PSFs in a new folder, and write down what the commands said."""
+    folder.mkdir()
     run, order = folder / "run", folder / "order"
     said = {
         "optimize": run_here("optimize", tiny, "--out", run),
@@ -133,7 +135,22 @@ def finished(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
         "psf": run_here("psf", run, "--masks", order, "--json"),
     }
     assert {name: done.code for name, done in said.items()} == dict.fromkeys(said, 0), said
-    return Finished(run, order, said)
+    (folder / "said.json").write_text(json.dumps(said))
+
+
+@pytest.fixture(scope="session")
+def finished(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The results of optimize, masks, verify and psf, made once for all processes of a session. Not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = tmp_path_factory.getbasetemp().parent / "finished"
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "said.json").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            finish(tiny, folder)
+    said = {name: Done(*done) for name, done in json.loads((folder / "said.json").read_text()).items()}
+    return Finished(folder / "run", folder / "order", said)
 
 
 @pytest.fixture

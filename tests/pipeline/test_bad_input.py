@@ -385,6 +385,7 @@ def mask_files(order: Path) -> list[str]:
     return sorted(path.name for path in order.iterdir() if path.suffix in (".gds", ".oas"))
 
 
+@pytest.mark.slow
 def test_one_flipped_byte_fails_verify_and_is_named(copied, cli):
     rng = np.random.default_rng(11)
     names = [*mask_files(copied.order), "DOE_TINY_LEVELS.npy", "DOE_TINY_PREVIEW.png"]

@@ -141,6 +141,7 @@ def test_masks_and_psf_replace_their_earlier_results(copied, cli, content):
 
 
 @pytest.mark.usefixtures("without_pictures")
+@pytest.mark.slow
 def test_folders_are_called_after_the_design(tiny, cli, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "--set=name=plate_1.2-b"

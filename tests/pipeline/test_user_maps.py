@@ -77,7 +77,7 @@ def test_a_marked_place_stays_where_it_is(cli, tmp_path, kind, shape):
 
 
 @pytest.mark.parametrize(
-    "kind", [kind if kind in ("npy", "exr", "png") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+    "kind", [kind if kind in ("npy", "exr") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 )
 def test_every_kind_draws_the_same_masks(cli, tmp_path, rng, kind):
     shape = (37, 52)
@@ -118,7 +118,7 @@ def test_odd_shapes(cli, tmp_path, rng, shape):
     [
         ("My lens (v2)", "My_lens__v2", "MY_LENS_V2"),
         pytest.param("Linse-Größe", "Linse_Gr__e", "LINSE_GR_E", marks=pytest.mark.slow),
-        ("плата", "height", "HEIGHT"),
+        pytest.param("плата", "height", "HEIGHT", marks=pytest.mark.slow),
         pytest.param("…", "height", "HEIGHT", marks=pytest.mark.slow),
     ],
 )
@@ -131,6 +131,7 @@ def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):
     assert (tmp_path / "masks" / folder / f"DOE_{order_id}_ALL.gds").is_file()
 
 
+@pytest.mark.slow
 def test_a_map_may_say_more_than_its_file(cli, tmp_path):
     write_height(tmp_path / "plate.exr", np.full((20, 20), FULL_M), 2e-6, 40e-6)
     levels = ("--levels", LEVELS, "--step", "75 nm", "--out", tmp_path / "order")

@@ -138,6 +138,7 @@ def test_a_plate_at_rest_has_the_psf_of_the_bank() -> None:
 # --- the capture -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_capture_has_the_gradient_of_its_plate() -> None:
     """By central differences along one direction, with the heights unrounded."""
     made, plate = live("optimize.sampling=exact")

@@ -38,6 +38,7 @@ def test_stride_two_keeps_every_other_pixel() -> None:
     np.testing.assert_allclose(convolution(image, weights, 2), convolution(image, weights)[:, ::2, ::2], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_half_precision_misses_by_its_rounding() -> None:
     image = jax.random.normal(jax.random.key(0), (1, 16, 16, 8))
     weights = jax.random.normal(jax.random.key(1), (3, 3, 8, 8))

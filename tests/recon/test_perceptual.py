@@ -148,7 +148,10 @@ def pictures(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[np.ndarr
     return a.astype(np.float32), b.clip(0, 1).astype(np.float32)
 
 
-@pytest.mark.parametrize(("backbone", "side"), [*((name, SIDE) for name in BACKBONES), ("squeeze", (25, 36))])
+@pytest.mark.parametrize(
+    ("backbone", "side"),
+    [*(pytest.param(name, SIDE, marks=pytest.mark.slow) for name in BACKBONES), ("squeeze", (25, 36))],
+)
 def test_is_the_reference_graph(made, rng, backbone: str, side: tuple[int, int]):
     model, weights = made[backbone]
     a, b = pictures(rng, (2, 3, *side))

@@ -50,6 +50,7 @@ def walk(
 # --- the loss falls --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_optics_and_network_learn_together(joint: Trainer) -> None:
     before = joint.initial(heights())
     network, free = numbers(before.network), numbers(before.free)

@@ -100,9 +100,9 @@ def plot(name: str, ax: Axes | None = None) -> Axes | FigureBase:
 @pytest.mark.parametrize(
     "name",
     [
-        "histograms",
         "found",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("yield", "one_at_a_time", "sobol", "bare", "beyond")),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("histograms", "yield", "one_at_a_time")),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("sobol", "bare", "beyond")),
     ],
 )
 def test_a_picture_is_whole_and_the_same_whatever_the_user_has_set(name: str):

@@ -63,7 +63,8 @@ def plot(name: str, **more) -> FigureBase:
             return plot_pattern(energy[0, 0], energy[0, 1], CAMERA, efficiency=0.9, uniformity=0.8, **more)
 
 
-NAMES = ("psfs", "encircled", "pattern", *(pytest.param(name, marks=pytest.mark.slow) for name in ("mtf", "split")))
+SLOW = ("psfs", "mtf", "split")
+NAMES = ("encircled", "pattern", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -100,6 +100,7 @@ def test_the_wavelengths_are_those_of_the_camera_once_each_or_those_asked_for(le
     assert only.transmission.shape == (1, CELLS, CELLS)
 
 
+@pytest.mark.slow
 def test_errors_that_vanish_lead_to_the_plate_as_drawn(level: np.ndarray):
     """Cut, rounded and tilted, but by next to nothing: the whole machinery against the height map."""
     tiny = Variation(
