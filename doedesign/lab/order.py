@@ -103,6 +103,16 @@ def write_masks(
     return write_planned(Path("masks") / level_map.name if out is None else out, order, add=add)
 
 
+def drawn_as(order: WrittenOrder) -> str:
+    """What every pixel of an order was proved to be, as the last step before drawing left it."""
+    source, count = order.manifest.source, order.manifest.levels
+    if "repair" in source:
+        return "as repaired"
+    if "rounded" in source:
+        return f"as rounded to {count} levels, not as designed with {source['rounded']['designed_levels']}"
+    return f"as the map rounded to {count} levels" if source.get("kind") == "height map" else "as designed"
+
+
 def _run_sheet(
     design: Design | None, folder: Path, order: Order, frame: Frame, probe_m: float
 ) -> tuple[RunSheet, bytes | None]:

@@ -162,8 +162,8 @@ class Chrome:
     """The chrome around the clear aperture, as it is drawn.
 
     Attributes:
-        overlap_m: how far the chrome reaches inside the clear aperture, metres, so that the edge of the relief stays
-            covered when the chrome is aligned a little off.
+        overlap_m: how far the chrome reaches over the edge of the relief, metres, so that it stays covered
+            when the chrome is aligned a little off.
         outer_m: outer radius, metres; by default the corners of the raster and half a millimetre more.
         chord_error_m: largest distance between the circles and their chords, metres.
     """

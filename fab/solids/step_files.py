@@ -27,13 +27,13 @@ def _write_die(path: Path, model: DoeModel) -> ModelEntry:
     glass = Substrate("die", model.die_m, model.wafer.thickness_m)
     chrome = ChromeRing(*model.chrome.radii_m(level_map))
     levels_of_rings, rings = ring_levels(level_map), None
-    about = "millimetres; one die, relief plane at z = 0, where the clear aperture is drawn flat"
+    about = "millimetres; one die, relief plane at z = 0, where the relief is drawn flat"
     if levels_of_rings is not None:
         rings = rings_from_levels(levels_of_rings, level_map)
         share = 100 * pixel_share(level_map, levels_of_rings)
         about = (
             f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
-            f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
+            f"the masks draw them in pixels, with another height on {share:.2g} % of the relief"
         )
     substrate_step(path, glass, level_map.aperture_m, chrome, rings)
     return model_entry(path, about, substrate_bodies(glass, chrome, rings), _RELATIVE_ERROR)
