@@ -104,7 +104,7 @@ def write_masks(
 
 
 def drawn_as(order: WrittenOrder) -> str:
-    """What every pixel of an order was proved to be, as the last step before drawing left it."""
+    """Words on the level map that an order was proved to draw: as designed, rounded or repaired."""
     source, count = order.manifest.source, order.manifest.levels
     if "repair" in source:
         return "as repaired"
