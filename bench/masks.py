@@ -32,7 +32,7 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verification.verify import read_drawn_levels
+from fab.verification.files import read_drawn_levels
 
 LEVELS = Levels(16, 75 * NM)
 _CHUNK = bytes(1 << 22)

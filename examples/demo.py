@@ -22,8 +22,8 @@ from doedesign.optimization import optimize
 from doedesign.runs.psfs import psfs
 from doedesign.spec import load_spec
 from fab.files import MANIFEST_NAME, read_json
+from fab.order.verify import verify
 from fab.units import format_length
-from fab.verification.verify import verify
 
 HERE = Path(__file__).parent
 

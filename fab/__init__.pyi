@@ -9,6 +9,7 @@ from .level_map import LevelMap as LevelMap
 from .level_map import read_level_map as read_level_map
 from .level_map import write_level_map as write_level_map
 from .levels import Levels as Levels
+from .order.verify import verify as verify
 from .order.write import WrittenOrder as WrittenOrder
 from .order.write import write_order as write_order
 from .process import Defects as Defects
@@ -24,5 +25,4 @@ from .solids.patch import Patch as Patch
 from .stock import STOCK as STOCK
 from .stock import process_from as process_from
 from .units import metres as metres
-from .verification.verify import VerificationReport as VerificationReport
-from .verification.verify import verify as verify
+from .verification.report import VerificationReport as VerificationReport

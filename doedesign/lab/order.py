@@ -13,21 +13,14 @@ from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
 from doedesign.spec import ProcessSpec, WaferSpec, load_process, load_wafer
 from fab.errors import InputError
-from fab.figure import save
-from fab.files import sha256_file
-from fab.layout.frame import Frame
 from fab.layout.geometry import Chrome
-from fab.layout.marks import alignment_site
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.order import Order, plan_order
 from fab.order.write import WrittenOrder, write_planned
-from fab.plots.marks import plot_part
-from fab.plots.wafer import plot_wafer
 from fab.process import Process, Variation
-from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
-from fab.runsheet.write import write_run_sheet
+from fab.runsheet.tables import SheetPrediction
 from fab.solids.patch import Patch
 
 log = logging.getLogger("doedesign")
@@ -79,77 +72,24 @@ def write_masks(
         source=origin,
         on_violation=on_violation,
         waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),
+        papers=True,
     )
     if order.repair is not None and design is not None:
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}
         order = replace(order, source={**order.source, "repair": repair})
 
-    def add(fresh: Path, order: Order, frame: Frame) -> list[str]:
-        wafer, marks, name = (f"{order.stem}_{what}.png" for what in ("WAFER", "MARKS", "RULES"))
-        dbu_m, aperture_m = order.dbu_m, order.level_map.aperture_m
-        title = f"{order.stem}: what lies where"
-        save(plot_wafer(order.wafer, frame, aperture_m, dbu_m, title), fresh / wafer)
-        site = alignment_site(order.photomasks, dbu_m)
-        title = f"{order.stem}: alignment site, every mask in its colour"
-        save(plot_part(site, order.photomasks, title), fresh / marks)
-        log.info("writing the run sheet")
-        sheets = write_run_sheet(fresh, *_run_sheet(design, fresh, order, frame, probe_m))
-        if order.rules.clean:
-            return [wafer, marks, *sheets]
-        title = f"{order.stem}: where the masks break the rules of {made_by.name}"
-        save(order.rules.plot(title=title), fresh / name)
-        return [wafer, marks, *sheets, name]
-
-    return write_planned(Path("masks") / level_map.name if out is None else out, order, add=add)
-
-
-def drawn_as(order: WrittenOrder) -> str:
-    """Words on the level map that an order was proved to draw: as designed, rounded or repaired."""
-    source, count = order.manifest.source, order.manifest.levels
-    if "repair" in source:
-        return "as repaired"
-    if "rounded" in source:
-        return f"as rounded to {count} levels, not as designed with {source['rounded']['designed_levels']}"
-    return f"as the map rounded to {count} levels" if source.get("kind") == "height map" else "as designed"
-
-
-def _run_sheet(
-    design: Design | None, folder: Path, order: Order, frame: Frame, probe_m: float
-) -> tuple[RunSheet, bytes | None]:
-    """The run sheet of an order in the making, and the picture of what the lab should see."""
-    moves_m = [move * order.dbu_m for move in order.edge_moves()]
-    found = None
-    if design is not None and design.spec is not None:
-        drawn = replace(design, level_map=order.level_map)
+    def predicted(order: Order) -> SheetPrediction | None:
+        if design is None or design.spec is None:
+            return None
+        drawn, design_m = replace(design, level_map=order.level_map), design.spec.optics.design_wavelength_m
+        moves_m = [move * order.dbu_m for move in order.edge_moves()]
         try:
-            found = predict_sheet(drawn, order.process, design.spec.optics.design_wavelength_m, probe_m, moves_m)
+            return predict_sheet(drawn, order.process, design_m, probe_m, moves_m)
         except InputError as error:
             log.warning("the run sheet says nothing of the light: %s", error)
-    files = {
-        photomask.name: PhotomaskFile(
-            file=f"{order.photomask_stem(photomask)}.gds",
-            sha256=sha256_file(folder / f"{order.photomask_stem(photomask)}.gds"),
-            cell=order.photomask_stem(photomask),
-            edge_move_m=0.0 if photomask.bit is None else moves_m[photomask.bit],
-        )
-        for photomask in order.photomasks
-    }
-    sheet = RunSheet(
-        stem=order.stem,
-        level_map=order.level_map,
-        photomasks=order.photomasks,
-        files=files,
-        process=order.process,
-        opening_m=2 * order.chrome.radii_m(order.level_map)[0],
-        wafer=order.wafer,
-        places=frame.places,
-        dies=tuple(
-            Die(f"die {number}", x, y, order.splits[split].words)
-            for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
-        ),
-        predictions=None if found is None else found.predictions,
-    )
-    return sheet, None if found is None else found.picture
+            return None
+
+    return write_planned(Path("masks") / level_map.name if out is None else out, order, predict=predicted)
 
 
 def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Process:

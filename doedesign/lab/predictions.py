@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +26,7 @@ from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.process import Normal, Process, Variation, deviation_of
-from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions
+from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions, SheetPrediction
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.material import full_wave_wavelength_m, refractive_index
@@ -124,13 +124,6 @@ def _measured(error: str) -> str:
     if bracket:
         return f"{name} of mask {int(mask.removesuffix(']')) + 1}"
     return f"{name} of every mask" if key.startswith("common_") else name
-
-
-class SheetPrediction(NamedTuple):
-    """Predictions on the sheet, and a PNG of the PSFs of the DOE with the process's mean errors."""
-
-    predictions: Predictions
-    picture: bytes
 
 
 def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:

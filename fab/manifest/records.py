@@ -22,7 +22,7 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, UM
 
-FORMAT = "doedesign mask order 1"
+FORMAT = "doedesign mask order 2"
 
 # Nothing is converted: a number in quotes is no number.
 _STRICT = ConfigDict(strict=True, extra="forbid")
@@ -183,12 +183,17 @@ class ChromeEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class Manifest:
-    """A whole mask order; `source` says where the level map came from, in the words of who asked."""
+    """A whole mask order.
+
+    `source` says where the level map came from, in the words of who asked. All but it and the versions of the tools
+    follows from `request` (`fab.order.request`) and the level numbers.
+    """
 
     format: str
     name: str
     source: dict[str, Any]
     conventions: dict[str, Any]
+    request: dict[str, Any]
     levels: int
     step_nm: float
     shape: list[int]
@@ -235,7 +240,7 @@ class Manifest:
 
     @property
     def aperture_m(self) -> float:
-        """Diameter of the relief, metres; light passes the opening of the chrome, the clear aperture."""
+        """Diameter of the clear aperture, metres."""
         return round(self.aperture_mm * MM, 18)
 
     def to_json(self) -> bytes:

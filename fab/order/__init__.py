@@ -1,6 +1,10 @@
-"""A mask order: from numbers to the folder that goes to the lab.
+"""A mask order: from numbers to the folder that goes to the lab, and its proof.
 
 order         Order: what is drawn, for whom, and what everything is called
+request       the order as its manifest records it, and back
+drawing       everything that is drawn and stated, before anything is written
 entries       entries of the manifest
-write         the folder, its manifest, and its proof
+papers        pictures and the run sheet
+write         the folder and its manifest
+verify        the proof from the folder alone
 """

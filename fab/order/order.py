@@ -17,6 +17,7 @@ from fab.level_map import LevelMap
 from fab.process import Process
 from fab.rules.check import RulesReport, check
 from fab.rules.repair import Repair, repaired
+from fab.runsheet.tables import Predictions
 from fab.solids.patch import Patch
 from fab.stock import process_from
 from fab.units import NM
@@ -33,9 +34,19 @@ OnViolation = Literal["warn", "fail", "fix"]
 _LONGEST_ID = 13
 
 
+@dataclass(frozen=True)
+class Light:
+    """Predictions of the light for the run sheet, and the digest of the PNG of the PSFs that goes with them."""
+
+    predictions: Predictions
+    picture_sha256: str
+
+
 @dataclass(frozen=True, eq=False)
 class Order:
     """A mask order in numbers, before it becomes files.
+
+    All files follow from it, so that `fab.order.verify` can say from the manifest what each of them has to hold.
 
     Attributes:
         rules: the level map to draw, checked against what the process prints.
@@ -45,6 +56,8 @@ class Order:
         source: where the level map came from, for the manifest; JSON values only.
         patch: a window that is wanted as a solid at full resolution, if any.
         repair: how the level map was changed for the process to print it, if it was.
+        papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
+        light: what the run sheet says of the light, if anything.
     """
 
     rules: RulesReport
@@ -54,6 +67,8 @@ class Order:
     source: Mapping[str, Any] = field(default_factory=dict)
     patch: Patch | None = None
     repair: Repair | None = None
+    papers: bool = False
+    light: Light | None = None
 
     @property
     def level_map(self) -> LevelMap:
@@ -118,8 +133,9 @@ def plan_order(
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
+    papers: bool = False,
 ) -> Order:
-    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order`."""
+    """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`."""
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
     inside = level_map.level[level_map.grid.inside_circle(level_map.aperture_m)]
@@ -130,7 +146,7 @@ def plan_order(
     if on_violation == "fail" and not report.printable:
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    order = Order(report, made_by, wafer or Wafer(), chrome or Chrome(), source or {}, patch)
+    order = Order(report, made_by, wafer or Wafer(), chrome or Chrome(), source or {}, patch, papers=papers)
     if on_violation == "fix" and not report.clean:
         log.info("repairing the level map")
         repair = repaired(report, waves_per_metre)

@@ -7,165 +7,87 @@
     DOE_<ID>_LEVELS.npy             the level map (uint8, row 0 at the lowest y)
     DOE_<ID>_PREVIEW.png            a picture for people
     manifest.json                   what each file is, its digest, its geometry
-    ...                             solids and height maps (`fab.solids.write`); what the caller adds
+    ...                             solids and height maps (`fab.solids.write`), papers (`fab.order.papers`)
 
 The folder appears at its final path only after everything in it was read back and found equal to the
 level map.
 """
 
 import logging
-import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fab.errors import InputError
-from fab.figure import html_of, save
-from fab.files import MANIFEST_NAME, atomic_folder, sha256_file
+from fab.figure import html_of
+from fab.files import MANIFEST_NAME, atomic_folder, sha256_bytes, sha256_file, write_atomic
 from fab.gds.writer import write_gds, write_oasis
-from fab.layout.doe import mask_layout
-from fab.layout.frame import Frame, draw_frame
-from fab.layout.geometry import Cell, Chrome, Layer, Layout, merged, pixel_edges
+from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
-from fab.manifest.cells import cell_entry
-from fab.manifest.records import CONVENTIONS, FORMAT, CellEntry, FileEntry, Manifest, read_manifest
-from fab.order.entries import chrome_entry, describe_edges, mask_entry, photomask_entry, split_entries, wafer_entry
-from fab.order.order import OnViolation, Order, plan_order
+from fab.manifest.records import Manifest, read_manifest
+from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
+from fab.order.order import Light, OnViolation, Order, plan_order
+from fab.order.papers import papers
+from fab.order.verify import verify
 from fab.process import Process
-from fab.solids.model import DoeModel
+from fab.runsheet.tables import SheetPrediction
 from fab.solids.patch import Patch
 from fab.solids.write import write_models
-from fab.units import MM, NM, UM
-from fab.verification.verify import VerificationReport, verify
+from fab.verification.report import VerificationReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
 log = logging.getLogger("doedesign")
-_TOOLS = ("numpy", "numba", "klayout", "gdstk", "matplotlib")
-
-Add = Callable[[Path, Order, Frame], Sequence[str]]
 
 
-def mask_file(layout: Layout, layer: Layer, top: str) -> Layout:
-    """Return the drawing of one photomask: one layer number, every datatype of it merged onto datatype 0."""
-    cells = []
-    for cell in layout.cells:
-        parts = [shapes for other, shapes in cell.shapes.items() if other.number == layer.number and len(shapes)]
-        name = top if cell is layout.top else cell.name
-        cells.append(Cell(name, {layer: merged(parts)} if parts else {}, cell.references))
-    return Layout(layout.dbu_m, tuple(cells))
+Predict = Callable[[Order], SheetPrediction | None]
 
 
-def _around(order: Order, layout: Layout) -> list[CellEntry]:
-    """Return the manifest's entries of every cell but those of the DOE, which come first."""
-    return [cell_entry(cell, layout.dbu_m) for cell in layout.cells[len(order.splits) :]]
-
-
-def _file_entry(
-    path: Path, kind: str = "", cell: str | None = None, layers: Sequence[Layer] = (), cells: Sequence[CellEntry] = ()
-) -> FileEntry:
-    """Return the manifest's entry of a file; that of a mask file has a top cell, DOE layers and other cells, too."""
-    named = [str(layer) for layer in layers]
-    size, digest = path.stat().st_size, sha256_file(path)
-    return FileEntry(path.name, kind or path.suffix[1:].upper(), size, digest, cell, named, list(cells))
-
-
-def _write_masks(
-    folder: Path, order: Order, layout: Layout, doe_layers: list[Layer], gds: str, oasis: str
-) -> list[FileEntry]:
+def _write_masks(folder: Path, drawing: DrawnOrder) -> None:
     """Write the review files and one file per mask."""
+    order, layout = drawing.order, drawing.layout
+    gds, oasis = (folder / f"{order.stem}_ALL.{ending}" for ending in ("gds", "oas"))
     log.info("writing GDSII")
-    write_gds(folder / gds, layout)
-    review = (layout.top.name, doe_layers, _around(order, layout))
-    entries = [_file_entry(folder / gds, "GDSII", *review)]
+    write_gds(gds, layout)
     for photomask in order.photomasks:
-        name, layer = order.photomask_stem(photomask), Layer(photomask.layer)
-        one = mask_file(layout, layer, name)
-        write_gds(folder / f"{name}.gds", one)
-        on = [layer] if layer in doe_layers else []
-        entries.append(_file_entry(folder / f"{name}.gds", "GDSII", name, on, _around(order, one)))
+        write_gds(folder / f"{order.photomask_stem(photomask)}.gds", drawing.plate(photomask))
     log.info("writing OASIS")
-    write_oasis(folder / oasis, folder / gds, layout.layers)
-    return [*entries, _file_entry(folder / oasis, "OASIS", *review)]
+    write_oasis(oasis, gds, layout.layers)
 
 
-def _write_files(folder: Path, order: Order, add: Add) -> Manifest:
+def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:
     """Write everything but the manifest, and return it."""
-    level_map = order.level_map
-    levels, grid = level_map.levels, level_map.grid
     log.info("drawing the masks")
-    does = [
-        mask_layout(level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
-        for split in order.splits
-    ]
-    drawn = Layout(does[0].dbu_m, tuple(one.top for one in does))
-    dbu_m = drawn.dbu_m
-    frame = draw_frame(
-        order.wafer,
-        order.photomasks,
-        level_map,
-        splits=order.splits,
-        stem=order.stem,
-        minimum_line_m=order.process.minimum_line_m,
-        chrome_m=2 * order.chrome.radii_m(level_map)[1],
-        dbu_m=dbu_m,
-    )
-    splits = split_entries(order, drawn, frame)
-    layout = Layout(dbu_m, (*drawn.cells, *frame.cells))
-    doe_cell, doe_layers = drawn.cells[0].name, list(drawn.cells[0].shapes)
-    masks = [mask_entry(order, layout, bit, plane) for bit, plane in enumerate(level_map.planes())]
-    chrome = chrome_entry(order, layout)
-    endings = ("ALL.gds", "ALL.oas", "LEVELS.npy", "PREVIEW.png")
-    gds, oasis, levels_file, preview = (f"{order.stem}_{end}" for end in endings)
-    files = _write_masks(folder, order, layout, doe_layers, gds, oasis)
-    del does, drawn, layout
-    log.info("drawing the preview")
-    np.save(folder / levels_file, level_map.level, allow_pickle=False)
-    save(order.plot(), folder / preview)
+    drawing = draw(order)
+    _write_masks(folder, drawing)
+    np.save(folder / f"{order.stem}_LEVELS.npy", order.level_map.level, allow_pickle=False)
     log.info("drawing the solids")
-    model = DoeModel(level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
-    # What is added takes long where it follows light; the solids are drawn meanwhile.
+    # What follows light takes long; the solids are drawn meanwhile.
     with ThreadPoolExecutor(1) as pool:
-        solids = pool.submit(write_models, folder, order.stem, model)
-        added = add(folder, order, frame)
+        solids = pool.submit(write_models, folder, order.stem, drawing.model)
+        seen = predict(order) if order.papers else None
         models = solids.result()
-    files += [_file_entry(folder / name) for name in (*(m.file for m in models), *added, levels_file, preview)]
-    return Manifest(
-        format=FORMAT,
-        name=level_map.name,
-        source=dict(order.source),
-        conventions=CONVENTIONS,
-        levels=levels.count,
-        step_nm=round(levels.step_m / NM, 9),
-        shape=list(grid.shape),
-        pitch_um=round(grid.pitch_m / UM, 12),
-        aperture_mm=round(level_map.aperture_m / MM, 9),
-        dbu_nm=round(dbu_m / NM, 9),
-        pixel_edges=describe_edges(pixel_edges(grid)),
-        level_map_file=levels_file,
-        level_map_sha256=level_map.digest,
-        combined_gds=gds,
-        combined_oasis=oasis,
-        preview=preview,
-        doe_cell=doe_cell,
-        plates=[photomask_entry(order, photomask) for photomask in order.photomasks],
-        wafer=wafer_entry(order, frame),
-        rules=order.rules.as_record(),
-        masks=masks,
-        splits=splits,
-        chrome=chrome,
-        models=models,
-        files=files,
-        tools={"python": platform.python_version(), **{tool: version(tool) for tool in _TOOLS}},
-    )
+    if seen is not None:
+        light = Light(seen.predictions, sha256_bytes(seen.picture))
+        drawing = replace(drawing, order=replace(order, light=light))
+    log.info("drawing the pictures")
+    plates = {
+        f"{stem}.gds": sha256_file(folder / f"{stem}.gds") for stem in map(order.photomask_stem, order.photomasks)
+    }
+    for name, content in papers(drawing, plates, seen and seen.picture).items():
+        write_atomic(folder / name, content())
+    files = [
+        replace(entry, bytes=(folder / entry.file).stat().st_size, sha256=sha256_file(folder / entry.file))
+        for entry in file_entries(drawing, models)
+    ]
+    return manifest_of(drawing, models, files, tools())
 
 
 def _require_own(folder: Path) -> None:
@@ -240,15 +162,15 @@ def write_order(
     return write_planned(folder, order)
 
 
-def write_planned(folder: str | Path, order: Order, *, add: Add = lambda *_: ()) -> WrittenOrder:
+def write_planned(folder: str | Path, order: Order, *, predict: Predict = lambda _: None) -> WrittenOrder:
     """Write an order of `plan_order`, and prove it; see `write_order`.
 
-    What needs light is written by `add`, which puts further files into the folder and returns their names.
+    The light that its run sheet speaks of comes from `predict`.
     """
     folder = Path(folder)
     _require_own(folder)
     with atomic_folder(folder) as fresh:
-        manifest = _write_files(fresh, order, add)
+        manifest = _write_files(fresh, order, predict)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
         log.info("reading everything back")
         report = verify(fresh)

@@ -89,6 +89,13 @@ class Predictions:
     ranking: tuple[Importance, ...] = ()
 
 
+class SheetPrediction(NamedTuple):
+    """Predictions on the sheet, and a PNG of the PSFs of the DOE with the process's mean errors."""
+
+    predictions: Predictions
+    picture: bytes
+
+
 @dataclass(frozen=True)
 class RunSheet:
     """Everything that stands on the sheet.

@@ -34,6 +34,9 @@ _FEWEST_ZEMAX = 5
 _SAG_CELLS = 500
 _ROWS = 256
 
+_Write = Callable[[Path, LevelMap], float]
+_Read = Callable[[Path], NDArray[Any]]
+
 
 def _description(level_map: LevelMap, metres_per_count: float, counts: NDArray[np.int64]) -> str:
     levels = level_map.levels
@@ -130,22 +133,30 @@ def write_zemax_sag(
     write_atomic(path, b"".join([header.encode(), *body]))
 
 
-def _write(path: Path, model: DoeModel, content: str, write: Callable[[Path, LevelMap], float]) -> ModelEntry:
-    return model_entry(path, content, metres_per_count=write(path, model.level_map))
+def _window(level_map: LevelMap) -> PixelWindow | None:
+    """Return the middle of the map, as far as a grid sag shows it; None if it has too few points."""
+    (ny, nx), (rows, columns) = level_map.shape, (min(n, _SAG_CELLS) for n in level_map.shape)
+    return (
+        None
+        if min(rows, columns) < _FEWEST_ZEMAX
+        else PixelWindow((ny - rows) // 2, (nx - columns) // 2, rows, columns)
+    )
 
 
-def _write_sag(path: Path, model: DoeModel) -> ModelEntry | None:
-    """Write the middle of the map, if it has enough points."""
-    (ny, nx), (rows, columns) = model.level_map.shape, (min(n, _SAG_CELLS) for n in model.level_map.shape)
-    if min(rows, columns) < _FEWEST_ZEMAX:
+def _sag_entry(path: Path, model: DoeModel) -> ModelEntry | None:
+    window = _window(model.level_map)
+    if window is None:
         return None
-    window = PixelWindow((ny - rows) // 2, (nx - columns) // 2, rows, columns)
-    write_zemax_sag(path, model.level_map, window)
-    about = f"sag from the blank surface, the middle {rows} x {columns} pixels, seen as an exit face"
+    about = f"sag from the blank surface, the middle {window.rows} x {window.columns} pixels, seen as an exit face"
     return model_entry(path, about, metres_per_count=MM, window=window)
 
 
-def _problems(path: Path, entry: ModelEntry, level_map: LevelMap, read: Callable[[Path], NDArray[Any]]) -> list[str]:
+def _write_sag(path: Path, model: DoeModel) -> None:
+    write_zemax_sag(path, model.level_map, _window(model.level_map))
+
+
+def _problems(path: Path, entry: ModelEntry, model: DoeModel, read: Callable[[Path], NDArray[Any]]) -> list[str]:
+    level_map = model.level_map
     window, per_count = window_of(entry) or whole(level_map.grid), entry.metres_per_count or 1.0
     try:
         found = read(path) * per_count
@@ -185,18 +196,21 @@ def _read_sag(path: Path) -> NDArray[np.float64]:
     return sag.reshape(rows, columns)[::-1]
 
 
+def _kind(ending: str, content: str, per_count: Callable[[Levels], float], write: _Write, read: _Read) -> ModelKind:
+    """Return the kind of a file that holds every height of the map, in counts of some metres."""
+    return ModelKind(
+        ending,
+        lambda path, model: model_entry(path, content, metres_per_count=per_count(model.level_map.levels)),
+        lambda path, model: write(path, model.level_map),
+        partial(_problems, read=read),
+    )
+
+
 _FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
 _TOP_ROW = "first row at the highest y"
-KINDS = tuple(
-    ModelKind(ending, write, partial(_problems, read=read))
-    for ending, write, read in (
-        ("_HEIGHT.tif", partial(_write, content=f"{_FLOOR}, {_TOP_ROW}", write=write_tiff), read_pixels),
-        ("_HEIGHT.npy", partial(_write, content=f"{_FLOOR}, row 0 at the lowest y", write=write_npy), np.load),
-        (
-            "_GREY.png",
-            partial(_write, content=f"white is the blank surface, {_TOP_ROW}", write=write_greymap),
-            read_pixels,
-        ),
-        ("_SAG.DAT", _write_sag, _read_sag),
-    )
+KINDS = (
+    _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", lambda levels: _exact_scale(levels)[1], write_tiff, read_pixels),
+    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda _: 1.0, write_npy, np.load),
+    _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", lambda levels: _full_scale(levels, 255)[1], write_greymap, read_pixels),
+    ModelKind("_SAG.DAT", _sag_entry, _write_sag, partial(_problems, read=_read_sag)),
 )

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
 from fab.solids.columns import BASE_M, Columns, reduced_cells, window_cells
 from fab.solids.mesh import Mesh
@@ -25,13 +24,12 @@ _RELATIVE_ERROR, _SINGLE = 1e-6, 2.0**-23
 _Shown = Callable[[DoeModel], MeshedRelief | None]
 
 
-def _write(
+def _entry(
     path: Path, model: DoeModel, shown: _Shown, unit: str, write: Callable[[Path, Mesh], None]
 ) -> ModelEntry | None:
     relief = shown(model)
     if relief is None:
         return None
-    write(path, relief.mesh)
     cells, off = relief.cells, _RELATIVE_ERROR
     if relief.window is not None and write is not write_3mf:
         # In single precision walls stand aside, the more so the farther out; over a whole map that cancels out.
@@ -41,9 +39,15 @@ def _write(
     return replace(entry, volumes_mm3={"RELIEF": (cells.volume_m3 + cells.area_m2 * BASE_M) / MM**3})
 
 
-def _problems(path: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
+def _write(path: Path, model: DoeModel, shown: _Shown, write: Callable[[Path, Mesh], None]) -> None:
+    relief = shown(model)
+    if relief is not None:
+        write(path, relief.mesh)
+
+
+def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
     mesh, window = read_mesh(path, "mm" if path.suffix == ".stl" else None), window_of(entry)
-    cells = reduced_cells(level_map, MESH_CELLS) if window is None else window_cells(level_map, window)
+    cells = reduced_cells(model.level_map, MESH_CELLS) if window is None else window_cells(model.level_map, window)
     return volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3}) + _top_problems(mesh, cells)
 
 
@@ -79,7 +83,12 @@ def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
 def _kinds(name: str, shown: _Shown) -> tuple[ModelKind, ...]:
     formats = ((".3mf", "millimetres", write_3mf), (".glb", "metres", write_glb), ("_MM.stl", "millimetres", write_stl))
     return tuple(
-        ModelKind(f"{name}{ending}", partial(_write, shown=shown, unit=unit, write=write), _problems)
+        ModelKind(
+            f"{name}{ending}",
+            partial(_entry, shown=shown, unit=unit, write=write),
+            partial(_write, shown=shown, write=write),
+            _problems,
+        )
         for ending, unit, write in formats
     )
 

@@ -5,7 +5,6 @@ from dataclasses import astuple, dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
@@ -20,13 +19,20 @@ from fab.units import MM, format_length
 MESH_CELLS = 400
 
 
-class MeshedRelief(NamedTuple):
-    """Columns of a relief, their closed mesh, what it shows in words, and the window it was cut from, if any."""
+@dataclass(frozen=True, eq=False)
+class MeshedRelief:
+    """Columns of a relief, what they show in words, and the window they were cut from, if any."""
 
     cells: Columns
-    mesh: Mesh
     about: str
     window: PixelWindow | None = None
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """Their skin; CheckFailed if it is not closed."""
+        mesh = relief_mesh(self.cells, BASE_M)
+        closed_volume_m3(mesh)
+        return mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ class DoeModel:
         """The whole relief, block-reduced where it is large."""
         cells = reduced_cells(self.level_map, MESH_CELLS)
         blocks = f"mean height of {cells.block} x {cells.block} pixels"
-        return _meshed(cells, f"relief on {format_length(BASE_M)} of glass, {blocks}")
+        return MeshedRelief(cells, f"relief on {format_length(BASE_M)} of glass, {blocks}")
 
     @cached_property
     def detail(self) -> MeshedRelief | None:
@@ -61,13 +67,7 @@ class DoeModel:
             f"{window.rows} x {window.columns} pixels of {format_length(grid.pitch_m)} about {middle} of the DOE, "
             f"on {format_length(BASE_M)} of glass"
         )
-        return _meshed(window_cells(self.level_map, window), about, window)
-
-
-def _meshed(cells: Columns, about: str, window: PixelWindow | None = None) -> MeshedRelief:
-    mesh = relief_mesh(cells, BASE_M)
-    closed_volume_m3(mesh)
-    return MeshedRelief(cells, mesh, about, window)
+        return MeshedRelief(window_cells(self.level_map, window), about, window)
 
 
 def model_entry(
@@ -89,13 +89,14 @@ def model_entry(
 class ModelKind:
     """One kind of file that an order holds besides its masks, whose names end with `ending`, such as "_HEIGHT.tif".
 
-    `write` returns the entry of the file that it wrote, None if this DOE has no such file. `problems` reads it back,
-    its bytes those of the manifest, and returns one sentence per difference from its entry and the level map.
+    `entry` says what the manifest states of the file, before there is one; None if this DOE has no such file. `write`
+    writes it. `problems` reads it back and returns one sentence per difference from its entry and the DOE.
     """
 
     ending: str
-    write: Callable[[Path, DoeModel], ModelEntry | None]
-    problems: Callable[[Path, ModelEntry, LevelMap], list[str]]
+    entry: Callable[[Path, DoeModel], ModelEntry | None]
+    write: Callable[[Path, DoeModel], object]
+    problems: Callable[[Path, ModelEntry, DoeModel], list[str]]
 
 
 def window_of(entry: ModelEntry) -> PixelWindow | None:

@@ -8,61 +8,94 @@ from pathlib import Path
 
 import numpy as np
 
-from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
 from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.solids.patch import patch_body, patch_step
 from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
 from fab.solids.step import step_bodies
-from fab.solids.substrate import ChromeRing, Substrate, substrate_bodies, substrate_step, wafer_bodies, wafer_step
+from fab.solids.substrate import (
+    ChromeRing,
+    Rings,
+    Substrate,
+    substrate_bodies,
+    substrate_step,
+    wafer_bodies,
+    wafer_step,
+)
 from fab.units import MM, format_length
 
 # Double precision, less what the kernel loses.
 _RELATIVE_ERROR = 1e-11
 
 
-def _write_die(path: Path, model: DoeModel) -> ModelEntry:
-    """Write one die, with its rings if the map is radial."""
-    level_map = model.level_map
+def _die(model: DoeModel) -> tuple[Substrate, ChromeRing]:
     glass = Substrate("die", model.die_m, model.wafer.thickness_m)
-    chrome = ChromeRing(*model.chrome.radii_m(level_map))
-    levels_of_rings, rings = ring_levels(level_map), None
-    about = "millimetres; one die, relief plane at z = 0, where the relief is drawn flat"
-    if levels_of_rings is not None:
-        rings = rings_from_levels(levels_of_rings, level_map)
-        share = 100 * pixel_share(level_map, levels_of_rings)
-        about = (
-            f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
-            f"the masks draw them in pixels, with another height on {share:.2g} % of the relief"
-        )
-    substrate_step(path, glass, level_map.aperture_m, chrome, rings)
-    return model_entry(path, about, substrate_bodies(glass, chrome, rings), _RELATIVE_ERROR)
+    return glass, ChromeRing(*model.chrome.radii_m(model.level_map))
 
 
-def _write_wafer(path: Path, model: DoeModel) -> ModelEntry:
-    """Write the wafer, with a flat unless the dies need its place."""
-    wafer, dies = model.wafer, model.dies
+def _rings(model: DoeModel) -> tuple[Rings | None, str]:
+    """Return the rings of a map that is radial, and what the file shows."""
+    level_map = model.level_map
+    levels_of_rings = ring_levels(level_map)
+    if levels_of_rings is None:
+        return None, "millimetres; one die, relief plane at z = 0, where the clear aperture is drawn flat"
+    share = 100 * pixel_share(level_map, levels_of_rings)
+    return rings_from_levels(levels_of_rings, level_map), (
+        f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
+        f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
+    )
+
+
+def _die_entry(path: Path, model: DoeModel) -> ModelEntry:
+    rings, about = _rings(model)
+    return model_entry(path, about, substrate_bodies(*_die(model), rings), _RELATIVE_ERROR)
+
+
+def _write_die(path: Path, model: DoeModel) -> None:
+    """Write one die, with its rings if the map is radial."""
+    glass, chrome = _die(model)
+    substrate_step(path, glass, model.level_map.aperture_m, chrome, _rings(model)[0])
+
+
+def _wafer(model: DoeModel) -> tuple[Substrate, ChromeRing]:
+    """Return the wafer, with a flat unless the dies need its place, and the chrome of a die."""
+    wafer = model.wafer
     chrome = ChromeRing(*model.chrome.radii_m(model.level_map))
     glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m, wafer.usual_flat_m)
+    if glass.flat_m and not all(glass.holds(x, y, chrome.outer_m) for x, y in model.dies):
+        glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m)
+    return glass, chrome
+
+
+def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry:
+    glass, chrome = _wafer(model)
     flat = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"
-    if not glass.flat_m or not all(glass.holds(x, y, chrome.outer_m) for x, y in dies):
-        glass, flat = Substrate("wafer", wafer.diameter_m, wafer.thickness_m), "no flat"
-    wafer_step(path, glass, model.level_map.aperture_m, chrome, dies)
-    about = f"millimetres; the wafer before it is diced, {flat}; chrome of {len(dies)} dies, no relief"
-    return model_entry(path, about, wafer_bodies(glass, chrome, dies), _RELATIVE_ERROR)
+    about = (
+        f"millimetres; the wafer before it is diced, {flat if glass.flat_m else 'no flat'}; chrome of "
+        f"{len(model.dies)} dies, no relief"
+    )
+    return model_entry(path, about, wafer_bodies(glass, chrome, model.dies), _RELATIVE_ERROR)
 
 
-def _write_patch(path: Path, model: DoeModel) -> ModelEntry | None:
+def _write_wafer(path: Path, model: DoeModel) -> None:
+    glass, chrome = _wafer(model)
+    wafer_step(path, glass, model.level_map.aperture_m, chrome, model.dies)
+
+
+def _patch_entry(path: Path, model: DoeModel) -> ModelEntry | None:
     if model.patch is None or not model.patch.step or model.detail is None:
         return None
-    level_map, window = model.level_map, model.patch.window(model.level_map.grid)
-    patch_step(path, level_map, window)
-    body = patch_body(level_map, window)
+    window = model.patch.window(model.level_map.grid)
     about = f"millimetres; boxes side by side, {model.detail.about}"
-    return model_entry(path, about, {"PATCH": body}, _RELATIVE_ERROR, window=window)
+    return model_entry(path, about, {"PATCH": patch_body(model.level_map, window)}, _RELATIVE_ERROR, window=window)
 
 
-def _problems(path: Path, entry: ModelEntry, _: LevelMap) -> list[str]:
+def _write_patch(path: Path, model: DoeModel) -> None:
+    if model.patch is not None:
+        patch_step(path, model.level_map, model.patch.window(model.level_map.grid))
+
+
+def _problems(path: Path, entry: ModelEntry, _: DoeModel) -> list[str]:
     found = step_bodies(path)
     problems = volume_problems(entry, {name: body.volume_m3 / MM**3 for name, body in found.items()})
     for name in sorted(entry.centres_mm.keys() & found.keys()):
@@ -84,6 +117,6 @@ def volume_problems(entry: ModelEntry, found_mm3: Mapping[str, float]) -> list[s
     return problems
 
 
-DIE = ModelKind("_PLATE.step", _write_die, _problems)
-WAFER = ModelKind("_WAFER.step", _write_wafer, _problems)
-PATCH = ModelKind("_PATCH.step", _write_patch, _problems)
+DIE = ModelKind("_PLATE.step", _die_entry, _write_die, _problems)
+WAFER = ModelKind("_WAFER.step", _wafer_entry, _write_wafer, _problems)
+PATCH = ModelKind("_PATCH.step", _patch_entry, _write_patch, _problems)

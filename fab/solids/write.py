@@ -1,8 +1,8 @@
 """The solids and height maps of an order, for people and programs that read no masks.
 
-    DOE_<ID>_PLATE.step     one die of glass with its chrome and the place of the relief; with its rings
+    DOE_<ID>_PLATE.step     one die of glass with its chrome and the clear aperture in the datum plane; with its rings
                             as exact circles if the map is radial
-    DOE_<ID>_WAFER.step     the wafer with the chrome and the place of the relief of every die
+    DOE_<ID>_WAFER.step     the wafer with the chrome and the clear aperture of every die
     DOE_<ID>_RELIEF.3mf     the relief as a closed mesh, block-reduced where it is large; also .glb and _MM.stl
     DOE_<ID>_PATCH.step     on request a window at full resolution, also as .3mf, .glb and _MM.stl
     DOE_<ID>_HEIGHT.tif     heights in 16 bits; also .npy, in metres
@@ -15,7 +15,6 @@ A new kind of file is a `ModelKind` in a module of its own and a place in `KINDS
 from pathlib import Path
 
 from fab.errors import CheckFailed, InputError
-from fab.level_map import LevelMap
 from fab.manifest.records import ModelEntry
 from fab.solids import height_files, mesh_files, step_files
 from fab.solids.model import DoeModel, ModelKind
@@ -30,18 +29,27 @@ KINDS: tuple[ModelKind, ...] = (
 )
 
 
+def model_entries(folder: Path, stem: str, model: DoeModel) -> list[ModelEntry]:
+    """Return the entries of all files that a DOE has, names beginning with `stem`; nothing is written."""
+    entries = (kind.entry(folder / f"{stem}{kind.ending}", model) for kind in KINDS)
+    return [entry for entry in entries if entry is not None]
+
+
 def write_models(folder: Path, stem: str, model: DoeModel) -> list[ModelEntry]:
-    """Write every kind of file that a DOE has into a folder, names beginning with `stem`; return their entries."""
-    written = (kind.write(folder / f"{stem}{kind.ending}", model) for kind in KINDS)
-    return [entry for entry in written if entry is not None]
+    """Write every kind of file that a DOE has into a folder; return their entries (`model_entries`)."""
+    entries = model_entries(folder, stem, model)
+    for entry in entries:
+        _kind(entry).write(folder / entry.file, model)
+    return entries
 
 
-def model_problems(folder: Path, entry: ModelEntry, level_map: LevelMap) -> list[str]:
-    """Read a model back and compare it with the manifest and with the level map; one sentence per difference."""
-    kind = next((kind for kind in KINDS if entry.file.endswith(kind.ending)), None)
-    if kind is None:
-        return ["the manifest names a kind of file that is not known"]
+def model_problems(folder: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
+    """Read a file back and compare it with what its entry says and with the DOE; one sentence per difference."""
     try:
-        return kind.problems(folder / entry.file, entry, level_map)
+        return _kind(entry).problems(folder / entry.file, entry, model)
     except (InputError, CheckFailed) as error:
         return [str(error)]
+
+
+def _kind(entry: ModelEntry) -> ModelKind:
+    return next(kind for kind in KINDS if entry.file.endswith(kind.ending))

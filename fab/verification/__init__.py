@@ -1,7 +1,9 @@
-"""The proof of a mask order from its files alone.
+"""The proof of a mask order from its files alone; `fab.order.verify` says what they should hold, and asks all of it.
 
-verify        every check of an order, and the report
-compare       content of the files against what should be there
+report        the checks and their answers
+files         every mask file and model, read back
+compare       content of mask files against what should be there
+values        values and papers (run sheet, pictures) against what should be there
 shop_checks   checks of a mask shop, whatever is drawn
 child         work in a process of its own, with limits
 """

@@ -15,9 +15,9 @@ from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
 from fab.layout.polygons import doubled_area, paint
-from fab.level_map import LevelMap
 from fab.manifest.cells import cell_entry, shapes_digest
 from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
+from fab.solids.model import DoeModel
 from fab.units import MM, NM, UM
 
 Drawn = MaskEntry | DrawnEntry
@@ -27,12 +27,12 @@ Drawn = MaskEntry | DrawnEntry
 class Expected:
     """Content that the files of an order should have.
 
-    The DOE that they draw, the pixels that each etch mask should open ``[bit, y, x]``, and its pixel edges in the
-    drawing.
+    What the manifest should say, the DOE as its models show it, the pixels that each etch mask should open
+    ``[bit, y, x]``, and its pixel edges in the drawing.
     """
 
     manifest: Manifest
-    level_map: LevelMap
+    model: DoeModel
     planes: NDArray[np.uint8]
     edges: PixelEdges
 

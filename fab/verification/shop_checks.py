@@ -2,8 +2,7 @@
 
 A mask writer takes simple polygons of up to 199 vertices and of some area, whose edges neither cross nor meet at less
 than 45 degrees, and nothing beyond the blank. These questions are put to the drawing, not to the manifest, so that a
-drawing which was wrong from the beginning fails, too. The numbers of the order form (areas, boxes, narrowest line and
-space, density) are taken again from the drawing and from the level map.
+drawing which was wrong from the beginning fails, too.
 """
 
 import math
@@ -13,14 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import canonical_json
-from fab.layout.geometry import Box, Cell, Layer, Layout, Shapes, box_around, require_name
-from fab.layout.polygons import MAX_VERTICES, doubled_area, smallest_runs
-from fab.manifest.cells import geometry
-from fab.manifest.records import FileEntry
-from fab.rules.check import Rules, check
-from fab.units import MM, UM, format_length
-from fab.verification.compare import Expected
+from fab.layout.geometry import Box, Cell, Layer, Layout, box_around, require_name
+from fab.layout.polygons import MAX_VERTICES, doubled_area
+from fab.units import format_length
 
 _LEAST_ANGLE_RAD = math.pi / 4
 # A right angle or half of one whose corners were rounded to the database unit.
@@ -29,11 +23,10 @@ _SLACK = 1e-3
 _MOST_LOOKED_AT = 2000
 
 
-def drawing_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
-    """Check every shape and name of a file, where all of it lies, and stated areas; a sentence per kind of defect."""
+def drawing_problems(layout: Layout, blank_m: float) -> list[str]:
+    """Check every shape and name of a file, and where all of it lies; a sentence per kind of defect."""
     problems = [problem for cell in layout.cells for problem in _cell_problems(cell)]
-    problems += _place_problems(layout, expected.manifest.wafer.blank_mm * MM)
-    return problems + _stated_problems(layout, entry, expected)
+    return problems + _place_problems(layout, blank_m)
 
 
 def _cell_problems(cell: Cell) -> Iterator[str]:
@@ -112,43 +105,3 @@ def _place_problems(layout: Layout, blank_m: float) -> list[str]:
         for layer, box in done[layout.top.name].items()
         if (reach := max(abs(edge) for edge in box)) > most
     ]
-
-
-def _stated_problems(layout: Layout, entry: FileEntry, expected: Expected) -> list[str]:
-    """Compare counts, areas and boxes of the DOE with those of the manifest."""
-    problems = []
-    chrome = expected.chrome_layer(entry)
-    for name, drawn in expected.etch_layers(entry).items():
-        cell = layout.cell(name)
-        if cell is None:
-            continue
-        stated = {**drawn, **({chrome: expected.manifest.chrome} if chrome is not None else {})}
-        for layer, one in stated.items():
-            found = geometry(cell.shapes.get(layer, Shapes()), layout.dbu_m)
-            wanted = {"polygons": one.polygons, "area_um2": one.area_um2, "box_um": one.box_um}
-            problems += [
-                f"cell {name}: layer {layer}: {key} is {found[key]} and not {wanted[key]} as the manifest says"
-                for key in wanted
-                if found[key] != wanted[key]
-            ]
-    return problems
-
-
-def number_problems(expected: Expected) -> dict[str, list[str]]:
-    """Compute the numbers of the order form again from the level map: one sentence per difference, by file."""
-    manifest, pitch_m = expected.manifest, expected.level_map.grid.pitch_m
-    problems: dict[str, list[str]] = {}
-    for mask in manifest.masks:
-        found = [None if n is None else round(n * pitch_m / UM, 6) for n in smallest_runs(expected.planes[mask.bit])]
-        stated = [mask.smallest_width_um, mask.smallest_space_um]
-        if found != stated:
-            difference = f"narrowest line and space are {found} um and not {stated} um as the manifest says"
-            problems.setdefault(mask.file, []).append(difference)
-    try:
-        report = check(expected.level_map, Rules(**manifest.rules.get("rules", {})))
-    except (TypeError, InputError) as error:
-        return {**problems, "manifest.json": [f"the rules cannot be read: {error}"]}
-    if canonical_json(report.as_record()) != canonical_json(manifest.rules):
-        difference = "lines, spaces, corners and density are not those that the rules find in the level map"
-        problems["manifest.json"] = [difference]
-    return problems

@@ -8,7 +8,7 @@ from fab.files import sha256_file
 from fab.gds.reader import read_gds
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import FileEntry, Manifest, read_manifest
-from fab.verification.verify import verify
+from fab.order.verify import verify
 
 
 def restate(folder: Path, change: Callable[[Manifest], Manifest]) -> None:

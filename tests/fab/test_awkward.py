@@ -13,7 +13,7 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.units import NM, UM
-from fab.verification.verify import read_drawn_levels
+from fab.verification.files import read_drawn_levels
 from tests.fab.maps import wide_map
 
 BLANK = 15
@@ -69,7 +69,7 @@ MAPS = {
 def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_path, monkeypatch, level_map, count):
     # The picture for people takes most of the time of an order this small.
     monkeypatch.setattr("fab.order.order.Order.plot", lambda *_: None)
-    monkeypatch.setattr("fab.order.write.save", lambda _, path: path.write_bytes(b"picture"))
+    monkeypatch.setattr("fab.order.papers.png_bytes", lambda _: b"picture")
     levels, grid = Levels(count, 1200 * NM / count), Grid(level_map.shape, 2 * UM)
     # A circle wide enough for every pixel is wider than the raster; the aperture may not be, so corners are blank.
     folder = tmp_path / "o"

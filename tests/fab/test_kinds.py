@@ -4,22 +4,25 @@ import numpy as np
 import pytest
 
 from fab.manifest.records import read_manifest
+from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.solids import write
 from fab.solids.model import ModelKind, model_entry
-from fab.verification.verify import verify
 from tests.fab.maps import level_map_from
 from tests.fab.mended import mend, told
 
 
-def write_counts(path, model):
-    path.write_text(" ".join(map(str, np.bincount(model.level_map.level.ravel()))))
+def counts_entry(path, model):
     return model_entry(path, "how many pixels have each level")
 
 
-def count_problems(path, entry, level_map):
+def write_counts(path, model):
+    path.write_text(" ".join(map(str, np.bincount(model.level_map.level.ravel()))))
+
+
+def count_problems(path, entry, model):
     found = [int(word) for word in path.read_text().split()]
-    return [] if found == np.bincount(level_map.level.ravel()).tolist() else ["other numbers of pixels"]
+    return [] if found == np.bincount(model.level_map.level.ravel()).tolist() else ["other numbers of pixels"]
 
 
 def not_for_this_doe(path, model):
@@ -29,8 +32,8 @@ def not_for_this_doe(path, model):
 @pytest.fixture
 def order(tmp_path, monkeypatch):
     kinds = (
-        ModelKind("_COUNTS.txt", write_counts, count_problems),
-        ModelKind("_NONE.txt", not_for_this_doe, count_problems),
+        ModelKind("_COUNTS.txt", counts_entry, write_counts, count_problems),
+        ModelKind("_NONE.txt", not_for_this_doe, write_counts, count_problems),
     )
     monkeypatch.setattr(write, "KINDS", (*write.KINDS, *kinds))
     level = np.random.default_rng(0).integers(0, 16, (19, 18))
@@ -54,4 +57,4 @@ def test_what_is_wrong_in_it_is_told(order):
 
 def test_a_kind_that_nobody_knows_is_told(order, monkeypatch):
     monkeypatch.setattr(write, "KINDS", write.KINDS[:-2])
-    assert "a kind of file that is not known" in told(order.folder, "DOE_TOY_COUNTS.txt")
+    assert "models: DOE_TOY_COUNTS.txt should not be there" in told(order.folder, "manifest.json")

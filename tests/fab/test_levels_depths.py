@@ -13,13 +13,13 @@ from fab.grid import Grid
 from fab.layout.structures import codes_by_depth
 from fab.levels import Levels, height_of, level_map_from_planes, planes, quantise, quantise_wrapped, wrapped_cells
 from fab.manifest.records import read_manifest
+from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.plots.masks import plot_masks
 from fab.process import Process
 from fab.rules.check import Rules
 from fab.rules.repair import repair
 from fab.runsheet.recipe import depths_m
-from fab.verification.verify import verify
 from tests.fab.maps import level_map_from, wide_map
 
 NM = 1e-9

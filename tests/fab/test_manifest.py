@@ -38,7 +38,7 @@ def test_any_change_by_hand_is_noticed(order_folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(format="other"), 'the format must be "doedesign mask order 1"'),
+        (lambda d: d.update(format="other"), 'the format must be "doedesign mask order 2"'),
         (lambda d: d.pop("chrome"), "'chrome'"),
         (lambda d: d.update(extra=1), "'extra'"),
         (lambda d: d["masks"][1].pop("bit"), r"masks\[1\].*'bit'"),

@@ -13,6 +13,9 @@ from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.drawing import draw
+from fab.order.request import order_from
+from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.solids.columns import PixelWindow
 from fab.solids.model import DoeModel
@@ -20,7 +23,6 @@ from fab.solids.patch import Patch
 from fab.solids.step import step_bodies
 from fab.solids.write import model_problems, write_models
 from fab.units import MM, NM, UM
-from fab.verification.verify import verify
 from tests.fab.maps import level_map_from
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
@@ -53,7 +55,7 @@ def test_a_radial_order_has_its_rings_as_exact_circles(tmp_path):
 
 def test_any_other_order_has_a_flat_plate(written_order):
     entry = entries(written_order)["PLATE.step"]
-    assert "where the relief is drawn flat" in entry.content
+    assert "where the clear aperture is drawn flat" in entry.content
 
 
 def test_the_wafer_of_an_order(written_order):
@@ -114,17 +116,18 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
 def test_a_patch_of_another_place_is_told(patched):
     """The same files, but said to be a pixel farther: neither the centre of the boxes nor a column fits."""
     manifest = read_manifest(patched)
-    level_map = manifest.level_map(np.load(patched / manifest.level_map_file))
+    order = order_from(manifest.request, np.load(patched / manifest.level_map_file), "here")
+    model = draw(order).model
     for name, entry in entries(patched).items():
         if not name.startswith("PATCH"):
             continue
-        assert model_problems(patched, entry, level_map) == []
+        assert model_problems(patched, entry, model) == []
         if name == "PATCH.step":
             centre = [value + 1e-6 for value in entry.centres_mm["PATCH"]]
             other, words = replace(entry, centres_mm={"PATCH": centre}), "its centre of mass lies 1 nm aside"
         else:
             other, words = replace(entry, window_px=[12, 8, 8, 8]), "columns have no top of the height"
-        assert any(words in problem for problem in model_problems(patched, other, level_map))
+        assert any(words in problem for problem in model_problems(patched, other, model))
 
 
 def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path, caplog):

@@ -15,7 +15,7 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.order import order_id
 from fab.order.write import write_order
-from fab.verification.verify import read_drawn_levels
+from fab.verification.files import read_drawn_levels
 from tests.fab.maps import wide_map
 
 NAMES = [
@@ -84,7 +84,7 @@ def test_the_manifest_tells_what_each_mask_is(written_order, level_map):
     assert manifest.chrome.opening_diameter_mm == pytest.approx((16 * 1.85 - 10) / 1000)
     assert manifest.dbu_nm == 1.0
     assert manifest.pixel_edges == "every pixel edge is a whole number of 1 nm"
-    assert set(manifest.tools) == {"python", "numpy", "numba", "klayout", "gdstk", "matplotlib"}
+    assert set(manifest.tools) == {"doedesign", "python", "numpy", "numba", "klayout", "gdstk", "matplotlib"}
     for entry in manifest.files:
         assert entry.sha256 == sha256_file(written_order / entry.file)
         assert entry.bytes == (written_order / entry.file).stat().st_size

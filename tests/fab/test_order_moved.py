@@ -14,9 +14,10 @@ from fab.layout.geometry import Layer, Shapes, pixel_edges
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from fab.verification.verify import read_drawn_levels, verify
+from fab.verification.files import read_drawn_levels
 from tests.fab.maps import wide_map
 
 

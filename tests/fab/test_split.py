@@ -16,9 +16,9 @@ from fab.layout.split import splits_of
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from fab.verification.verify import verify
 from tests.fab.maps import wide_map
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)

@@ -13,7 +13,8 @@ from fab.grid import Grid
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.verification.verify import read_drawn_levels, verify
+from fab.order.verify import verify
+from fab.verification.files import read_drawn_levels
 
 MASKS = [
     "DOE_SMALL_ALL.gds",

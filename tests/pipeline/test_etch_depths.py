@@ -11,7 +11,7 @@ from doedesign.runs.level_maps import level_map_of_run, open_design
 from fab.layout.geometry import pixel_edges
 from fab.levels import Levels, height_of
 from fab.manifest.records import read_manifest
-from fab.verification.verify import read_drawn_levels
+from fab.verification.files import read_drawn_levels
 from sim.store import read_bank, read_height
 
 pytestmark = pytest.mark.usefixtures("without_pictures")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fab.verification.verify import verify
+from fab.order.verify import verify
 
 MASKS = Path(__file__).parents[2] / "masks"
 

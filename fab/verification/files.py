@@ -1,4 +1,4 @@
-"""The proof of a mask order: read every file back and compare every pixel with the level map.
+"""Every mask file and model of an order, read back and compared pixel by pixel with the level map.
 
 Three questions are put to each mask file, and all of them are always asked, so that a report says not
 only that a file changed but also what in the drawing is different:
@@ -17,81 +17,40 @@ through KLayout, which refuses what is broken, and then through the own reader, 
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
-from fab.figure import html_of
-from fab.files import os_errors_explained, read_npy, sha256_file
+from fab.files import read_npy, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Layer, PixelEdges, pixel_edges
-from fab.layout.limits import MOST_AROUND
 from fab.layout.polygons import paint
 from fab.level_map import level_digest
 from fab.levels import Levels
-from fab.manifest.records import FileEntry, Manifest, plane_digest, read_manifest
+from fab.manifest.records import FileEntry, Manifest
 from fab.solids.write import model_problems
-from fab.verification.child import Child, ChildFailed, TooMuch, child_process, limited
+from fab.units import MM
+from fab.verification.child import Child, ChildFailed, child_process, limited
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
-from fab.verification.shop_checks import drawing_problems, number_problems
-
-if TYPE_CHECKING:
-    from fab.order.write import WrittenOrder
+from fab.verification.report import Check
+from fab.verification.shop_checks import drawing_problems
 
 _GDS, _OASIS = "GDSII", "OASIS"
 
 
-@dataclass(frozen=True)
-class Check:
-    """One question about a file, and its answer: a sentence per difference, none if it holds."""
-
-    file: str
-    question: str
-    problems: tuple[str, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing differs."""
-        return not self.problems
-
-
-@dataclass(frozen=True)
-class VerificationReport:
-    """All checks of a mask order, in the order they were made."""
-
-    checks: tuple[Check, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether every check holds."""
-        return all(check.passed for check in self.checks)
-
-    @property
-    def differences(self) -> tuple[str, ...]:
-        """One sentence per difference, each naming its file first."""
-        return tuple(f"{c.file}: {c.question}: {problem}" for c in self.checks for problem in c.problems)
-
-    def _repr_html_(self) -> str:
-        rows = {f"{c.file}: {c.question}": "; ".join(c.problems) or "passed" for c in self.checks}
-        return html_of(f"{sum(check.passed for check in self.checks)} of {len(self.checks)} checks passed", rows)
-
-    def require(self) -> None:
-        """Raise `CheckFailed` with the differences, if there are any."""
-        if not self.passed:
-            raise CheckFailed(self.differences)
-
-
-def _check_bytes(folder: Path, entry: FileEntry) -> Check:
+def check_bytes(folder: Path, entry: FileEntry) -> Check:
+    """Compare size and digest of a file with the manifest."""
     path, problems = folder / entry.file, ()
-    if not path.is_file():
+    if path.is_symlink():
+        problems = ("it is a link to elsewhere",)
+    elif not path.is_file():
         problems = ("the file is missing",)
     elif path.stat().st_size != entry.bytes:
         problems = (f"{path.stat().st_size} bytes instead of {entry.bytes}",)
@@ -139,16 +98,20 @@ def read_drawn_levels(
     return np.uint8(levels.count - 1) - etched
 
 
-def _reference(folder: Path, manifest: Manifest, levels: Levels, edges: PixelEdges) -> tuple[NDArray[np.uint8], Check]:
-    """Return the level numbers to compare with, and whether the stored ones are those of the manifest.
+def reference_level(folder: Path, manifest: Manifest) -> tuple[NDArray[np.uint8], Check]:
+    """Return the level numbers ``[y, x]`` to compare with, and whether the stored ones are those of the manifest.
 
     A damaged copy must not put the blame on the masks: the map drawn in the combined file may be the right one.
+
+    Raises:
+        CheckFailed: neither holds the map of the manifest.
     """
     stored = _stored_levels(folder, manifest)
     question = "the level map as in the manifest"
     if stored is not None and level_digest(stored) == manifest.level_map_sha256:
         return stored, Check(manifest.level_map_file, question, ())
     failed = Check(manifest.level_map_file, question, ("the level map is unreadable or its digest differs",))
+    levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
     try:
         moves = manifest.edge_moves()
         drawn = read_drawn_levels(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
@@ -170,29 +133,23 @@ def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check,
         problem = f"it cannot be read: {error.rule}, but got {error.got}"
         return Check(entry.file, question, (problem,)), False
     fit = abs(layout.dbu_m / expected.edges.dbu_m - 1) < 1e-9
-    problems = layout_problems(layout, entry, expected) + drawing_problems(layout, entry, expected)
+    blank_m = expected.manifest.wafer.blank_mm * MM
+    problems = layout_problems(layout, entry, expected) + drawing_problems(layout, blank_m)
     return Check(entry.file, question, tuple(problems)), fit
 
 
-def _most_shapes(entry: FileEntry, expected: Expected) -> int:
-    """Twice the shapes that the manifest states for a file: more are not unfolded to see how they differ.
-
-    A manifest that states more than a rectangle per pixel and what the other cells may hold is not believed.
-    """
+def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
     around = sum(one.polygons for cell in entry.cells for one in cell.layers)
     does = expected.manifest.drawn().values()
     etched = sum(one.polygons for drawn in does for one in drawn)
-    stated = etched + len(does) * expected.manifest.chrome.polygons + around
-    return 2 * min(stated, len(does) * expected.planes.size + MOST_AROUND)
-
-
-def _altered_oasis(path: Path, entry: FileEntry, expected: Expected, scratch: Path) -> Check:
-    gds = scratch / f"{entry.file}.gds"
-    try:
-        oasis_to_gds(path, gds, _most_shapes(entry, expected))
-    except InputError as error:
-        return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.rule}, but got {error.got}",))
-    return _own_check(gds, entry, expected)[0]
+    most = 2 * (etched + len(does) * expected.manifest.chrome.polygons + around)
+    with tempfile.TemporaryDirectory() as folder:
+        gds = Path(folder) / "altered.gds"
+        try:
+            oasis_to_gds(path, gds, most)
+        except InputError as error:
+            return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.got}",))
+        return _own_check(gds, entry, expected)[0]
 
 
 def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
@@ -205,39 +162,27 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     again = GdstkReader(expected.etch_layers(entry), expected.edges)
     numbers = [tuple(map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers]
     others = dict.fromkeys(Layer(number, datatype) for number, datatype in numbers)
-    if entry.format == _OASIS:
-        readings = again.oasis(path, layers, _most_shapes(entry, expected))
-    else:
-        readings = again.gds(path, layers, others)
-    try:
-        problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
-    except InputError as error:
-        problems = [f"it cannot be read: {error.rule}, but got {error.got}"]
-    else:
-        problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
+    readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
+    problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
+    problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
     return Check(entry.file, "gdstk, every pixel", tuple(problems))
 
 
-def _check_oasis(
-    child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected, scratch: Path
-) -> Callable[[], Check]:
+def _check_oasis(child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected) -> Callable[[], Check]:
     """Begin to check an OASIS file in a child process; return what waits for the result."""
-    shapes = _most_shapes(entry, expected)
+    size = path.stat().st_size
+    first, *others = (_library_check, _altered_oasis) if intact else (_altered_oasis,)
     path = path.absolute()  # the child may work in another folder
-    works = [(_library_check, path, entry, expected), (_altered_oasis, path, entry, expected, scratch)]
-    first, *others = works if intact else works[1:]
-    begun = child.begin(limited, shapes, *first)
+    begun = child.begin(limited, size, first, path, entry, expected)
 
     def wait() -> Check:
         try:
-            return child.result(begun, shapes)
-        except TooMuch as error:
-            return Check(entry.file, "OASIS", (f"it cannot be read: {error}",))
+            return child.result(begun, size)
         except ChildFailed as error:
             problems = [f"it cannot be read: {error}"]
         for other in others:
             try:
-                found = child.result(child.begin(limited, shapes, *other), shapes)
+                found = child.result(child.begin(limited, size, other, path, entry, expected), size)
                 return replace(found, problems=(*problems, *found.problems))
             except ChildFailed as error:
                 problems.append(f"nor by KLayout: {error}")
@@ -254,52 +199,27 @@ def _check_mask_file(folder: Path, entry: FileEntry, expected: Expected) -> list
     return [own, _library_check(path, entry, expected)] if fit else [own]
 
 
-def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
-    """Read a mask order back, with two readers, and compare every pixel with its level map.
+def check_files(folder: Path, expected: Expected, intact: Mapping[str, bool]) -> list[Check]:
+    """Read every mask file and every model of an order, and compare it with what it should hold.
 
-    Args:
-        order: the folder that `write_order` wrote, or what it returned.
-
-    Raises:
-        InputError: the folder is not a mask order, or its manifest is corrupt.
-        CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
+    `intact` says of every file whether its bytes are those of the manifest.
     """
-    folder = Path(order) if isinstance(order, str | Path) else order.folder
-    manifest = read_manifest(folder)
-    levels = manifest.staircase()
-    edges = pixel_edges(manifest.grid())
-    with os_errors_explained(folder):
-        byte_checks = {entry.file: _check_bytes(folder, entry) for entry in manifest.files}
-        checks = [*byte_checks.values()]
-        masks = {path.name for path in folder.iterdir() if path.suffix.lower() in (".gds", ".oas")}
-        for name in sorted(masks - byte_checks.keys()):
-            checks.append(Check(name, "listed in the manifest", ("a mask file that the manifest does not know",)))
-        reference, map_check = _reference(folder, manifest, levels, edges)
-        level_map = manifest.level_map(reference)
-        expected = Expected(manifest, level_map, level_map.planes(), edges)
-        checks.append(map_check)
-        for mask in manifest.masks:
-            if plane_digest(expected.planes[mask.bit]) != mask.plane_sha256:
-                question = "digest of the plane in the manifest"
-                checks.append(Check(mask.file, question, ("it is not that of the level map",)))
-        for file, problems in number_problems(expected).items():
-            checks.append(Check(file, "numbers of the order form", tuple(problems)))
-        with tempfile.TemporaryDirectory(prefix="doedesign-verify-") as scratch, child_process() as child:
-            begun = {
-                entry.file: _check_oasis(
-                    child, folder / entry.file, entry, byte_checks[entry.file].passed, expected, Path(scratch)
-                )
-                for entry in manifest.files
-                if entry.format == _OASIS and (folder / entry.file).is_file()
-            }
-            for entry in manifest.files:
-                if entry.format == _GDS:
-                    checks += _check_mask_file(folder, entry, expected)
-                elif entry.file in begun:
-                    checks.append(begun[entry.file]())
-        for model in manifest.models:
-            # Libraries of solids and pictures are given whole files only.
-            if byte_checks[model.file].passed:
-                problems = model_problems(folder, model, level_map)
-                checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
-    return VerificationReport(tuple(checks))
+    checks = []
+    files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
+    with child_process() as child:
+        begun = {
+            entry.file: _check_oasis(child, folder / entry.file, entry, intact[entry.file], expected)
+            for entry in files
+            if entry.format == _OASIS
+        }
+        for entry in files:
+            if entry.format == _GDS:
+                checks += _check_mask_file(folder, entry, expected)
+            elif entry.file in begun:
+                checks.append(begun[entry.file]())
+    for model in expected.manifest.models:
+        # Libraries of solids and pictures are given whole files only.
+        if intact[model.file]:
+            problems = model_problems(folder, model, expected.model)
+            checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
+    return checks

@@ -1,0 +1,84 @@
+"""The papers of an order: pictures, and the run sheet."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from fab.figure import png_bytes
+from fab.files import canonical_json
+from fab.layout.marks import alignment_site
+from fab.order.drawing import DrawnOrder
+from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
+from fab.runsheet.write import html_page, record
+
+Paper = Callable[[], bytes]
+
+
+def papers(drawing: DrawnOrder, plates: Mapping[str, str], psfs: bytes | None = None) -> dict[str, Paper]:
+    """Return what makes the content of every paper of an order, by file name.
+
+    Args:
+        drawing: the order.
+        plates: SHA-256 of the file of every photomask, by its name.
+        psfs: PNG of the PSFs for the run sheet, if there is one.
+    """
+    order = drawing.order
+    stem = order.stem
+    pictures: dict[str, Paper] = {"PREVIEW.png": lambda: png_bytes(order.plot())}
+    sheets: dict[str, Paper] = {}
+    if order.papers:
+        pictures["WAFER.png"] = partial(_wafer, drawing)
+        pictures["MARKS.png"] = partial(_marks, drawing)
+        if not order.rules.clean:
+            title = f"{stem}: where the masks break the rules of {order.process.name}"
+            pictures["RULES.png"] = lambda: png_bytes(order.rules.plot(title=title))
+        content = record(run_sheet(drawing, plates))
+        sheets["RUNSHEET.json"] = lambda: canonical_json(content)
+        sheets["RUNSHEET.html"] = lambda: html_page(content, f"{stem}_RUNSHEET.json", psfs).encode()
+    kept = {name: partial(drawing.kept, name, draw) for name, draw in pictures.items()}
+    return {f"{stem}_{name}": make for name, make in {**kept, **sheets}.items()}
+
+
+def _wafer(drawing: DrawnOrder) -> bytes:
+    from fab.plots.wafer import plot_wafer
+
+    order = drawing.order
+    title = f"{order.stem}: what lies where"
+    return png_bytes(plot_wafer(order.wafer, drawing.frame, order.level_map.aperture_m, order.dbu_m, title))
+
+
+def _marks(drawing: DrawnOrder) -> bytes:
+    from fab.plots.marks import plot_part
+
+    masks, title = drawing.order.photomasks, f"{drawing.order.stem}: alignment site, every mask in its colour"
+    return png_bytes(plot_part(alignment_site(masks, drawing.order.dbu_m), masks, title))
+
+
+def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str]) -> RunSheet:
+    """Return the run sheet of an order; `plates` is the SHA-256 of the file of every photomask, by its name."""
+    order, frame = drawing.order, drawing.frame
+    moves = order.edge_moves()
+    stems = {photomask.name: order.photomask_stem(photomask) for photomask in order.photomasks}
+    files = {
+        photomask.name: PhotomaskFile(
+            file=f"{stems[photomask.name]}.gds",
+            sha256=plates[f"{stems[photomask.name]}.gds"],
+            cell=stems[photomask.name],
+            edge_move_m=0.0 if photomask.bit is None else moves[photomask.bit] * order.dbu_m,
+        )
+        for photomask in order.photomasks
+    }
+    return RunSheet(
+        stem=order.stem,
+        level_map=order.level_map,
+        photomasks=order.photomasks,
+        files=files,
+        process=order.process,
+        opening_m=2 * order.chrome.radii_m(order.level_map)[0],
+        wafer=order.wafer,
+        places=frame.places,
+        dies=tuple(
+            Die(f"die {number}", x, y, order.splits[split].words)
+            for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
+        ),
+        predictions=None if order.light is None else order.light.predictions,
+    )

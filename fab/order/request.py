@@ -1,0 +1,68 @@
+"""The request: everything that an order follows from, besides its level numbers, as the manifest records it.
+
+Lengths are metres. Numbers are written with all their digits, so that what is drawn from a request that was read is
+what was drawn at first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from fab.errors import InputError
+from fab.files import canonical_json
+from fab.grid import Grid
+from fab.level_map import LevelMap
+from fab.order.order import Order
+from fab.rules.check import check
+
+# The rules are those of the process, and a repaired level map needs no second repair.
+_ASKED = tuple(field.name for field in fields(Order) if field.name not in ("rules", "repair"))
+_CURE = "Fetch the manifest again, or write the order again."
+
+
+def _plain(value: Any) -> Any:
+    """Turn a value into JSON values, fields by name."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if hasattr(value, "_asdict"):
+        return _plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def request_of(order: Order) -> dict[str, Any]:
+    """Return the request of an order as JSON values."""
+    level_map = order.level_map
+    drawn = {"name": level_map.name, "shape": list(level_map.shape), "pitch_m": level_map.grid.pitch_m}
+    asked = {name: _plain(getattr(order, name)) for name in _ASKED}
+    return {"level_map": {**drawn, "aperture_m": level_map.aperture_m}, **asked}
+
+
+def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str) -> Order:
+    """Return the order of a request and of level numbers ``[y, x]``; `where` names the file in errors.
+
+    Raises:
+        InputError: the request holds other keys or values than `request_of` writes, or does not fit the level numbers.
+    """
+    hints = get_type_hints(Order)
+    try:
+        asked = {name: TypeAdapter(hints[name]).validate_python(request[name]) for name in _ASKED}
+        drawn = request["level_map"]
+        grid = Grid(level.shape, float(drawn["pitch_m"]))
+        level_map = LevelMap(level, asked["process"].levels, grid, float(drawn["aperture_m"]), drawn["name"])
+    except ValidationError as errors:
+        found = errors.errors(include_url=False)[0]
+        raise InputError(f"{where}: request", found["msg"], repr(found["input"])[:60], _CURE) from errors
+    except InputError as error:
+        raise InputError(f"{where}: request: {error.where}", error.rule, error.got, _CURE) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: request", "must be whole", f"{type(error).__name__}: {error}", _CURE) from error
+    order = Order(check(level_map, asked["process"]), **asked)
+    if canonical_json(request_of(order)) != canonical_json(request):
+        raise InputError(f"{where}: request", "must hold the keys and values of an order", "others", _CURE)
+    return order

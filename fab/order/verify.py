@@ -1,0 +1,148 @@
+"""The proof of a mask order from its files alone.
+
+Two things are done, and nothing of the first is used for the second:
+
+1. Every mask file is read by two readers that had no part in the writing, and the pixels that they find are compared
+   with the bit planes of the level map (`fab.verification.files`). That proves what is drawn.
+2. The order is drawn again from the level map and from what was asked for, as the manifest records it
+   (`fab.order.request`): every entry of the manifest, every cell around the DOE, every number of the run sheet, every
+   picture. What lies in the folder is compared with that, so that no file and no entry can vouch for itself, and
+   whatever is changed disagrees with the rest, or with what was asked for. That proves that all belong together.
+
+Whatever says nothing may differ: dates, the order of shapes and where each begins, how a program packs an OASIS file.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes
+from fab.layout.geometry import pixel_edges
+from fab.manifest.records import Manifest, read_manifest
+from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of
+from fab.order.papers import papers
+from fab.order.request import order_from
+from fab.solids.write import model_entries
+from fab.verification.compare import Expected
+from fab.verification.files import check_bytes, check_files, reference_level
+from fab.verification.papers import paper_problems, picture_of_digest
+from fab.verification.report import Check, VerificationReport
+from fab.verification.values import differences
+
+if TYPE_CHECKING:
+    from fab.order.write import WrittenOrder
+
+# Endings of layouts, and of what packs them.
+_LAYOUTS = {
+    ".gds",
+    ".gds2",
+    ".gdsii",
+    ".gdz",
+    ".sf",
+    ".strm",
+    ".oas",
+    ".oasis",
+    ".dxf",
+    ".cif",
+    ".ctb",
+    ".jb51",
+    ".lic",
+}
+_PACKED = {".gz", ".bz2", ".xz", ".zst", ".zip", ".7z", ".rar", ".tar", ".tgz", ".z"}
+_MAGIC = (b"\x00\x06\x00\x02", b"%SEMI-OASIS")
+
+
+def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
+    """Read a mask order back, with two readers, and compare every file with what was asked for.
+
+    Args:
+        order: the folder that `write_order` wrote, or what it returned.
+
+    Raises:
+        InputError: the folder is not a mask order, or its manifest is corrupt.
+        CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
+    """
+    folder = Path(order) if isinstance(order, str | Path) else order.folder
+    recorded = read_manifest(folder)
+    with os_errors_explained(folder):
+        manifest_check = Check(MANIFEST_NAME, "written as it is", tuple(_spelling_problems(folder, recorded)))
+        level, map_check = reference_level(folder, recorded)
+        asked = order_from(recorded.request, level, str(folder / MANIFEST_NAME))
+        drawing = draw(asked)
+        wanted = _wanted(drawing, recorded)
+        byte_checks = {entry.file: check_bytes(folder, entry) for entry in wanted.files}
+        intact = {file: check.passed for file, check in byte_checks.items()}
+        told = tuple(differences(asdict(recorded), asdict(wanted)))
+        checks = [
+            manifest_check,
+            Check(MANIFEST_NAME, "as was asked for", told),
+            *_others(folder, asked.stem, intact.keys()),
+            *byte_checks.values(),
+            map_check,
+        ]
+        level_map = asked.level_map
+        expected = Expected(wanted, drawing.model, level_map.planes(), pixel_edges(level_map.grid))
+        checks += check_files(folder, expected, intact)
+        checks += _paper_checks(folder, drawing, wanted)
+    return VerificationReport(tuple(checks))
+
+
+def _spelling_problems(folder: Path, recorded: Manifest) -> list[str]:
+    path = folder / MANIFEST_NAME
+    if path.is_symlink():
+        return ["it is a link to elsewhere"]
+    same = read_bytes(path) == recorded.to_json()
+    return [] if same else ["its spaces, the order of its keys or the spelling of its numbers were changed"]
+
+
+def _wanted(drawing: DrawnOrder, recorded: Manifest) -> Manifest:
+    """Return the manifest that the order should have; sizes and digests of files are compared with the files alone."""
+    models = model_entries(Path(), drawing.order.stem, drawing.model)
+    stated = {entry.file: entry for entry in recorded.files}
+    files = [
+        replace(entry, bytes=stated[entry.file].bytes, sha256=stated[entry.file].sha256)
+        if entry.file in stated
+        else entry
+        for entry in file_entries(drawing, models)
+    ]
+    return manifest_of(drawing, models, files, recorded.tools)
+
+
+def _others(folder: Path, stem: str, listed: Collection[str]) -> Iterator[Check]:
+    """Look at everything else in the folder, and name what somebody could take for a part of the order."""
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if name not in listed and name != MANIFEST_NAME and (what := _taken_for(path, stem)):
+            yield Check(name, "listed in the manifest", (f"{what} that the manifest does not know",))
+
+
+def _taken_for(path: Path, stem: str) -> str:
+    endings = {ending.lower() for ending in path.suffixes}
+    if endings & _LAYOUTS:
+        return "a mask file"
+    if endings & _PACKED:
+        return "an archive"
+    if path.name.upper().startswith(stem):
+        return "a file of its name"
+    return "a mask file" if path.is_file() and _first_bytes(path).startswith(_MAGIC) else ""
+
+
+def _first_bytes(path: Path) -> bytes:
+    with opened(path) as stream:
+        return stream.read(16)
+
+
+def _paper_checks(folder: Path, drawing: DrawnOrder, wanted: Manifest) -> list[Check]:
+    """Make every picture and page again, and compare."""
+    order = drawing.order
+    plates = {entry.file: entry.sha256 for entry in wanted.files if entry.format == "GDSII"}
+    psfs = None
+    if order.light is not None:
+        psfs = picture_of_digest(folder / f"{order.stem}_RUNSHEET.html", order.light.picture_sha256)
+    checks = []
+    for name, make in papers(drawing, plates, psfs).items():
+        if (folder / name).is_file():
+            question = "drawn again" if name.endswith(".png") else "written again"
+            checks.append(Check(name, question, tuple(paper_problems(folder / name, make()))))
+    return checks
