@@ -59,6 +59,7 @@ def optimize(
     *,
     overrides: Sequence[str] = (),
     objectives: Mapping[str, Objective] | None = None,
+    overwrite: bool = False,
 ) -> Design:
     """Optimise the design of a spec.
 
@@ -69,6 +70,7 @@ def optimize(
         overrides: changes to the spec, "table.key=value".
         objectives: objectives of your own, by the names "module:function" that the spec gives them
             (`doedesign.import_objectives` imports them). A run records the files they are in.
+        overwrite: where the folder has the run of another spec, remove it with all that was made of it.
 
     Returns:
         the design: its level map, the heights before rounding (metres), and the history of its loss.
@@ -82,7 +84,7 @@ def optimize(
         log.warning(warning)
     files = input_files(spec)
     if out is not None:
-        return _optimize_in(Path(out), spec, files, overrides, objectives or {})
+        return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)
     problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(problem, sources, spec, state, [])
@@ -95,9 +97,10 @@ def _optimize_in(
     files: dict[str, Path],
     overrides: Sequence[str],
     objectives: Mapping[str, Objective],
+    overwrite: bool,
 ) -> Design:
     inputs = input_digests(files) | source_digests(spec, objectives)
-    with claim_run(folder, spec, inputs, overrides) as run:
+    with claim_run(folder, spec, inputs, overrides, overwrite=overwrite) as run:
         if run.done:
             log.info(f"{folder} already holds the finished run of this spec")
             return open_design(folder, False)
@@ -181,7 +184,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(problem, design)
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
-    save(plot_height(HeightMap(height, camera.grid, camera.aperture_m), levels, spec.name), run.path("height.png"))
+    save(plot_height(HeightMap(height, camera.grid, spec.doe.aperture_m), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far), run.path("psf.png"))
     transfers = [mtf(each, camera, (*near, *far)) for each in (height, flat)]
     save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))

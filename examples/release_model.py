@@ -6,12 +6,13 @@ TRAINED is the folder of a training (RUN/trained), ORDER what `doedesign masks T
 
     network.npz     weights in half precision, what they were trained on and under which licences
     psf.exr         PSFs of the plate
-    height.exr      the plate, with spec.toml
-    masks.json      the manifest of its mask order, whose files can be drawn again from the height map
+    level_map.npz   the plate, with height.exr and spec.toml
+    masks.json      the manifest of its mask order, whose files can be drawn again from the level map
     capture.png     a sample picture of scikit-image behind the obstruction, photographed through the plate with noise
     manifest.json   digests of all of these, how the network was trained and how it is judged
 
-`doedesign reconstruct` takes a model from masks/released where none is named.
+`doedesign reconstruct` takes a model from masks/released where none is named; the commands that take a run take the
+folder for its plate.
 """
 
 import argparse
@@ -22,15 +23,17 @@ from see_through import photographed
 
 from doedesign.capture.images import sample_files
 from doedesign.cli import exit_code
-from doedesign.recon.model import RELEASED, Model
+from doedesign.recon.model import RELEASED as HOME
+from doedesign.recon.model import Model
 from doedesign.recon.photos import write_reconstruction
 from doedesign.recon.weights import BANK_NAME, NETWORK_NAME, write_network
+from doedesign.runs.folder import HEIGHT, LEVEL_MAP, RELEASED
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
+from fab.level_map import read_level_map
 
 SIDE, SEED = 512, 2
-FORMAT = "doedesign released model 1"
-COPIED = (BANK_NAME, "height.exr", "spec.toml")
+COPIED = (BANK_NAME, LEVEL_MAP, HEIGHT, "spec.toml")
 TOLD = ("camera", "licence", "obstruction", "obstruction_parameters", "occlusion", "perceptual", "run")
 SCORED = ("capture", "reconstruction", "wiener_far")
 
@@ -51,7 +54,7 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
     names = [NETWORK_NAME, *COPIED, "capture.png"]
     if order is not None:
         drawn = read_json(order / MANIFEST_NAME)
-        if drawn["source"]["height_sha256"] != sha256_file(trained / "height.exr"):
+        if drawn["level_map_sha256"] != read_level_map(trained / LEVEL_MAP).digest:
             cure = "Draw it with: doedesign masks TRAINED --out ORDER"
             raise InputError(str(order), "the order must be drawn from this plate", "another plate's", cure)
         write_atomic(out / "masks.json", canonical_json(drawn))
@@ -60,11 +63,13 @@ def release(trained: Path, order: Path | None, out: Path) -> None:
     write_reconstruction(out / "capture.png", chain.plate, 16)
     scores = read_json(trained / "metrics.json")
     said = {
-        "format": FORMAT,
+        "format": RELEASED,
+        "state": "done",
+        "spec_sha256": manifest["spec_sha256"],
         "trained": {key: manifest[key] for key in TOLD} | {"steps": model.about["steps"]},
         "held_out": {kind: scores[kind] for kind in SCORED} | {"scenes": len(scores["scenes"])},
         "capture": {"near_m": chain.near_m, "words": chain.words},
-        "sha256": {name: sha256_file(out / name) for name in sorted(names)},
+        "results_sha256": {name: sha256_file(out / name) for name in sorted(names)},
     }
     write_atomic(out / MANIFEST_NAME, canonical_json(said))
 
@@ -74,7 +79,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("trained", type=Path, help="folder of a training")
     parser.add_argument("order", nargs="?", type=Path, help="its mask order")
-    parser.add_argument("--out", type=Path, default=RELEASED)
+    parser.add_argument("--out", type=Path, default=HOME)
     given = parser.parse_args()
 
     def work() -> None:

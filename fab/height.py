@@ -32,7 +32,7 @@ class HeightMap:
     Attributes:
         height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative.
         grid: the raster.
-        aperture_m: diameter of the clear aperture, metres.
+        aperture_m: diameter of the relief, metres.
 
     Raises:
         InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
@@ -63,7 +63,7 @@ class HeightMap:
         rows = {
             "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
             "heights": f"{length_text(float(self.height_m.min()))} to {length_text(float(self.height_m.max()))}",
-            "clear aperture": length_text(self.aperture_m),
+            "relief": length_text(self.aperture_m),
         }
         return html_of("height map", rows, self.plot())
 
@@ -115,7 +115,7 @@ def read_height(
         path: ``.npy``, ``.tif``, ``.tiff`` or ``.png``.
         pitch: edge of a pixel. None of these files holds it, so it must be given.
         scale: length that one count of the file stands for. Floats are metres if it is left out; integers need it.
-        aperture: diameter of the clear aperture; the shorter side of the map if left out.
+        aperture: diameter of the relief; the shorter side of the map if left out.
 
     Returns:
         The height map, float32 if the file holds float32 or float16, otherwise float64.

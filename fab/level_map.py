@@ -1,6 +1,6 @@
 """LevelMap: the state of a quantised DOE. Everything else, heights and masks alike, is derived from it.
 
-A level map says for every pixel of a grid which level of a staircase it has. Outside the clear aperture, where chrome
+A level map says for every pixel of a grid which level of a staircase it has. Outside the relief, where chrome
 covers the plate, it holds the top level, blank glass: that is seen to here, once, when a map is made. A file of one
 (`write_level_map`) keeps the bit planes of the level numbers, packed eight pixels to a byte, and loses nothing.
 """
@@ -117,7 +117,7 @@ class LevelMap:
         rows = {
             "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
             "levels": str(self.levels),
-            "clear aperture": length_text(self.aperture_m),
+            "relief": length_text(self.aperture_m),
             "SHA-256": self.digest[:12],
         }
         return html_of(self.name, rows, self.plot())

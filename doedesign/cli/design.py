@@ -10,13 +10,20 @@ from fab.errors import InputError
 
 
 def optimize(
-    spec: Path, *, out: Path | None = None, set_: Overrides = (), allow_code: Flag = False, json_: AsJson = False
+    spec: Path,
+    *,
+    out: Path | None = None,
+    set_: Overrides = (),
+    overwrite: Flag = False,
+    allow_code: Flag = False,
+    json_: AsJson = False,
 ) -> None:
     """Optimise a spec into a run folder, or resume it where it was stopped.
 
     Args:
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
+        overwrite: Where the folder has the run of another spec, remove it and all that was made of it.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
     """
     from doedesign.design.objectives import import_objectives
@@ -25,7 +32,8 @@ def optimize(
 
     read = load_spec(spec, set_)
     folder = out or Path("runs") / read.name
-    work(spec, folder, overrides=set_, objectives=import_objectives(read) if allow_code else None)
+    own = import_objectives(read) if allow_code else None
+    work(spec, folder, overrides=set_, objectives=own, overwrite=overwrite)
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
 
 
@@ -82,7 +90,7 @@ def masks(
         return
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
-    from doedesign.lab.order import PROBE_M, write_masks
+    from doedesign.lab.order import PROBE_M, drawn_as, write_masks
 
     done = write_masks(
         source,
@@ -99,7 +107,7 @@ def masks(
         scale_m=length_of("--scale", scale),
         aperture_m=length_of("--aperture", aperture),
     )
-    say(f"{len(done.report.checks)} checks passed: every pixel of every file is as designed")
+    say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
 
 

@@ -58,6 +58,7 @@ _OPTIONS = {
     "Give `obstruction`,": "Add [obstruction] to the spec, or give --obstruction,",
     "Give `occlusion`:": "Add occlusion to [scene], or give --occlusion:",
     "Give the function by `objectives`, if you trust it.": "Add --allow-code, if you trust the spec.",
+    "give `overwrite`": "give --overwrite",
     "leave `images` out": "leave --images out",
     "Choose another folder": "Choose another --out",
     "take fewer workers.": "take fewer workers (--workers).",

@@ -92,6 +92,16 @@ def write_masks(
     return write_planned(Path("masks") / level_map.name if out is None else out, order, predict=predicted)
 
 
+def drawn_as(order: WrittenOrder) -> str:
+    """Words on the level map that an order was proved to draw: as designed, rounded or repaired."""
+    source, count = order.manifest.source, order.manifest.levels
+    if "repair" in source:
+        return "as repaired"
+    if "rounded" in source:
+        return f"as rounded to {count} levels, not as designed with {source['rounded']['designed_levels']}"
+    return f"as the map rounded to {count} levels" if source.get("kind") == "height map" else "as designed"
+
+
 def _process(given: Process | str | Path | None, levels: Levels, usual: ProcessSpec | None) -> Process:
     """The process that is given or usual; for other levels than the usual ones, what that says of the lithography."""
     if given is not None or usual is None:

@@ -35,12 +35,14 @@ from pydantic import BaseModel, ValidationError
 
 from doedesign import __version__
 from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
+from doedesign.spec.table import toml_key
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
 
 FORMAT = "doedesign run 1"
 TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of its own
+RELEASED = "doedesign released model 1"  # a training that is given away, with its DOE
 CHECKPOINT = "checkpoint.npz"
 LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
 _DEPTHS = "etch_depths_m"
@@ -152,7 +154,9 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Sequence[str] = ()) -> Iterator[Run]:
+def claim_run(
+    folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Sequence[str] = (), *, overwrite: bool = False
+) -> Iterator[Run]:
     """Lock the folder of a run: one for a new run, an unfinished run to resume, or a finished one.
 
     Args:
@@ -160,6 +164,7 @@ def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Se
         spec: the spec.
         inputs: digests of the files that the spec names, by key.
         overrides: changes that led to the spec, "table.key=value", for the record.
+        overwrite: remove the run of another spec, with all that was made of it, instead of refusing the folder.
 
     Yields:
         the run. Nothing is written before `begin_run`.
@@ -175,7 +180,16 @@ def claim_run(folder: Path, spec: Spec, inputs: Mapping[str, str], overrides: Se
         known = (folder / MANIFEST_NAME).is_file()
         if not known and any(folder.iterdir()):
             raise InputError(str(folder), "a run needs a new or empty folder, or its own", "other content", cure)
+        if known and overwrite and not _belongs(_read_manifest(folder), spec, inputs):
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            known = False
         yield Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
+
+
+def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:
+    """Whether a run is that of a spec and its inputs."""
+    return (found.spec_sha256, found.inputs_sha256) == (spec_digest(spec), inputs)
 
 
 def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
@@ -183,12 +197,29 @@ def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
     found = _read_manifest(folder)
     if found.state != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
         return False  # begun and nothing more: there is nothing to lose, whatever the spec was
-    digest = spec_digest(spec)
-    if (found.spec_sha256, found.inputs_sha256) != (digest, inputs):
-        rule = f"the folder must belong to this spec (sha256 {digest[:12]})"
-        got = f"the run of another spec or other input files ({found.spec_sha256[:12]})"
-        raise InputError(str(folder), rule, got, "Choose another output folder, or remove that run.")
+    if not _belongs(found, spec, inputs):
+        keys = _changed_keys(folder / "spec.toml", spec)
+        got = f"the run of another spec or other input files{keys and f', with another {keys}'}"
+        cure = "Choose another output folder, or give `overwrite` to remove that run and all that was made of it."
+        raise InputError(str(folder), "the folder must belong to this spec", got, cure)
     return found.state == "done" and open_run(folder).done
+
+
+def _changed_keys(path: Path, spec: Spec) -> str:
+    """The first keys in which the spec of a run differs from another; nothing where its file cannot be read."""
+
+    def differing(before: Any, after: Any, key: str) -> Iterator[str]:
+        if isinstance(before, dict) and isinstance(after, dict):
+            for name in sorted({*before, *after}):
+                yield from differing(before.get(name), after.get(name), f"{key}.{toml_key(name)}".removeprefix("."))
+        elif before != after:
+            yield key
+
+    try:
+        keys = list(differing(spec_to_json(load_spec(path)), spec_to_json(spec), ""))
+    except InputError:
+        return ""
+    return ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
 
 
 def begin_run(run: Run) -> None:
@@ -206,7 +237,7 @@ def finish_run(run: Run, results: Sequence[str], depths_m: Sequence[float] = ())
 
 
 def open_run(folder: Path) -> Run:
-    """Open a finished run, or a finished training, whose DOE was trained beside its network.
+    """Open a finished run, or a finished or released training, whose DOE was trained beside its network.
 
     Raises:
         InputError: no run, an unfinished one, one without a DOE, or one whose spec or height map changed since it was
@@ -216,7 +247,7 @@ def open_run(folder: Path) -> Run:
         raise InputError(str(folder), "must be a run folder", "no folder", "Make one with: doedesign optimize SPEC")
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
-    manifest = _read_manifest(folder, (FORMAT, TRAINING))
+    manifest = _read_manifest(folder, (FORMAT, TRAINING, RELEASED))
     path = folder / "spec.toml"
     spec = load_spec(path)
     if spec_digest(spec) != manifest.spec_sha256:
@@ -225,7 +256,7 @@ def open_run(folder: Path) -> Run:
     if manifest.state != "done":
         cure = "Resume it with the same command."
         raise InputError(str(folder), "the run must be finished", "an unfinished run", cure)
-    if manifest.format == TRAINING and LEVEL_MAP not in manifest.results_sha256:  # trained behind a plain lens
+    if manifest.format != FORMAT and LEVEL_MAP not in manifest.results_sha256:  # trained behind a plain lens
         cure = "Give the run, or a training behind its plate."
         raise InputError(str(folder), f"must hold a plate, {LEVEL_MAP}", "none", cure)
     for name, digest in manifest.results_sha256.items():

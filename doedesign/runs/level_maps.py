@@ -74,8 +74,10 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
             raise InputError(str(file), f"must be for {own}", level_map.levels, cure)
         return level_map
     levels = Levels(count, own.period_m / max(count, 1))
+    # A training that left the DOE as it was has only the heights after rounding.
+    file = run.path(CONTINUOUS) if run.path(CONTINUOUS).is_file() else run.path(HEIGHT)
     # The design repeats with the full height, so the top half step rounds to the lowest level.
-    height = read_any_height(run.path(CONTINUOUS), aperture_m=run.spec.doe.aperture_m)
+    height = read_any_height(file, aperture_m=run.spec.doe.aperture_m)
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
@@ -178,7 +180,10 @@ def drawing_from(
             design, own = source, source.level_map
         else:
             raise InputError("levels", "a design has its own levels", count, "Leave it out, or give its run.")
-        return Drawing(design.level_map, {"kind": "run", "name": own.name, "level_map_sha256": own.digest}, design)
+        origin: dict[str, Any] = {"kind": "run", "name": own.name, "level_map_sha256": own.digest}
+        if design.levels != own.levels:
+            origin["rounded"] = {"designed_levels": own.levels.count, "efficiency": _kept_light(design, own)}
+        return Drawing(design.level_map, origin, design)
     if count is None or step_m is None:
         missing, name = ("number of levels", "levels") if count is None else ("height of a level", "step")
         raise InputError(str(source), f"a bare height map needs the {missing}", "none", f"Give `{name}`.")
@@ -195,6 +200,22 @@ def drawing_from(
     return Drawing(level_map, origin, None)
 
 
+def _kept_light(design: Design, own: LevelMap) -> float:
+    """Share of the light that goes where a run's `own` level map sends it, in its design drawn with other levels.
+
+    As for a repair, |mean exp(2 pi i dh waves_per_metre)|^2 over the relief; it is said in a warning, too.
+    """
+    assert design.spec is not None  # that of its run
+    wavelength_m = design.spec.optics.design_wavelength_m
+    inside = own.grid.inside_circle(own.aperture_m)
+    moved_m = np.subtract(design.height_m, own.height_m, dtype=np.float64)[inside]
+    kept = float(abs(np.exp(2j * np.pi * design.camera.waves_per_metre(wavelength_m) * moved_m).mean()) ** 2)
+    words = "designed with %d levels and drawn with %d: %.2g %% of its light at %s goes astray; an optimisation with %d"
+    counts = own.levels.count, design.levels.count
+    log.warning(f"{words} levels allows for them", *counts, 100 * (1 - kept), format_length(wavelength_m), counts[1])
+    return kept
+
+
 def _is_wrapped(height: HeightMap, levels: Levels) -> bool:
     """Whether heights beyond the top level stay within one wave, as those of a phase do; say what becomes of them."""
     top_m = levels.total_m + levels.step_m / 2
@@ -208,10 +229,17 @@ def _is_wrapped(height: HeightMap, levels: Levels) -> bool:
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
-    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws."""
+    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws.
+
+    Raises:
+        InputError: no order that can be read, or the order of another level map.
+    """
     from fab.verification.files import read_drawn_levels  # slow to import
 
     manifest = read_manifest(folder)
+    if manifest.source.get("level_map_sha256", level_map.digest) != level_map.digest:
+        rule, got = "the masks must be those of this run", "those of another, such as an earlier one"
+        raise InputError(str(folder), rule, got, "Draw the masks of this run again: doedesign masks RUN.")
     levels, grid = manifest.staircase(), manifest.grid()
     alike = grid.shape == level_map.shape and levels.count == level_map.levels.count
     # The manifest rounds lengths to its units' last digit.

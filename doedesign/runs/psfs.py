@@ -51,7 +51,8 @@ def psfs(
         out: folder for the banks, their metrics (SI units) and pictures.
 
     Returns:
-        PSF banks by name: "continuous", "quantised", and "from_masks" if there is a mask order.
+        PSF banks by name: "continuous" if the run has heights before rounding, "quantised", and "from_masks" if there
+        is a mask order.
 
     Raises:
         InputError: a run, a mask order or depths that cannot be used.
@@ -85,8 +86,10 @@ def psfs(
 
 def _heights_of(run: Run, masks: str | Path | None) -> dict[str, np.ndarray]:
     """Height maps by name; see `psfs`."""
-    level_map = level_map_of_run(run)
-    designs = {"continuous": read_any_height(run.path(CONTINUOUS)).height_m, "quantised": level_map.height_m}
+    level_map, file = level_map_of_run(run), run.path(CONTINUOUS)
+    # A training that left the DOE as it was has only the heights after rounding.
+    before = {"continuous": read_any_height(file).height_m} if file.is_file() else {}
+    designs = {**before, "quantised": level_map.height_m}
     folder = Path("masks") / run.spec.name if masks is None else Path(masks)
     if masks is None and not (folder / MANIFEST_NAME).is_file():
         log.info(f"no mask order in {folder}; write one with: doedesign masks {run.folder}")
@@ -129,8 +132,10 @@ def _write(
     lens = psf(flat, depths=depths, field_rad=field)
     lens_transfer = mtf(flat, depths=depths)
     metrics: dict[str, Any] = {}
-    for name in ("continuous", "quantised"):
-        bank, height = banks[name], designs[name]
+    for name, height in designs.items():
+        if name == "from_masks":
+            continue
+        bank = banks[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
         save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
         transfer = mtf(height, camera, depths)
@@ -145,6 +150,7 @@ def _write(
         metrics["from_masks"] = metrics["quantised"]
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
-    height_map = HeightMap(designs["continuous"], camera.grid, camera.aperture_m)
-    save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
+    if "continuous" in designs:
+        height_map = HeightMap(designs["continuous"], camera.grid, run.spec.doe.aperture_m)
+        save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))

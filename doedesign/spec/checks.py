@@ -154,7 +154,7 @@ def _training(spec: Spec) -> Iterator[InputError]:
 
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
-    rules = (_level_warning, _printing_warning, _window_warnings, _limit_warnings)
+    rules = (_level_warning, _printing_warning, _window_warnings, _occlusion_warning, _limit_warnings)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -199,6 +199,16 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
         yield (
             f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
             f"more than the window's {_rounded(sensor.window_m)}; its rim is cut off."
+        )
+
+
+def _occlusion_warning(spec: Spec) -> Iterator[str]:
+    """Warn of an obstruction whose effect on light is not said: no command that takes pictures goes on without it."""
+    if (spec.obstruction or spec.scene.near_m) and spec.scene.occlusion is None:
+        yield (
+            "scene.occlusion: not named, so `simulate` and `train` will ask for it: how the obstruction takes light "
+            'from what is behind it has no default. Add occlusion = "reciprocal", nearest to wave optics, '
+            '"radiometric", or "paper" for eq. 10.'
         )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
+from fab.layout.limits import Tally
 from fab.units import NM, UM
 
 # The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
@@ -115,6 +116,11 @@ def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
         yield Layer(first.layer, first.datatype), first.size, polygons[start:end]
 
 
+def _unfold_to(folded: Iterable[Any]) -> int:
+    """Count shapes or references with their repetitions."""
+    return sum(one.repetition.size or 1 for one in folded)
+
+
 def _offsets(one: Any) -> NDArray[np.float64]:
     return one.repetition.get_offsets() if one.repetition.size else np.zeros((1, 2))
 
@@ -171,9 +177,21 @@ class GdstkReader:
             rest = []
             yield from self._read(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
 
-    def oasis(self, path: str | Path, layers: Iterable[Layer]) -> Iterator[LayerReading]:
-        """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell."""
-        yield from self._read(gdstk.read_oas(str(path), unit=UM), list(layers))
+    def oasis(self, path: str | Path, layers: Iterable[Layer], most: int = 10**8) -> Iterator[LayerReading]:
+        """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell.
+
+        Raises:
+            InputError: it stands for more than `most` shapes, or more than `fab.layout.limits` allows.
+        """
+        library = gdstk.read_oas(str(path), unit=UM)
+        tally = Tally(str(path), {"shapes": most})
+        cells: list[Any] = library.cells
+        tally.add("cells", len(cells))
+        for cell in cells:
+            tally.add("placed copies", _unfold_to(cell.references))
+            tally.add("shapes", _unfold_to(cell.polygons))
+            tally.add("polygons that are no rectangles", _unfold_to(one for one in cell.polygons if one.size != 4))
+        yield from self._read(library, list(layers))
 
     def _read(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:
         if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:

@@ -19,6 +19,7 @@ from fab.errors import InputError
 from fab.files import opened
 from fab.gds import writer as gds
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order
+from fab.layout.limits import Tally
 from fab.units import UM
 
 _BLOCK = 1 << 20
@@ -117,11 +118,12 @@ class _Found:
         self.all_rects: dict[int, list[NDArray[np.int32]]] = defaultdict(list)
         self.all_polygons: dict[int, list[NDArray[np.int32]]] = defaultdict(list)
 
-    def take(self, buffer: NDArray[np.uint8], stop: int) -> tuple[int, int]:
-        """Read the whole elements at the front of `buffer[:stop]`; return the bytes used and why it stopped."""
-        words = self.words[: stop // 4]
-        np.copyto(words, buffer[: words.size * 4].view(">i4"))
+    def take(self, front: NDArray[np.uint8], tally: Tally) -> tuple[int, int]:
+        """Read the whole elements at the front of some bytes; return the bytes used and why it stopped."""
+        words = self.words[: front.size // 4]
+        np.copyto(words, front[: words.size * 4].view(">i4"))
         read, count, polygons, why = _walk(words, self.rects, self.rect_keys, self.points, self.ends, self.keys)
+        tally.add("polygons that are no rectangles", int(polygons))
         rects, keys = self.rects[:count], self.rect_keys[:count]
         mixed = count and (keys != keys[0]).any()
         for key in np.unique(keys) if mixed else keys[:1]:
@@ -151,40 +153,46 @@ class _Stream:
     """A file read block by block, of which the front is looked at and then dropped."""
 
     def __init__(self, path: str | Path, file: BinaryIO) -> None:
-        self.path, self._file = path, file
-        self.buffer = np.empty(_BLOCK + _LONGEST, dtype=np.uint8)
-        self.offset = self.kept = 0
+        self.path, self._file, self.tally = path, file, Tally(str(path))
+        self._buffer = np.empty(_BLOCK + _LONGEST, dtype=np.uint8)
+        self._start = self._end = self.offset = 0
+
+    @property
+    def front(self) -> NDArray[np.uint8]:
+        """Bytes that were read and not yet dropped."""
+        return self._buffer[self._start : self._end]
 
     def fill(self) -> bool:
         """Read on, as far as there is room; return whether anything came."""
-        room = min(_BLOCK, self.buffer.size - self.kept)
-        got = self._file.readinto(self.buffer.data[self.kept : self.kept + room])  # type: ignore[attr-defined]
-        self.kept += got
+        kept = self._end - self._start
+        self._buffer[:kept] = self.front.copy()
+        room = min(_BLOCK, self._buffer.size - kept)
+        got = self._file.readinto(self._buffer.data[kept : kept + room])  # type: ignore[attr-defined]
+        self._start, self._end = 0, kept + got
         return bool(got)
 
     def drop(self, count: int) -> None:
         """Forget the front."""
-        self.buffer[: self.kept - count] = self.buffer[count : self.kept].copy()
-        self.kept -= count
+        self._start += count
         self.offset += count
 
     def record(self, rule: str, *kinds: int) -> tuple[int, bytes]:
         """Take the next record, which must be of one of these kinds; return its kind and data."""
         length = self._ahead(4, rule)
-        kind = int.from_bytes(self.buffer[2:4].tobytes(), "big")
+        kind = int.from_bytes(self.front[2:4].tobytes(), "big")
         if kind not in kinds or length < 4:
             _fail(self.path, rule, self.offset, kind)
         self._ahead(length, rule)
-        data = self.buffer[4:length].tobytes()
+        data = self.front[4:length].tobytes()
         self.drop(length)
         return kind, data
 
     def _ahead(self, count: int, rule: str) -> int:
         """Have some bytes ready; return the length of the record at the front."""
-        while self.kept < count:
+        while self._end - self._start < count:
             if not self.fill():
                 _fail(self.path, rule, self.offset)
-        return int.from_bytes(self.buffer[:2].tobytes(), "big")
+        return int.from_bytes(self.front[:2].tobytes(), "big")
 
 
 _WHOLE = "the file must be a whole GDSII stream"
@@ -232,20 +240,25 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
     """Read a cell from its name to its end."""
     name = _name(stream.record(_WHOLE, gds.STRNAME)[1])
     references = []
+    most = _LONGEST  # little at first: a file may have many small cells
     while True:
-        read, why = found.take(stream.buffer, stream.kept)
+        read, why = found.take(stream.front[:most], stream.tally)
         stream.drop(read)
         if why == _OPEN:
             _fail(stream.path, "every boundary must end at its first point", stream.offset)
         if why == _UNEXPECTED:
             rule = "a cell must hold plain boundaries (layer, datatype, points) and references only"
-            _fail(stream.path, rule, stream.offset, int.from_bytes(stream.buffer[2:4].tobytes(), "big"))
+            _fail(stream.path, rule, stream.offset, int.from_bytes(stream.front[2:4].tobytes(), "big"))
         if why == _DONE:
             return Cell(name, found.shapes(), tuple(references))
         if why == _REFERENCE:
             references.append(_read_reference(stream))
-        elif not stream.fill():
+            stream.tally.add("placed copies", references[-1].columns * references[-1].rows)
+            most = _LONGEST
+        elif read == 0 and not stream.fill():
             _fail(stream.path, "the file must be whole, up to its end record", stream.offset)
+        else:
+            most = _BLOCK + _LONGEST
 
 
 def read_gds(path: str | Path) -> Layout:
@@ -255,19 +268,23 @@ def read_gds(path: str | Path) -> Layout:
     too) polygons; layers are sorted and have no names.
 
     Raises:
-        InputError: the file is missing, cut off, not GDSII, or holds anything else; the message names the offset.
+        InputError: the file is missing, cut off, not GDSII, or holds anything else (the message names the offset), or
+            more than `fab.layout.limits` allows.
     """
     with opened(path) as file:
         stream, found, cells = _Stream(path, file), _Found(), []
         dbu_m = _read_unit(stream)
         while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+            stream.tally.add("cells")
             cells.append(_read_cell(stream, found))
         # Zeros may follow, since some programs fill the last block of a tape.
-        while stream.kept or stream.fill():
-            if stream.buffer[: stream.kept].any():
+        while stream.front.size or stream.fill():
+            if stream.front.any():
                 _fail(path, "the file must end with its end record", stream.offset)
-            stream.drop(stream.kept)
+            stream.drop(stream.front.size)
     try:
-        return Layout(dbu_m, in_order(cells))
+        ordered = in_order(cells)
     except ValueError as error:
         raise InputError(str(path), "the cells must make one drawing", str(error), _SPOILED) from error
+    stream.tally.add_places(ordered)
+    return Layout(dbu_m, ordered)

@@ -121,7 +121,7 @@ def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:
     """Write an OASIS file, which may be broken and so stand for billions of shapes, as GDSII through KLayout."""
     import klayout.db as kdb
 
-    layout = kdb.Layout()
+    layout = kdb.Layout(False)  # which keeps repeated shapes folded
     options = kdb.SaveLayoutOptions()
     options.format = "GDS2"
     cure = "Write the order again, or fetch the file again."

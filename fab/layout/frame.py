@@ -2,7 +2,7 @@
 
     PLATE    outline of the mask blank (100/0), labels beside the wafer
     WAFER    outline (101/0), dies on a raster, alignment sites left and right, test structures
-    DIE      the DOE in its middle, marks below it, the die's box (110/0) and the clear aperture (102/0)
+    DIE      the DOE in its middle, marks below it, the die's box (110/0) and the relief's outline (102/0)
 
 All cells are upright, about the middle of the photomask, which is the middle of the wafer. Layers from 100 on say
 where things are; they are in the review files and on no mask.
@@ -26,7 +26,7 @@ from fab.level_map import LevelMap
 from fab.units import MM, UM, format_length
 
 BLANK, WAFER = Layer(100, 0, "BLANK_OUTLINE"), Layer(101, 0, "WAFER_OUTLINE")
-APERTURE, DIE = Layer(102, 0, "CLEAR_APERTURE"), Layer(110, 0, "DIE_BOX")
+RELIEF, DIE = Layer(102, 0, "RELIEF"), Layer(110, 0, "DIE_BOX")
 
 # The rim that is held, beaded or ground.
 _RIM_M = 4 * MM
@@ -96,12 +96,12 @@ def draw_frame(
     wafer.require_room(raster)
     dies = _raster(raster, pitch)
     unit = _InUnits(dbu_m)
-    aperture = unit.circle(level_map.aperture_m)
+    relief = unit.circle(level_map.aperture_m)
     names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
     die_cells = [
         Cell(
             f"{stem}_DIE" if number == 0 else f"{stem}_{split.code}_DIE",
-            {DIE: unit.square(pitch), APERTURE: aperture, **_titled(marks, split, photomasks[0]).shapes},
+            {DIE: unit.square(pitch), RELIEF: relief, **_titled(marks, split, photomasks[0]).shapes},
             (Reference(f"{stem}_{split.code}"),),
         )
         for number, split in enumerate(splits)

@@ -9,6 +9,7 @@ The database unit is 1 nm where every pixel edge falls on it, otherwise the coar
 none does, each edge is rounded once, so that neighbours still share it.
 """
 
+import graphlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -143,14 +144,17 @@ def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
         raise ValueError(f"the placed cell {missing[0]!r} is missing")
     if len(tops) != 1:
         raise ValueError(f"{len(tops)} cells instead of one are placed by no other")
-    done: dict[str, Cell] = {}
-    while waiting:
-        ready = [c for c in waiting.values() if all(r.cell in done for r in c.references)]
-        if not ready:
-            raise ValueError(f"cell {min(waiting)!r} places itself")
-        for cell in ready:
-            done[cell.name] = waiting.pop(cell.name)
-    return tuple(done.values())
+    sorter = graphlib.TopologicalSorter({name: {r.cell for r in cell.references} for name, cell in waiting.items()})
+    try:
+        sorter.prepare()
+    except graphlib.CycleError as error:
+        raise ValueError(f"cell {min(error.args[1])!r} places itself") from error
+    rank = {name: n for n, name in enumerate(waiting)}
+    done: list[Cell] = []
+    while ready := sorter.get_ready():
+        done += [waiting[name] for name in sorted(ready, key=rank.__getitem__)]
+        sorter.done(*ready)
+    return tuple(done)
 
 
 @dataclass(frozen=True)
@@ -158,8 +162,8 @@ class Chrome:
     """The chrome around the clear aperture, as it is drawn.
 
     Attributes:
-        overlap_m: how far the chrome reaches inside the clear aperture, metres, so that the edge of the relief stays
-            covered when the chrome is aligned a little off.
+        overlap_m: how far the chrome reaches over the edge of the relief, metres, so that it stays covered
+            when the chrome is aligned a little off.
         outer_m: outer radius, metres; by default the corners of the raster and half a millimetre more.
         chord_error_m: largest distance between the circles and their chords, metres.
     """

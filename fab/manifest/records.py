@@ -240,7 +240,7 @@ class Manifest:
 
     @property
     def aperture_m(self) -> float:
-        """Diameter of the clear aperture, metres."""
+        """Diameter of the relief, metres; light passes the opening of the chrome, the clear aperture."""
         return round(self.aperture_mm * MM, 18)
 
     def to_json(self) -> bytes:

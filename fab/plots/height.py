@@ -27,7 +27,7 @@ def plot_height(
     """Draw a height map: the whole, a window at the centre and one at the edge, and the share of area at every height.
 
     The overview is a smooth mean where there are more cells than dots, and says so; the windows show single cells.
-    Outside the clear aperture, where chrome covers the glass, all is grey. With `levels` the axis names their heights,
+    Outside the relief, where chrome covers the glass, all is grey. With `levels` the axis names their heights,
     and a map that stands on them is counted per level. The picture takes the place of `ax`; a new figure by default.
     """
     from matplotlib import colormaps
@@ -76,7 +76,7 @@ def _draw_whole(axes: "Axes", height: "HeightMap", inside: NDArray[np.bool_], st
     factor = max(grid.shape) / _MOST
     averaged = f", mean over about {factor:.2g} × {factor:.2g}" if factor > 1 else ""
     axes.set_title(f"{grid.shape[1]} × {grid.shape[0]} cells{averaged}")
-    axes.set_title(f"clear aperture {length_text(height.aperture_m)}", loc="right", fontsize=SMALL, color=MARK)
+    axes.set_title(f"relief {length_text(height.aperture_m)}", loc="right", fontsize=SMALL, color=MARK)
     axes.set_xlabel("x (mm)")
     axes.set_ylabel("y (mm)")
     axes.locator_params(nbins=6, steps=[1, 2, 5, 10])
@@ -116,7 +116,7 @@ def _draw_shares(
     ends_m: tuple[float, float],
     style: dict[str, Any],
 ) -> None:
-    """Draw the colour scale and, along it, the share of the clear aperture's area at every height."""
+    """Draw the colour scale and, along it, the share of the relief's area at every height."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -134,5 +134,5 @@ def _draw_shares(
     axes.set_yticks([])
     axes.set_xlim(left=0)
     axes.set_xlabel(f"area per {(edges[1] - edges[0]) / NM:.3g} nm (%)" if fine else "area per level (%)")
-    axes.set_title("share of the clear aperture")
+    axes.set_title("share of the relief")
     axes.spines[["top", "right"]].set_visible(False)

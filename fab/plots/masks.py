@@ -85,5 +85,5 @@ def _draw_chrome(axes: "Axes", level_map: "LevelMap", radii_m: tuple[float, floa
     x0, x1, y0, y1 = box_mm(level_map.grid)
     axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=INK, lw=0.8)
     axes.set(xlim=(-1.03 * outer, 1.03 * outer), ylim=(-1.03 * outer, 1.03 * outer), aspect="equal")
-    axes.set_title(f"chrome: opening {2 * inner:.6g} mm,\nclear aperture {aperture_m / MM:.6g} mm (dashed)")
+    axes.set_title(f"chrome: clear aperture {2 * inner:.6g} mm,\nrelief {aperture_m / MM:.6g} mm (dashed)")
     scale_bar(axes, 2.06 * outer * MM)

@@ -22,7 +22,7 @@ def plot_wafer(
     """Draw where everything lies on a photomask, seen from the etched side.
 
     The cells around the DOE are the frame (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
-    number. Diameter of the clear aperture and database unit are metres.
+    number. Diameter of the relief and database unit are metres.
     """
     from matplotlib.patches import Circle, Rectangle
 
@@ -56,8 +56,7 @@ def _words(wafer: "Wafer", frame: "Frame") -> str:
     return (
         f"Blank of {length_text(wafer.blank_m)}, wafer of {length_text(wafer.diameter_m)} and "
         f"{length_text(wafer.thickness_m)}, {rows} x {columns} dies {length_text(frame.die_m)} apart. "
-        f"Seen from the etched side, +y up; {wafer.reading}. Grey: clear apertures."
-        + (numbered if any(frame.splits) else "")
+        f"Seen from the etched side, +y up; {wafer.reading}. Grey: reliefs." + (numbered if any(frame.splits) else "")
     )
 
 

@@ -1,7 +1,7 @@
 """The rules of lithography: what on a mask is too fine for the process, how often, and where.
 
 What is etched is a line, what is not is a space, on every mask by itself and as drawn, before any compensation. Outside
-the clear aperture nothing is etched, so the staircase of its edge is an edge like any other.
+the relief nothing is etched, so the staircase of its edge is an edge like any other.
 
 * Width. The length of a run of pixels of one kind along x or along y. A space has a line at either end; the blank glass
   around the plate is none. This is what KLayout's `width` and `space` checks measure with projection metrics.
@@ -11,7 +11,7 @@ the clear aperture nothing is etched, so the staircase of its edge is an edge li
 * Sliver. A narrow place at least three times the minimum long: a ribbon of resist, or of opening, that bends, breaks
   or lifts off, where a shorter one is merely lost.
 * Kissing corner. Two pixels of one kind that touch only at a corner, which a process joins or parts as it likes.
-* Density. The etched share of the clear aperture, and of the emptiest and the fullest square window inside it, because
+* Density. The etched share of the relief, and of the emptiest and the fullest square window inside it, because
   etch rates follow it.
 * Off grid. A pixel edge that is no whole multiple of the address unit of the mask writer, which will round it.
 """
@@ -125,7 +125,7 @@ class Widths:
 class PlaneRules:
     """One etch mask: lines (etched), spaces between them, and how many corners kiss.
 
-    The densities are the etched share of the clear aperture, and of its emptiest and fullest window. `places` are some
+    The densities are the etched share of the relief, and of its emptiest and fullest window. `places` are some
     of the worst, narrowest first and then longest.
     """
 
@@ -297,7 +297,7 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     """Check every etch mask of a level map.
 
     Args:
-        level_map: the DOE; outside its clear aperture nothing is etched.
+        level_map: the DOE; outside its relief nothing is etched.
         process: rules; or a process, or the name of a stock process, whose narrowest line and space are the rules.
 
     Raises:

@@ -42,7 +42,7 @@ _WIDEST = 32
 
 @dataclass(frozen=True)
 class RepairCost:
-    """Extent and cost of a repair, over the clear aperture.
+    """Extent and cost of a repair, over the relief.
 
     `changed_share` is that of pixels with another level; `efficiency`, |mean exp(2 pi i dh waves_per_metre)|^2, of the
     light that still goes where it was meant to. Broken places are counted over all masks; afterwards they are corners
@@ -202,7 +202,7 @@ def repair(level_map: LevelMap, process: Process | Rules | str, waves_per_metre:
     """Change as few levels as possible, as little as possible, until no mask breaks a rule.
 
     Args:
-        level_map: the DOE; nothing changes outside its clear aperture, where the glass stays blank.
+        level_map: the DOE; nothing changes outside its relief, where the glass stays blank.
         process: narrowest line and space, as for `check`. With neither there is nothing to repair.
         waves_per_metre: waves of light per metre of height, (n - 1) / wavelength, which says which levels are near each
             other; one wave over the period of the staircase by default.

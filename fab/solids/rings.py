@@ -67,7 +67,7 @@ def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
 
 
 def rings_from_levels(ring_level: NDArray[np.uint8], level_map: LevelMap) -> Rings:
-    """Return the rings of a map: one pixel wide each, the last one as far as the clear aperture."""
+    """Return the rings of a map: one pixel wide each, the last one as far as the edge of the relief."""
     levels = level_map.levels
     outer_m = np.arange(1, len(ring_level) + 1) * np.float64(level_map.grid.pitch_m)
     outer_m[-1] = level_map.aperture_m / 2
@@ -80,7 +80,7 @@ def rings_from_levels(ring_level: NDArray[np.uint8], level_map: LevelMap) -> Rin
 
 
 def pixel_share(level_map: LevelMap, ring_level: NDArray[np.uint8]) -> float:
-    """Return the share of the clear aperture, at a million even points (0.1 %), where pixels and rings differ."""
+    """Return the share of the relief, at a million even points (0.1 %), where pixels and rings differ."""
     grid, aperture_m = level_map.grid, level_map.aperture_m
     number = np.arange(_SAMPLES)
     radius_m = aperture_m / 2 * np.sqrt((number + 0.5) / _SAMPLES)

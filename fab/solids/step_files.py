@@ -38,11 +38,11 @@ def _rings(model: DoeModel) -> tuple[Rings | None, str]:
     level_map = model.level_map
     levels_of_rings = ring_levels(level_map)
     if levels_of_rings is None:
-        return None, "millimetres; one die, relief plane at z = 0, where the clear aperture is drawn flat"
+        return None, "millimetres; one die, relief plane at z = 0, where the relief is drawn flat"
     share = 100 * pixel_share(level_map, levels_of_rings)
     return rings_from_levels(levels_of_rings, level_map), (
         f"millimetres; one die, blank surface at z = 0, relief of {len(levels_of_rings)} rings as exact circles; "
-        f"the masks draw them in pixels, with another height on {share:.2g} % of the clear aperture"
+        f"the masks draw them in pixels, with another height on {share:.2g} % of the relief"
     )
 
 

@@ -2,7 +2,7 @@
 
 The origin is the centre of the clear aperture, z = 0 the blank surface (the datum, on which the relief is etched and
 the chrome lies), and the z axis the light axis. The glass lies below, the relief faces +z. A file holds named parts:
-SUBSTRATE and CHROME are solids, DATUM_CLEAR_APERTURE is a disc without thickness in the plane z = 0, to be referred to.
+SUBSTRATE and CHROME are solids, DATUM_RELIEF is a disc without thickness in the plane z = 0, to be referred to.
 
 A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into the
 top of the substrate. Any other map belongs in a mesh; a small window of one can be STEP (`fab.solids.patch`).
@@ -157,7 +157,7 @@ class Rings:
 
 def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | None, rings: Rings | None) -> None:
     # Chrome may reach the edge of the glass; the rim of the relief must leave some surface around it.
-    most = {"clear aperture": (aperture_m / 2, 1 - 1e-6)}
+    most = {"relief": (aperture_m / 2, 1 - 1e-6)}
     if chrome is not None:
         most["chrome"] = (chrome.outer_m, 1 + 1e-12)
     for name, (radius, share) in most.items():
@@ -167,7 +167,7 @@ def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | N
             raise InputError(name, rule, got, "Choose a larger die or a smaller circle.")
     if rings is not None and not rings.outer_m[-1] <= aperture_m / 2 * (1 + 1e-9):
         got = f"{format_length(float(rings.outer_m[-1]))} of {format_length(aperture_m / 2)}"
-        raise InputError("rings", "must lie inside the clear aperture", got, "Cut them at the aperture.")
+        raise InputError("rings", "must lie inside the relief", got, "Cut them at its edge.")
     if rings is not None and not rings.blank_m < substrate.thickness_m:
         got = f"{format_length(rings.blank_m)} into {format_length(substrate.thickness_m)}"
         raise InputError("rings", "must be less deep than the substrate is thick", got, "Check the two lengths.")
@@ -196,15 +196,15 @@ def substrate_step(
     chrome: ChromeRing | None = None,
     rings: Rings | None = None,
 ) -> None:
-    """Write the plate as STEP: glass, chrome and the clear aperture in the datum plane.
+    """Write the plate as STEP: glass, chrome and the place of the relief in the datum plane.
 
-    Without rings the surface is flat, with the clear aperture (its diameter in metres) as a face of its own. The chrome
+    Without rings the surface is flat, with the relief (diameter in metres) as a face of its own. The chrome
     lies flat at z = 0, also where it reaches over etched rings.
     """
     _require_fit(substrate, aperture_m, chrome, rings)
     profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (aperture_m / 2, 0.0)]
     surface = outline(substrate.width_m, None if substrate.outline == "die" else substrate.flat_m)
-    parts = {"SUBSTRATE": plate(surface, substrate.thickness_m, profile), "DATUM_CLEAR_APERTURE": disc(aperture_m / 2)}
+    parts = {"SUBSTRATE": plate(surface, substrate.thickness_m, profile), "DATUM_RELIEF": disc(aperture_m / 2)}
     if chrome is not None:
         parts["CHROME"] = chrome.solid()
     write_step(path, "DOE", parts)
@@ -220,14 +220,14 @@ def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[
 def wafer_step(
     path: str | Path, wafer: Substrate, aperture_m: float, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
 ) -> None:
-    """Write a wafer as STEP: flat glass, and chrome and clear aperture of every die about its middle x, y, metres."""
+    """Write a wafer as STEP: flat glass; chrome and place of the relief of every die about its middle x, y, metres."""
     for x, y in places_m:
         if not wafer.holds(x, y, chrome.outer_m):
             got = f"a chrome of {format_length(2 * chrome.outer_m)} at {format_length(x)}, {format_length(y)}"
             raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
     parts = {
         "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),
-        "DATUM_CLEAR_APERTURE": copies(disc(aperture_m / 2), places_m),
+        "DATUM_RELIEF": copies(disc(aperture_m / 2), places_m),
         "CHROME": copies(chrome.solid(), places_m),
     }
     write_step(path, "WAFER", parts)

@@ -1,8 +1,8 @@
 """The solids and height maps of an order, for people and programs that read no masks.
 
-    DOE_<ID>_PLATE.step     one die of glass with its chrome and the clear aperture in the datum plane; with its rings
+    DOE_<ID>_PLATE.step     one die of glass with its chrome and the place of the relief; with its rings
                             as exact circles if the map is radial
-    DOE_<ID>_WAFER.step     the wafer with the chrome and the clear aperture of every die
+    DOE_<ID>_WAFER.step     the wafer with the chrome and the place of the relief of every die
     DOE_<ID>_RELIEF.3mf     the relief as a closed mesh, block-reduced where it is large; also .glb and _MM.stl
     DOE_<ID>_PATCH.step     on request a window at full resolution, also as .3mf, .glb and _MM.stl
     DOE_<ID>_HEIGHT.tif     heights in 16 bits; also .npy, in metres

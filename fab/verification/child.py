@@ -11,15 +11,18 @@ from typing import Any
 from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool, TerminatedWorkerError
 
-# A sound file takes far less of either: gdstk about 350 bytes for a polygon of ten bytes in a packed file, and seconds
-# for a million of them.
-_SECONDS, _SECONDS_PER_BYTE = 5.0, 10e-6
-_BYTES, _BYTES_PER_BYTE = 1 << 30, 400
+# A sound file takes far less of either: gdstk about 350 bytes for a polygon, and seconds for a million of them.
+_SECONDS, _SECONDS_PER_SHAPE = 4.0, 5e-6
+_BYTES, _BYTES_PER_SHAPE = 1 << 30, 400
 _IDLE_S = 60  # after which a child without work ends
 
 
 class ChildFailed(Exception):
-    """The work could not be done within the limits; the text says why."""
+    """The work could not be done; the text says why."""
+
+
+class TooMuch(ChildFailed):
+    """The work takes more time or memory than it may."""
 
 
 class Child:
@@ -33,27 +36,28 @@ class Child:
         """Begin a piece of work; `result` waits for it."""
         if self._executor is None:
             self._executor = ProcessPoolExecutor(max_workers=1, timeout=_IDLE_S)
-        self._ready = self._executor.submit(_import, work.__module__)
+        self._ready = self._executor.submit(_import, [each.__module__ for each in (work, *arguments) if callable(each)])
         return self._executor.submit(work, *arguments)
 
-    def result(self, begun: "Future[Any]", file_bytes: int) -> Any:
+    def result(self, begun: "Future[Any]", shapes: int) -> Any:
         """Wait for a piece of work.
 
         Args:
             begun: the work.
-            file_bytes: size of the file that it reads, by which its time is limited.
+            shapes: number of shapes that it may have to read, by which its time is limited.
 
         Raises:
-            ChildFailed: the work failed, or its process died, had not enough memory, or took too long and is ended.
+            TooMuch: the work had not enough memory, or took too long and is ended.
+            ChildFailed: the work failed, or its process died.
         """
         try:
             self._ready.exception()  # what is imported for the first time does not count
-            return begun.result(_SECONDS + _SECONDS_PER_BYTE * file_bytes)
+            return begun.result(_SECONDS + _SECONDS_PER_SHAPE * shapes)
         except TimeoutError as error:
             self.end()
-            raise ChildFailed("it takes too long") from error
+            raise TooMuch("it takes too long") from error
         except MemoryError as error:
-            raise ChildFailed("it takes too much memory") from error
+            raise TooMuch("it takes too much memory") from error
         except (BrokenProcessPool, TerminatedWorkerError) as error:
             self.end()
             raise ChildFailed("the library that reads it crashes") from error
@@ -80,12 +84,13 @@ def child_process() -> Iterator[Child]:
         raise
 
 
-def _import(module: str) -> None:
-    importlib.import_module(module)
+def _import(modules: list[str]) -> None:
+    for module in modules:
+        importlib.import_module(module)
 
 
-def limited(file_bytes: int, work: Callable[..., Any], *arguments: Any) -> Any:
-    """Do work with no more memory than reading a file of so many bytes takes, beyond what is in use already.
+def limited(shapes: int, work: Callable[..., Any], *arguments: Any) -> Any:
+    """Do work with no more memory than reading so many shapes takes, beyond what is in use already.
 
     For the child: neither it nor a library says anything on its own; who waits for the result is told.
     """
@@ -99,7 +104,7 @@ def limited(file_bytes: int, work: Callable[..., Any], *arguments: Any) -> Any:
     except ImportError:  # Windows
         return work(*arguments)
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = _in_use() + _BYTES + _BYTES_PER_BYTE * file_bytes
+    most = _in_use() + _BYTES + _BYTES_PER_SHAPE * shapes
     with contextlib.suppress(ValueError, OSError):  # a lower limit is there already
         resource.setrlimit(resource.RLIMIT_DATA, (most, before[1]))
     try:

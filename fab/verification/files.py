@@ -31,13 +31,14 @@ from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Layer, PixelEdges, pixel_edges
+from fab.layout.limits import MOST_AROUND
 from fab.layout.polygons import paint
 from fab.level_map import level_digest
 from fab.levels import Levels
 from fab.manifest.records import FileEntry, Manifest
 from fab.solids.write import model_problems
 from fab.units import MM
-from fab.verification.child import Child, ChildFailed, child_process, limited
+from fab.verification.child import Child, ChildFailed, TooMuch, child_process, limited
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
 from fab.verification.report import Check
 from fab.verification.shop_checks import drawing_problems
@@ -138,18 +139,25 @@ def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check,
     return Check(entry.file, question, tuple(problems)), fit
 
 
-def _altered_oasis(path: Path, entry: FileEntry, expected: Expected) -> Check:
+def _most_shapes(entry: FileEntry, expected: Expected) -> int:
+    """Twice the shapes that the manifest states for a file: more are not unfolded to see how they differ.
+
+    A manifest that states more than a rectangle per pixel and what the other cells may hold is not believed.
+    """
     around = sum(one.polygons for cell in entry.cells for one in cell.layers)
     does = expected.manifest.drawn().values()
     etched = sum(one.polygons for drawn in does for one in drawn)
-    most = 2 * (etched + len(does) * expected.manifest.chrome.polygons + around)
-    with tempfile.TemporaryDirectory() as folder:
-        gds = Path(folder) / "altered.gds"
-        try:
-            oasis_to_gds(path, gds, most)
-        except InputError as error:
-            return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.got}",))
-        return _own_check(gds, entry, expected)[0]
+    stated = etched + len(does) * expected.manifest.chrome.polygons + around
+    return 2 * min(stated, len(does) * expected.planes.size + MOST_AROUND)
+
+
+def _altered_oasis(path: Path, entry: FileEntry, expected: Expected, scratch: Path) -> Check:
+    gds = scratch / f"{entry.file}.gds"
+    try:
+        oasis_to_gds(path, gds, _most_shapes(entry, expected))
+    except InputError as error:
+        return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.rule}, but got {error.got}",))
+    return _own_check(gds, entry, expected)[0]
 
 
 def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
@@ -162,27 +170,39 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
     again = GdstkReader(expected.etch_layers(entry), expected.edges)
     numbers = [tuple(map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers]
     others = dict.fromkeys(Layer(number, datatype) for number, datatype in numbers)
-    readings = again.oasis(path, layers) if entry.format == _OASIS else again.gds(path, layers, others)
-    problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
-    problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
+    if entry.format == _OASIS:
+        readings = again.oasis(path, layers, _most_shapes(entry, expected))
+    else:
+        readings = again.gds(path, layers, others)
+    try:
+        problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
+    except InputError as error:
+        problems = [f"it cannot be read: {error.rule}, but got {error.got}"]
+    else:
+        problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
     return Check(entry.file, "gdstk, every pixel", tuple(problems))
 
 
-def _check_oasis(child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected) -> Callable[[], Check]:
+def _check_oasis(
+    child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected, scratch: Path
+) -> Callable[[], Check]:
     """Begin to check an OASIS file in a child process; return what waits for the result."""
-    size = path.stat().st_size
-    first, *others = (_library_check, _altered_oasis) if intact else (_altered_oasis,)
+    shapes = _most_shapes(entry, expected)
     path = path.absolute()  # the child may work in another folder
-    begun = child.begin(limited, size, first, path, entry, expected)
+    works = [(_library_check, path, entry, expected), (_altered_oasis, path, entry, expected, scratch)]
+    first, *others = works if intact else works[1:]
+    begun = child.begin(limited, shapes, *first)
 
     def wait() -> Check:
         try:
-            return child.result(begun, size)
+            return child.result(begun, shapes)
+        except TooMuch as error:
+            return Check(entry.file, "OASIS", (f"it cannot be read: {error}",))
         except ChildFailed as error:
             problems = [f"it cannot be read: {error}"]
         for other in others:
             try:
-                found = child.result(child.begin(limited, size, other, path, entry, expected), size)
+                found = child.result(child.begin(limited, shapes, *other), shapes)
                 return replace(found, problems=(*problems, *found.problems))
             except ChildFailed as error:
                 problems.append(f"nor by KLayout: {error}")
@@ -206,9 +226,9 @@ def check_files(folder: Path, expected: Expected, intact: Mapping[str, bool]) ->
     """
     checks = []
     files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
-    with child_process() as child:
+    with tempfile.TemporaryDirectory(prefix="doedesign-verify-") as scratch, child_process() as child:
         begun = {
-            entry.file: _check_oasis(child, folder / entry.file, entry, intact[entry.file], expected)
+            entry.file: _check_oasis(child, folder / entry.file, entry, intact[entry.file], expected, Path(scratch))
             for entry in files
             if entry.format == _OASIS
         }

@@ -85,6 +85,24 @@ def test_another_spec_or_other_inputs_are_refused(run: Run, spec: Spec):
             pytest.fail("claimed")
 
 
+def test_another_spec_overwrites_on_request_alone(done: Run, spec: Spec, tmp_path: Path):
+    """The message says what differs, and what was made of the old run goes with it; the same spec loses nothing."""
+    (done.folder / "psf").mkdir()
+    (done.folder / "psf" / "manifest.json").write_text("{}")
+    (tmp_path / "kept.txt").write_text("mine")
+    (done.folder / "link").symlink_to(tmp_path)
+    changed = load_spec(QUICK, ["optimize.seed=2", "objective[0].weight=3.0"])
+    found = pytest.raises(InputError, match=r"with another objective, optimize\.seed\. .*give `overwrite`")
+    with found, claim_run(done.folder, changed, {}):
+        pytest.fail("claimed")
+    with claim_run(done.folder, spec, {}, overwrite=True) as run:
+        assert (run.folder / "psf" / "manifest.json").is_file()
+    with claim_run(done.folder, changed, {}, overwrite=True) as run:
+        assert not run.done
+        assert list(run.folder.iterdir()) == []
+    assert (tmp_path / "kept.txt").read_text() == "mine"
+
+
 def test_a_run_that_got_nowhere_gives_way(run: Run):
     """Such as one with a start that diverges at once: mend the spec and go on."""
     other = load_spec(QUICK, ["optimize.seed=2"])

@@ -7,7 +7,7 @@ import pytest
 from fab.errors import InputError
 from fab.gds.writer import write_gds
 from fab.grid import Grid
-from fab.layout.frame import APERTURE, BLANK, DIE, WAFER, draw_frame
+from fab.layout.frame import BLANK, DIE, RELIEF, WAFER, draw_frame
 from fab.layout.geometry import Cell, Layer, Layout, Shapes
 from fab.layout.part import photomasks_of
 from fab.layout.split import splits_of
@@ -60,7 +60,7 @@ def test_doe_and_die_come_where_they_are_said_to_be(tmp_path, dies):
     found = boxes(layout, DIE.number)
     assert [((x0 + x1) // 2, (y0 + y1) // 2) for x0, y0, x1, y1 in found] == middles
     assert {x1 - x0 for x0, _, x1, _ in found} == {round(frame.die_m * 1e9)}
-    assert len(boxes(layout, APERTURE.number)) == len(middles)
+    assert len(boxes(layout, RELIEF.number)) == len(middles)
     assert boxes(layout, BLANK.number) == [(-63500000, -63500000, 63500000, 63500000)]
     (wafer,) = boxes(layout, WAFER.number)
     # A polygon of 180 corners comes within its sagitta of the circle.

@@ -55,7 +55,7 @@ def test_a_radial_order_has_its_rings_as_exact_circles(tmp_path):
 
 def test_any_other_order_has_a_flat_plate(written_order):
     entry = entries(written_order)["PLATE.step"]
-    assert "where the clear aperture is drawn flat" in entry.content
+    assert "where the relief is drawn flat" in entry.content
 
 
 def test_the_wafer_of_an_order(written_order):

@@ -29,7 +29,7 @@ def plot(wafer, ax=None):
     return plot_wafer(wafer, frame, 4e-3, 1e-9, "plate", ax)
 
 
-def test_every_clear_aperture_is_there_and_the_bytes_repeat():
+def test_every_relief_is_there_and_the_bytes_repeat():
     pictures = (dots_of(plot(Wafer())), dots_of(plot(Wafer(dies=(2, 2)))))
     grey = [int((np.abs(255 * p - [0x8C, 0x8F, 0x94]).sum(axis=2) < 12).sum()) for p in pictures]
     # Nine discs against four; rims and the frames of dies blur it by a few per cent.

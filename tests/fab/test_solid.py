@@ -102,7 +102,7 @@ def test_a_wafer_carries_the_chrome_of_every_die(tmp_path, wafer):
         assert found[name].centre_m == pytest.approx(body.centre_m, abs=1e-11)
     shapes = shapes_of(tmp_path / "w.step")
     rings = [solid.Center().toTuple()[:2] for solid in shapes["CHROME"].Solids()]
-    discs = [face.Center().toTuple()[:2] for face in shapes["DATUM_CLEAR_APERTURE"].Faces()]
+    discs = [face.Center().toTuple()[:2] for face in shapes["DATUM_RELIEF"].Faces()]
     for got in (rings, discs):
         assert np.array(sorted(got)) == pytest.approx(np.array([(-10, 5), (0, 0), (20, -30)]), abs=1e-9)
 
@@ -117,18 +117,18 @@ def test_a_die_beyond_the_wafer_is_refused(tmp_path, place):
 def test_parts_lie_at_the_datum(tmp_path):
     substrate_step(tmp_path / "p.step", DIE, APERTURE, CHROME, some_rings())
     shapes = shapes_of(tmp_path / "p.step")
-    assert set(shapes) == {"SUBSTRATE", "CHROME", "DATUM_CLEAR_APERTURE"}
+    assert set(shapes) == {"SUBSTRATE", "CHROME", "DATUM_RELIEF"}
     # The kernel's boxes are wider than the shape by its tolerance, 1e-7 mm.
     assert sizes(shapes["SUBSTRATE"]) == pytest.approx([-5, 5, -5, 5, -0.5, 0], abs=1e-6)
     assert sizes(shapes["CHROME"]) == pytest.approx([-3.7, 3.7, -3.7, 3.7, 0, 1e-4], abs=1e-6)
-    assert sizes(shapes["DATUM_CLEAR_APERTURE"]) == pytest.approx([-2.2, 2.2, -2.2, 2.2, 0, 0], abs=1e-6)
-    assert shapes["DATUM_CLEAR_APERTURE"].Area() == pytest.approx(math.pi * 2.2**2, rel=CLOSE)
+    assert sizes(shapes["DATUM_RELIEF"]) == pytest.approx([-2.2, 2.2, -2.2, 2.2, 0, 0], abs=1e-6)
+    assert shapes["DATUM_RELIEF"].Area() == pytest.approx(math.pi * 2.2**2, rel=CLOSE)
     substrate_step(tmp_path / "w.step", FLAT, APERTURE)
     low_y = -math.sqrt(50**2 - 16.25**2)
     assert sizes(shapes_of(tmp_path / "w.step")["SUBSTRATE"])[2:4] == pytest.approx([low_y, 50], abs=1e-6)
 
 
-def test_a_flat_plate_has_the_clear_aperture_as_a_face(tmp_path):
+def test_a_flat_plate_has_the_relief_as_a_face(tmp_path):
     substrate_step(tmp_path / "p.step", DIE, APERTURE)
     areas = sorted(face.Area() for face in shapes_of(tmp_path / "p.step")["SUBSTRATE"].Faces())
     disc = math.pi * 2.2**2
@@ -218,11 +218,11 @@ def test_impossible_parts_are_refused(make, words):
 @pytest.mark.parametrize(
     ("substrate", "aperture_m", "chrome", "rings", "words"),
     [
-        (DIE, 10 * MM, None, None, "clear aperture"),
-        (DIE, -MM, None, None, "clear aperture"),
+        (DIE, 10 * MM, None, None, "relief"),
+        (DIE, -MM, None, None, "relief"),
         (DIE, APERTURE, ChromeRing(2 * MM, 5.1 * MM), None, "chrome"),
         (Substrate("wafer", 10 * MM, MM, 8 * MM), APERTURE, CHROME, None, "circle of 6 mm"),
-        (DIE, 4.3 * MM, None, some_rings(), "inside the clear aperture"),
+        (DIE, 4.3 * MM, None, some_rings(), "inside the relief"),
         (Substrate("die", 10 * MM, UM), APERTURE, None, some_rings(), "less deep"),
     ],
 )
