@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from fab.gds.writer import write_gds, write_oasis
+from fab.gds.oasis import write_oasis
+from fab.gds.writer import write_gds
 from fab.grid import Grid
 from fab.layout.doe import mask_layout
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
@@ -113,7 +114,7 @@ def full_size(kind: str, count: int, folder: Path) -> dict[str, float]:
     size = gds.stat().st_size
     write_s, floor_s, write_ratio = ratio(lambda: generate(level_map, gds), lambda: write_floor(other, size), pairs=5)
     read_s, _, read_ratio = ratio(lambda: read_back(gds, level_map), lambda: write_floor(other, size), pairs=5)
-    oasis_s = timed(lambda: write_oasis(oasis, gds, layout.layers))
+    oasis_s = timed(lambda: write_oasis(oasis, layout))
     return {
         "rectangles": sum(map(len, layout.cells[0].shapes.values())),
         "gds_mb": size / 1e6,

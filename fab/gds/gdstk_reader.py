@@ -4,16 +4,19 @@ Everything here relies on gdstk and numpy alone and shares no code with the writ
 package: a mistake in those cannot hide itself. Rectangles are counted into a winding number per pixel by a difference
 array and two running sums; a sound plane has 0 and 1 only.
 
-OASIS keeps repeated shapes folded. They are unfolded here by the library's own list of offsets; reading the polygons
-alone would silently miss most of a mask.
+The library hands out shapes slowly, a million in seconds. It is made to write what it read as a plain stream instead,
+repetitions of OASIS unfolded (`fab.gds.plain`).
 """
 
+import gzip
+import shutil
+import struct
+import tempfile
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +24,18 @@ import gdstk
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.errors import InputError
+from fab.gds.plain import PlainCell, plain_cells
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.layout.limits import Tally
 from fab.units import NM, UM
 
-# The library's polygons take about 350 bytes each, so this many stay under a gigabyte.
+# The library's polygons take about 200 bytes each, so this many stay under half a gigabyte.
 _MOST_AT_ONCE = 2_200_000
 _BATCH = 100_000
 
 # Rectangles and other polygons of one layer of a cell, batch by batch.
-_Taken = tuple[list[NDArray[np.int32]], list[NDArray[np.int64]]]
+_Taken = tuple[list[NDArray[np.int32]], list[NDArray[np.int32]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +88,7 @@ def _edge_numbers(values: NDArray[np.int64], edges: NDArray[np.int32]) -> tuple[
     return numbers, edges[numbers] == values
 
 
-def _separated(points: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _separated(points: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Separate the rectangles x0, y0, x1, y1 from all other polygons ``(n, v, 2)``."""
     # The long axis last: numpy is slow along axes of four.
     x, y = np.ascontiguousarray(points.transpose(2, 1, 0))
@@ -91,29 +96,13 @@ def _separated(points: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np
     # Every side runs along one axis; with a box that is not flat, that leaves only rectangles.
     along = (np.roll(x, -1, axis=0) == x) != (np.roll(y, -1, axis=0) == y)
     upright = (len(x) == 4) & along.all(axis=0) & (x0 < x1) & (y0 < y1)
-    return np.stack([x0, y0, x1, y1], axis=1)[upright].astype(np.int32), points[~upright]
+    return np.stack([x0, y0, x1, y1], axis=1)[upright], points[~upright]
 
 
 def _shapes(taken: _Taken) -> Shapes:
     boxes, polygons = taken
     rects = np.concatenate([np.empty((0, 4), dtype=np.int32), *boxes])
-    return Shapes(rects, tuple(polygon.astype(np.int32) for polygon in polygons))
-
-
-def _runs(polygons: list[Any]) -> Iterator[tuple[Layer, int, list[Any]]]:
-    """Cut a list of library polygons where layer or number of points changes, and into batches."""
-    # Attributes are fetched without a loop in Python, which would take most of the time.
-    layers, datatypes, sizes = (
-        np.fromiter(map(attrgetter(name), polygons), dtype=np.int64, count=len(polygons))
-        for name in ("layer", "datatype", "size")
-    )
-    changes = (np.diff(layers) != 0) | (np.diff(datatypes) != 0) | (np.diff(sizes) != 0)
-    cuts = {0, len(polygons), *range(0, len(polygons), _BATCH)}
-    cuts.update((np.flatnonzero(changes) + 1).tolist())
-    bounds = sorted(cuts) if polygons else []
-    for start, end in pairwise(bounds):
-        first = polygons[start]
-        yield Layer(first.layer, first.datatype), first.size, polygons[start:end]
+    return Shapes(rects, tuple(polygons))
 
 
 def _unfold_to(folded: Iterable[Any]) -> int:
@@ -121,22 +110,30 @@ def _unfold_to(folded: Iterable[Any]) -> int:
     return sum(one.repetition.size or 1 for one in folded)
 
 
-def _offsets(one: Any) -> NDArray[np.float64]:
-    return one.repetition.get_offsets() if one.repetition.size else np.zeros((1, 2))
-
-
-def _unfolded(polygons: list[Any], size: int) -> Iterator[NDArray[np.float64]]:
-    """Yield the points of polygons with one copy per repetition, in batches."""
-    points_um = np.frombuffer(b"".join([p.points for p in polygons]), dtype=np.float64).reshape(-1, size, 2)
-    if not any(polygon.repetition.size for polygon in polygons):
-        yield points_um
+@contextmanager
+def _unpacked(path: str | Path) -> Iterator[Path]:
+    """Provide a file that may be packed by gzip, unpacked."""
+    if Path(path).suffix != ".gz":
+        yield Path(path)
         return
-    offsets = [_offsets(polygon) for polygon in polygons]
-    owners = np.repeat(np.arange(len(polygons)), [len(copies) for copies in offsets])
-    shifts = np.concatenate(offsets)
-    for start in range(0, len(owners), _BATCH):
-        part = slice(start, start + _BATCH)
-        yield points_um[owners[part]] + shifts[part, None, :]
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "unpacked.gds"
+        with gzip.open(path) as packed, plain.open("wb") as stream:
+            shutil.copyfileobj(packed, stream, 1 << 20)
+        yield plain
+
+
+def _cells(library: Any) -> list[PlainCell]:
+    """Return what a library holds, unfolded."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "unfolded.gds"
+        library.write_gds(str(path), max_points=0)
+        try:
+            return list(plain_cells(path))
+        except (ValueError, struct.error) as error:
+            # The library does not say so where a disk is full.
+            rule = "must have room for the file unfolded"
+            raise InputError(folder, rule, str(error), "Free some space there.") from error
 
 
 class GdstkReader:
@@ -161,21 +158,22 @@ class GdstkReader:
         ]
 
     def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[LayerReading]:
-        """Read a GDSII file, few enough shapes at a time to bound the memory.
+        """Read a GDSII file, few enough shapes at a time to bound the memory; unpack it first if it ends in .gz.
 
         `layers` are those of the DOE with the number of shapes expected on each, `others` all other ones. Yields one
         reading per layer, in the order given, and cell of the DOE.
         """
         waiting = list(layers)
         rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
-        while waiting or rest:
-            group = [waiting.pop(0)] if waiting else []
-            while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
-                group.append(waiting.pop(0))
-            wanted = {(layer.number, layer.datatype) for layer in group}
-            wanted.update(rest)
-            rest = []
-            yield from self._read(gdstk.read_gds(str(path), unit=UM, filter=wanted), group)
+        with _unpacked(path) as plain:
+            while waiting or rest:
+                group = [waiting.pop(0)] if waiting else []
+                while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
+                    group.append(waiting.pop(0))
+                wanted = {(layer.number, layer.datatype) for layer in group}
+                wanted.update(rest)
+                rest = []
+                yield from self._read(gdstk.read_gds(str(plain), unit=UM, filter=wanted), group)
 
     def oasis(self, path: str | Path, layers: Iterable[Layer], most: int = 10**8) -> Iterator[LayerReading]:
         """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell.
@@ -197,35 +195,27 @@ class GdstkReader:
         if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:
             units = [f"{value / NM:.9g} nm" for value in (library.precision, self.edges.dbu_m)]
             self.problems.append(f"the database unit is {units[0]} instead of {units[1]}")
+        # What a coordinate means is compared, whatever the unit it was written in.
+        library.precision = self.edges.dbu_m
+        odd = {cell.name for cell in library.cells if cell.labels or cell.paths}
         found: dict[tuple[str, Layer], _Taken] = {(name, layer): ([], []) for layer in group for name in self.does}
-        for cell in library.cells:
-            if cell.labels or cell.paths:
+        for cell in _cells(library):
+            if cell.name in odd or cell.others:
                 self.problems.append(f"cell {cell.name} holds labels or paths")
             around = cell.name not in self.does
             if around:
-                self._references[cell.name] = tuple(self._placed(cell))
+                self._references[cell.name] = cell.references
             elif cell.references:
                 self.problems.append(f"cell {cell.name} places others")
-            for layer, size, polygons in _runs(cell.polygons):
+            for layer, parts in cell.polygons.items():
                 taken = self._around[cell.name][layer] if around else found.get((cell.name, layer))
                 if taken is None:
                     self.problems.append(f"layer {layer} of cell {cell.name} holds shapes that should not be there")
                     continue
-                for points_um in _unfolded(polygons, size):
-                    boxes, others = _separated(self._units(points_um))
-                    taken[0].append(boxes)
-                    taken[1].extend(others)
+                for points in parts:
+                    for start in range(0, len(points), _BATCH):
+                        boxes, others = _separated(points[start : start + _BATCH])
+                        taken[0].append(boxes)
+                        taken[1].extend(others)
         for cell, layer in list(found):
             yield LayerReading(cell, layer, _shapes(found.pop((cell, layer))), self.edges)
-
-    def _units(self, points_um: NDArray[np.float64]) -> NDArray[np.int64]:
-        return np.rint(points_um * (UM / self.edges.dbu_m)).astype(np.int64)
-
-    def _placed(self, cell: Any) -> Iterator[Reference]:
-        """Yield the references of a cell, one per copy."""
-        for reference in cell.references:
-            name = reference.cell_name
-            if reference.rotation or reference.x_reflection or reference.magnification != 1:
-                name += " (turned, mirrored or scaled)"
-            for x, y in self._units(np.asarray(reference.origin) + _offsets(reference)).tolist():
-                yield Reference(name, x, y)

@@ -1,15 +1,11 @@
-"""GDSII and OASIS: the files that carry the geometry, written.
+"""GDSII: the files that carry the geometry, written.
 
 A GDSII file is a chain of records: two bytes of length, two bytes of type, then big-endian data. A rectangle takes
 exactly 64 bytes, sixteen 32-bit words of which only ten change, so rectangles go to the disk as rows of an integer
 array, a few megabytes at a time. Times are fixed, so the same layout gives the same bytes.
-
-OASIS is written by KLayout from the rectangles of a GDSII file. They are never merged: polygons with 10**5 holes take
-KLayout hours to cut, rectangles compress fiftyfold in seconds.
 """
 
 import struct
-from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -95,26 +91,6 @@ def write_gds(path: str | Path, layout: Layout) -> None:
                     stream.write(_element_start(layer) + _record(XY, closed.tobytes()) + _record(ENDEL))
             stream.write(b"".join(_reference(reference) for reference in cell.references) + _record(ENDSTR))
         stream.write(_record(ENDLIB))
-
-
-def write_oasis(path: str | Path, gds: str | Path, layers: Iterable[Layer]) -> None:
-    """Write the content of a GDSII file of `write_gds` as compressed OASIS, with the names of `layers`."""
-    import klayout.db as kdb
-
-    layout = kdb.Layout()
-    options = kdb.SaveLayoutOptions()
-    options.format = "OASIS"
-    options.oasis_compression_level = 2
-    options.oasis_write_cblocks = True
-    try:
-        layout.read(str(gds))
-        for layer in layers:
-            index = layout.find_layer(layer.number, layer.datatype)
-            if index is not None:
-                layout.set_info(index, kdb.LayerInfo(layer.number, layer.datatype, layer.name))
-        layout.write(str(path), options)
-    except RuntimeError as error:
-        raise InputError(str(path), "the OASIS file must be writable", str(error), "Check the disk.") from error
 
 
 def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:

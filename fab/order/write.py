@@ -25,7 +25,8 @@ import numpy as np
 from fab.errors import InputError
 from fab.figure import html_of
 from fab.files import MANIFEST_NAME, atomic_folder, sha256_bytes, sha256_file, write_atomic
-from fab.gds.writer import write_gds, write_oasis
+from fab.gds.oasis import write_oasis
+from fab.gds.writer import write_gds
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
@@ -59,7 +60,7 @@ def _write_masks(folder: Path, drawing: DrawnOrder) -> None:
     for photomask in order.photomasks:
         write_gds(folder / f"{order.photomask_stem(photomask)}.gds", drawing.plate(photomask))
     log.info("writing OASIS")
-    write_oasis(oasis, gds, layout.layers)
+    write_oasis(oasis, layout)
 
 
 def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fab.gds.gdstk_reader import GdstkReader
-from fab.gds.writer import write_gds, write_oasis
+from fab.gds.oasis import write_oasis
+from fab.gds.writer import write_gds
 from fab.grid import Grid
 from fab.layout.doe import mask_layout
 from fab.layout.geometry import Cell, Layer, Layout, Shapes, pixel_edges
@@ -24,8 +25,9 @@ def written(folder, edges, **planes):
         Layer(number): Shapes(rectangles(plane, edges.x, edges.y), (TRIANGLE,))
         for number, plane in enumerate(planes.values(), 1)
     }
-    write_gds(folder / "a.gds", Layout(edges.dbu_m, (Cell("TOP", shapes),)))
-    write_oasis(folder / "a.oas", folder / "a.gds", shapes)
+    layout = Layout(edges.dbu_m, (Cell("TOP", shapes),))
+    write_gds(folder / "a.gds", layout)
+    write_oasis(folder / "a.oas", layout)
     return {layer: len(drawn) for layer, drawn in shapes.items()}
 
 
