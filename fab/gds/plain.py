@@ -38,7 +38,7 @@ class _Stream:
     """The records of a file, from its front on."""
 
     def __init__(self, path: str | Path) -> None:
-        self._bytes = memoryview(np.memmap(path, dtype=np.uint8, mode="r"))
+        self._bytes = np.memmap(path, dtype=np.uint8, mode="r").data
         self.at = 0
 
     def head(self) -> int:
