@@ -2,19 +2,23 @@
 
 A result is written under a temporary name beside its final place, forced to the disk and then renamed. Whatever happens
 in between (an exception, a full disk, a kill), the final path holds the old content or the new one and never a half.
+What a killed process was writing lies hidden beside it until the next one writes there.
 What the operating system refuses is an `InputError` that names the path.
 """
 
+import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import FileIO
 from pathlib import Path
@@ -70,18 +74,65 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     path = Path(path)
     with os_errors_explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        temporary = Path(name)
+        _clear_killed(path)
+        temporary, handle = _locked(lambda: _made_file(path))
         try:
             with os.fdopen(handle, "wb") as stream:
                 stream.write(data)
                 stream.flush()
                 os.fsync(stream.fileno())
-            temporary.chmod(0o666 & ~_umask())
-            temporary.replace(path)
+                temporary.chmod(0o666 & ~_umask())
+                temporary.replace(path)  # before the lock is given back
             _sync(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def _made_file(path: Path) -> tuple[Path, int]:
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    return Path(name), handle
+
+
+def _made_folder(path: Path, what: str) -> tuple[Path, int]:
+    name = tempfile.mkdtemp(prefix=f".{path.name}.{what}.", dir=path.parent)
+    return Path(name), os.open(name, os.O_RDONLY)
+
+
+def _locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
+    """Make a temporary file or folder, and lock it until its handle is closed: its process lives."""
+    while True:
+        with contextlib.suppress(FileNotFoundError):  # cleared by another process before it was locked
+            path, handle = make()
+            if _lock(handle) is not False and path.exists():
+                return path, handle
+            os.close(handle)
+
+
+def _lock(handle: int) -> bool | None:
+    """Whether a lock could be had; None where the file system has none."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _clear_killed(path: Path) -> None:
+    """Remove what killed processes were writing to a path; an earlier result that one had moved aside comes back."""
+    unfinished = re.compile(rf"\.{re.escape(path.name)}\.((new|old)\.)?[a-z0-9_]{{8}}")
+    for entry in [Path(entry) for entry in os.scandir(path.parent) if unfinished.fullmatch(entry.name)]:
+        with contextlib.suppress(OSError):  # another process clears it, or may not
+            handle = os.open(entry, os.O_RDONLY | os.O_NOFOLLOW)
+            try:
+                if not _lock(handle):
+                    continue
+                if not path.exists() and (entry / path.name).exists():
+                    (entry / path.name).rename(path)
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            finally:
+                os.close(handle)
 
 
 def _umask() -> int:
@@ -106,20 +157,20 @@ def _require_replaceable(path: Path) -> None:
 
 
 def _swap(fresh: Path, path: Path) -> None:
-    """Put `fresh` at `path`; an earlier result moves aside first and comes back if the rename fails."""
-    aside = None
-    if path.exists():
-        aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-        path.rename(aside / path.name)
+    """Put `fresh` at `path`; an earlier result moves aside first and comes back if the rename fails or is stopped."""
+    aside, handle = _locked(lambda: _made_folder(path, "old"))
     try:
+        if path.exists():
+            path.rename(aside / path.name)
         fresh.rename(path)
-    except OSError:
-        if aside is not None:
+    except BaseException:
+        if not path.exists() and (aside / path.name).exists():
             (aside / path.name).rename(path)
-            aside.rmdir()
         raise
-    if aside is not None:
-        shutil.rmtree(aside, ignore_errors=True)
+    finally:
+        if path.exists() or not any(aside.iterdir()):  # else the earlier result is in there, and cannot come back
+            shutil.rmtree(aside, ignore_errors=True)
+        os.close(handle)
     _sync(path.parent)
 
 
@@ -137,9 +188,11 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     if path.is_symlink():
         path = path.resolve()  # the link stays, and what it points to is replaced
     with os_errors_explained(path):
+        if path.parent.is_dir():
+            _clear_killed(path)
         _require_replaceable(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.new.", dir=path.parent))
+        temporary, handle = _locked(lambda: _made_folder(path, "new"))
         try:
             temporary.chmod(0o777 & ~_umask())
             yield temporary
@@ -153,6 +206,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             raise
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+            os.close(handle)
 
 
 def sha256_bytes(data: bytes | memoryview) -> str:

@@ -131,6 +131,52 @@ def test_an_empty_folder_may_be_filled(tmp_path):
     assert (tmp_path / "out" / "x").exists()
 
 
+def test_what_a_killed_process_was_writing_is_cleared_by_the_next(tmp_path):
+    (tmp_path / ".out.new.abcd_123").mkdir()
+    (tmp_path / ".out.new.abcd_123" / "half.gds").write_text("half")
+    (tmp_path / ".file.bin.k2_x81ab").write_bytes(b"half")
+    others = {".outer.new.abcd_123", ".out.new.mine", ".file.bin.backup1.old"}
+    for name in others:
+        (tmp_path / name).write_text("mine")
+    with atomic_folder(tmp_path / "out") as fresh:
+        (fresh / "x").write_text("1")
+    write_atomic(tmp_path / "file.bin", b"whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "file.bin", *others}
+
+
+def test_what_a_living_process_writes_is_left_alone(tmp_path):
+    with atomic_folder(tmp_path / "out") as first:
+        (first / "x").write_text("1")
+        with atomic_folder(tmp_path / "out") as second:
+            (second / "manifest.json").write_text("{}")
+        assert (first / "x").exists()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["x"]
+
+
+def test_an_earlier_result_comes_back_whenever_its_replacement_is_stopped(tmp_path, monkeypatch):
+    """By a signal between the two renames, or by a kill there, after which the next call finds it moved aside."""
+    path, rename = tmp_path / "out", Path.rename
+    with atomic_folder(path) as fresh:
+        (fresh / "manifest.json").write_text("{}")
+
+    def stopped(source, target):
+        if source.name.startswith(".out.new."):
+            raise KeyboardInterrupt
+        return rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", stopped)
+        with pytest.raises(KeyboardInterrupt), atomic_folder(path) as fresh:
+            (fresh / "x").write_text("1")
+    assert (path / "manifest.json").exists()
+    (tmp_path / ".out.old.abcd_123").mkdir()
+    path.rename(tmp_path / ".out.old.abcd_123" / "out")
+    with pytest.raises(RuntimeError):
+        break_off(path)
+    assert [found.name for found in path.iterdir()] == ["manifest.json"]
+    assert [found.name for found in tmp_path.iterdir()] == ["out"]
+
+
 def test_a_kill_in_the_middle_leaves_nothing_at_the_final_path(tmp_path):
     code = f"""
         import os, signal

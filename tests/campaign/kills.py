@@ -1,0 +1,41 @@
+"""kill -9, and the same command again: at a random moment, or in the middle of a random call that changes the disk."""
+
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+
+from tests.campaign.field import Family, Field, disturbed
+from tests.campaign.ground import COMMANDS, Ground
+from tests.campaign.shim import Fault
+
+WRITING = tuple(name for name, command in COMMANDS.items() if command.writes is not None)
+
+
+def moments(ground: Ground, seed: int, count: int) -> Iterator[tuple[str, str]]:
+    """Commands in turn, each with a call ("call=17") or a time in seconds ("after=0.25")."""
+    rng = np.random.default_rng(seed)
+    for k in range(count):
+        name = WRITING[k % len(WRITING)]
+        end = ground.whole(name)[1]
+        if rng.random() < 0.5:
+            yield name, f"call={rng.integers(1, len(end.calls) + 1)}"
+        else:
+            yield name, f"after={rng.uniform(0, 1.1 * end.wall_s):.3f}"
+
+
+def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
+    for name, moment in moments(ground, seed, count):
+        yield f"{name}:{moment}"
+
+
+def _problems(field: Field, case: str) -> list[str]:
+    name, moment = case.split(":")
+    kind, _, value = moment.partition("=")
+    killed = (-signal.SIGKILL,)
+    if kind == "call":
+        return disturbed(field, name, Fault(call=int(value), number=signal.SIGKILL), killed)
+    return disturbed(field, name, Fault(), killed, kill_after_s=float(value))
+
+
+KILLS = Family("kill -9, then the same command again", 40, _cases, _problems)
