@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
 FORMATTED := doedesign fab sim tests bench examples
 
-.PHONY: demo train-demo test test-slow lint bench clean
+.PHONY: demo train-demo test test-slow campaign lint bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
@@ -24,6 +24,10 @@ test: $(VENV)/.dev
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 -m slow
+
+# Minutes; hours with a count: make campaign CAMPAIGN="kills mutations --count 10000"
+campaign: $(VENV)/.dev
+	$(BIN)/python -m tests.campaign $(CAMPAIGN)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check $(FORMATTED)

@@ -15,8 +15,10 @@
 A stopped simulation goes on with the item it stopped at; the same seed gives the same bytes.
 """
 
+import json
 import logging
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -45,6 +47,7 @@ from sim.optic import HeightOptic
 from sim.surface import as_fabricated
 
 FORMAT = "doedesign simulation 1"
+_SEAL = "item_sha256"
 
 _USUAL_COUNT = 6
 _log = logging.getLogger("doedesign")
@@ -199,13 +202,22 @@ def _finished(folder: Path, digest: str) -> dict[int, str]:
     found = {}
     for path in sorted(folder.glob(f"*/{MANIFEST_NAME}")):
         item = read_json(path)
-        files = {path.parent / name: expected for name, expected in item.get("sha256", {}).items()}
-        whole = all(file.is_file() and sha256_file(file) == expected for file, expected in files.items())
-        if item.get("settings_sha256") == digest and files and whole:
-            found[int(item["number"])] = path.parent.name
+        if item == _sealed(item) and item.get("settings_sha256") == digest and _files_are_whole(path.parent, item):
+            found[item["number"]] = path.parent.name
         else:
             shutil.rmtree(path.parent)
     return found
+
+
+def _files_are_whole(folder: Path, item: Mapping[str, Any]) -> bool:
+    files = {folder / name: expected for name, expected in item["sha256"].items()}
+    return all(file.is_file() and sha256_file(file) == expected for file, expected in files.items())
+
+
+def _sealed(item: Mapping[str, Any]) -> dict[str, Any]:
+    """The description of an item with a digest of all else that it says."""
+    rest = {key: value for key, value in item.items() if key != _SEAL}
+    return {**rest, _SEAL: sha256_bytes(json.dumps(rest, sort_keys=True).encode())}
 
 
 def _write_item(folder: Path, number: int, found: SimulatedCapture, model: CaptureModel, digest: str, png: bool) -> str:
@@ -224,7 +236,7 @@ def _write_item(folder: Path, number: int, found: SimulatedCapture, model: Captu
             "images": stored,
             "sha256": {one["file"]: sha256_file(fresh / one["file"]) for one in stored.values()},
         }
-        (fresh / MANIFEST_NAME).write_bytes(canonical_json(described))
+        (fresh / MANIFEST_NAME).write_bytes(canonical_json(_sealed(described)))
     return name
 
 

@@ -71,6 +71,7 @@ class Campaign:
         with ThreadPoolExecutor(self._jobs) as pool:
             for result in pool.map(self.case, itertools.repeat(family), cases):
                 found.append(result)
+                print(f"\r{family}: {len(found)}/{len(cases)} ", end="", file=sys.stderr, flush=True)
                 for problem in result.problems:
                     print(f"\n{family}:{result.case}\n    {problem}", flush=True)
         return found
@@ -83,7 +84,7 @@ class Campaign:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the campaign; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("family", nargs="*", help=f"{', '.join(FAMILIES)}; all by default")
     parser.add_argument("--count", type=int, help="cases of each family; some minutes' worth by default")
     parser.add_argument("--seed", type=int, help="where the cases come from; a new one by default")
@@ -107,11 +108,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             results = []
             for name in asked.family or FAMILIES:
-                count = FAMILIES[name].count if asked.count is None else asked.count
+                count = FAMILIES[name].usual if asked.count is None else asked.count
                 results += campaign.run(name, seed, count)
     finally:
         campaign.stop()
-    print(f"\n{table(results)}")
+    print(f"\n\n{table(results)}")
     failed = [result for result in results if result.problems]
     for result in failed:
         print(f"\n{result.family}:{result.case}")

@@ -39,13 +39,13 @@ class Family(NamedTuple):
 
     Attributes:
         about: what is done to the commands, in words.
-        count: how many cases are tried by default.
+        usual: how many cases are tried by default.
         cases: names of cases, for the ground, a seed and a count.
         problems: what is wrong after a case.
     """
 
     about: str
-    count: int
+    usual: int
     cases: Callable[[Ground, int, int], Iterator[str]]
     problems: Callable[[Field, str], list[str]]
 

@@ -1,4 +1,4 @@
-"""A full disk or a full quota at every call that changes it, once and for good, then the same command with room again."""
+"""A full disk or quota at every call that changes it, once and for good, then the same command with room again."""
 
 import errno
 import itertools

@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Iterable
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +15,8 @@ from tests.campaign.process import End, Worker, content
 SPEC = Path(__file__).with_name("tiny.toml")
 BARE = ("--levels", 4, "--step", "300 nm", "--pitch", "1.85 um", "--out", "order")
 QUICK = ("--masks", "order")
+ONE_ERROR = ("--errors", "common_depth_scale")
+RATIO = ("--ring-to-disc", 1.0, "--probe", "550 nm", "--depth", "6 mm")
 
 
 class Command(NamedTuple):
@@ -78,13 +79,11 @@ COMMANDS = {
         ("model", "one.png", "two.exr", "three.tif"),
     ),
     "calibrate": Command(
-        ("calibrate", "run", "measurement.toml", *QUICK)
-        + ("--errors", "common_depth_scale", "--evaluations", 2, "--out", "out"),
+        ("calibrate", "run", "measurement.toml", *QUICK, *ONE_ERROR, "--evaluations", 2, "--out", "out"),
         ("run", "order", "measurement.toml", "image.tiff", "dark.tiff"),
     ),
     "explanations": Command(
-        ("calibrate", "run", *QUICK, "--ring-to-disc", 1.0, "--probe", "550 nm", "--depth", "6 mm", "--out", "out")
-        + ("--errors", "common_depth_scale", "--no-pairs"),
+        ("calibrate", "run", *QUICK, *ONE_ERROR, *RATIO, "--no-pairs", "--out", "out"),
         ("run", "order"),
     ),
 }
@@ -100,6 +99,7 @@ class Ground:
 
     def __init__(self, folder: Path, worker: Worker) -> None:
         self.folder, self.worker = folder, worker
+        self._contents: dict[str, dict[str, bytes]] = {}
         if not (folder / "made").exists():
             self._make()
 
@@ -108,10 +108,11 @@ class Ground:
         """The files."""
         return self.folder / "work"
 
-    def _run(self, *arguments: object) -> None:
-        end = self.worker.run(arguments, self.folder)
+    def _run(self, place: Path, *arguments: object) -> End:
+        end = self.worker.run(arguments, place)
         if end.code != 0:
             raise RuntimeError(f"{' '.join(map(str, arguments))}: {end}\n{end.err}")
+        return end
 
     def _make(self) -> None:
         work = self.work
@@ -119,14 +120,14 @@ class Ground:
         (work / "pictures").mkdir(parents=True)
         shutil.copy(SPEC, work / "spec.toml")
         _small_files(work)
-        self._run("optimize", "spec.toml", "--out", "run")
-        self._run("masks", "run", "--out", "order")
+        self._run(self.folder, "optimize", "spec.toml", "--out", "run")
+        self._run(self.folder, "masks", "run", "--out", "order")
         sheet = json.loads(next((work / "order").glob("*_RUNSHEET.json")).read_text())
         sheet["measured"]["mask 1"]["depth_nm"] = 301.0
         (work / "measured.json").write_text(json.dumps(sheet, indent=1))
-        self._run("train", "run", "--images", "pictures", "--out", "model")
+        self._run(self.folder, "train", "run", "--images", "pictures", "--out", "model")
         # A run that was ended after its first steps.
-        self._run("optimize", "spec.toml", "--out", "half", "--set", "optimize.steps=4")
+        self._run(self.folder, "optimize", "spec.toml", "--out", "half", "--set", "optimize.steps=4")
         self._half()
         (self.folder / "made").touch()
 
@@ -162,21 +163,19 @@ class Ground:
         if not ended.exists():
             for _ in range(2):  # the second time everything is compiled
                 self.lay(name, place)
-                end = self.worker.run(COMMANDS[name].arguments, place)
-                if end.code != 0:
-                    raise RuntimeError(f"{name}: {end}\n{end.err}")
-            ended.write_text(json.dumps(end))
-        kept = json.loads(ended.read_text())
-        return place / "work", End(*kept[:6], tuple(kept[6]), tuple(kept[7]))
+                end = self._run(place, *COMMANDS[name].arguments)
+                ended.write_text(json.dumps(end))
+        *rest, calls, read = json.loads(ended.read_text())
+        return place / "work", End(*rest, calls=tuple(calls), read=tuple(read))
 
     def lay_whole(self, name: str, place: Path) -> None:
         """Copy the folder after the undisturbed command to `place`/work."""
         shutil.rmtree(place, ignore_errors=True)
         shutil.copytree(self.whole(name)[0], place / "work", symlinks=True)
 
-    @cached_property
-    def _contents(self) -> dict[str, dict[str, bytes]]:
-        return {}
+    def forget(self, name: str) -> None:
+        """Read the folder after a command anew at the next call of `after`."""
+        self._contents.pop(name, None)
 
     def after(self, name: str) -> dict[str, bytes]:
         """Every file after the undisturbed command."""
@@ -234,4 +233,3 @@ def _small_files(work: Path) -> None:
         'probe = "550 nm"\npixel = "1.85 um"\ngain = 2.0\nread_noise = 4.0\nsaturation = 4095\n'
         '[[image]]\nname = "near"\ndepth = "6 mm"\nfiles = ["image.tiff"]\ndark = ["dark.tiff"]\n'
     )
-

@@ -1,4 +1,4 @@
-"""Commands in processes that are kept warm: everything is imported, so a case costs the command's own time.
+"""Commands in warm processes: everything is imported, so a case costs the command's own time.
 
 A process is forked from a server that has imported all packages and run nothing. It runs one command after another,
 with its own clock, memory and temporary folder for each, until one kills it.
@@ -24,7 +24,7 @@ from tests.campaign.shim import Fault, shimmed
 
 ROOT = Path(__file__).parents[2]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# A process that has grown beyond this gives way to a new one; and what no command may take, for the sake of the machine.
+# A process that has grown beyond the first gives way to a new one; the second saves the machine.
 _GROWN_BYTES, _DATA_BYTES = 2 << 30, 6 << 30
 
 
@@ -63,7 +63,7 @@ class _Job(NamedTuple):
 
 
 class Worker:
-    """A warm process. What a command says goes through the file `said`, so that it is there even if the process dies."""
+    """A warm process; what a command says is in files in `said`, even if the process dies."""
 
     def __init__(self, said: Path) -> None:
         self._said, self._process, self._pipe = said, None, None
@@ -176,7 +176,6 @@ def _done(job: _Job, said: Path) -> End:
     _OPENED.clear()
     _WATCHED[0] = f"{folder}{os.sep}"
     handles = [os.open(said / name, os.O_RDWR | os.O_CREAT | os.O_TRUNC) for name in ("out", "err")]
-    sys.stdin = open(os.devnull)
     kept = [os.dup(1), os.dup(2)]
     for stream, handle in zip((1, 2), handles, strict=True):
         os.dup2(handle, stream)
@@ -184,7 +183,9 @@ def _done(job: _Job, said: Path) -> End:
     began, used, before = time.monotonic(), _processor_s(), _resident()
     try:
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", closefd=False), "utf-8")
-        sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", closefd=False), "utf-8", "backslashreplace", write_through=True)
+        sys.stderr = io.TextIOWrapper(
+            os.fdopen(2, "wb", 0, closefd=False), "utf-8", "backslashreplace", write_through=True
+        )
         with shimmed(job.place, job.fault) as shim:
             try:
                 code = main(job.arguments)

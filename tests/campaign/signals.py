@@ -21,8 +21,8 @@ def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
 def _problems(field: Field, case: str) -> list[str]:
     name, number, moment = case.split(":")
     kind, _, value = moment.partition("=")
-    when = {"call": int(value)} if kind == "call" else {"after_s": float(value)}
-    return disturbed(field, name, Fault(number=signal.Signals[number], **when), (130,), words="interrupted")
+    fault = Fault(call=int(value)) if kind == "call" else Fault(after_s=float(value))
+    return disturbed(field, name, fault._replace(number=signal.Signals[number]), (130,), words="interrupted")
 
 
 SIGNALLED = Family("Ctrl-C, kill and a closed terminal, then the same command again", 40, _cases, _problems)

@@ -138,6 +138,18 @@ def test_same_seed_same_bytes_and_a_stopped_one_goes_on(run: Path, images: Path,
     (tmp_path / "b" / ".0002_x.new.abcdefgh").mkdir()
     simulate(run, tmp_path / "b", images)
     assert content(tmp_path / "b") == whole
+    # A damaged description, which the contact sheet would have believed.
+    described = json.loads((first / "manifest.json").read_text())
+    for damage in (
+        {"depth_m": []},
+        {"covered": 0.5},
+        {"images": {"clean": {"file": 2}}},
+        {"sha256": 1},
+        {"number": "a"},
+    ):
+        (first / "manifest.json").write_text(json.dumps(described | damage))
+        simulate(run, tmp_path / "b", images)
+        assert content(tmp_path / "b") == whole
     # More items of the same simulation keep those that are there.
     before = (tmp_path / "b" / first.name / "capture.exr").stat().st_mtime_ns
     result = simulate(run, tmp_path / "b", images, "--count", 3)

@@ -1,0 +1,88 @@
+"""A small part of the campaign with a fixed seed (`make campaign` runs the whole), and that its oracles can fail."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.campaign.__main__ import Campaign, table
+from tests.campaign.families import FAMILIES
+from tests.campaign.field import Field, disturbed, said_badly
+from tests.campaign.process import End
+from tests.campaign.shim import Fault, shimmed
+
+SEED = 16
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Campaign]:
+    one = Campaign(tmp_path_factory.mktemp("campaign"), jobs=2)
+    yield one
+    one.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nothing_is_lost_and_nothing_crashes(campaign: Campaign, family: str):
+    found = campaign.run(family, SEED, max(4, FAMILIES[family].usual // 8))
+    assert not [result for result in found if result.problems], table(found)
+
+
+@pytest.mark.slow
+def test_the_oracles_see_a_command_that_writes_other_bytes(campaign: Campaign, tmp_path: Path):
+    """A ground that expects something else than what the command writes, or loses."""
+    field = Field(campaign.ground, tmp_path)
+    campaign.ground.after("masks-npy")["out/more.gds"] = b"expected"
+    campaign.ground.after("masks-npy").pop("out/DOE_HEIGHTS_GREY.png")
+    try:
+        problems = disturbed(field, "masks-npy", Fault(), ())
+    finally:
+        field.stop()
+        campaign.ground.forget("masks-npy")
+    assert ["exit 0, but" in problems[0], "the same command again" in problems[1], len(problems)] == [True, True, 2]
+    assert all("more.gds" in problem and "GREY.png" in problem for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("end", "problem"),
+    [
+        (End(-11), "dies of signal 11"),
+        (End(None, wall_s=60.0), "takes longer than 60 s"),
+        (End(3, err="doedesign: what"), "exit code 3"),
+        (End(1, err="Traceback (most recent call last)\ndoedesign: "), "a traceback"),
+        (End(2, err="doedesign: \x1b[31m: must be text"), "control characters"),
+        (End(2, err="must be text"), "without a message"),
+        (End(0, err="x.py:3: UserWarning: what"), "meant for programmers"),
+    ],
+)
+def test_what_no_command_may_do(end: End, problem: str):
+    (found,) = said_badly(end)
+    assert problem in found
+
+
+def test_a_good_end_is_no_problem():
+    assert not said_badly(End(0, "out\n", "39 checks passed\n"))
+    assert not said_badly(End(2, err="doedesign: spec.toml: must be there"))
+
+
+def test_every_way_to_write_is_counted_and_fails(tmp_path: Path):
+    def write() -> None:
+        (tmp_path / "a").write_text("1")  # opened, written
+        (tmp_path / "a").rename(tmp_path / "b")
+        (tmp_path / "c").mkdir()
+        handle = os.open(tmp_path / "d", os.O_WRONLY | os.O_CREAT)
+        os.write(handle, b"1")
+        os.fsync(handle)
+        os.close(handle)
+        (tmp_path / "d").unlink()
+
+    with shimmed(tmp_path, Fault()) as shim:
+        write()
+        Path(os.devnull).write_text("elsewhere")
+    assert shim.calls == ["open", "write", "rename", "mkdir", "open", "write", "fsync", "unlink"]
+    for call in range(1, len(shim.calls)):
+        (tmp_path / "c").rmdir()
+        with shimmed(tmp_path, Fault(call=call, error=28)), pytest.raises(OSError, match="No space left"):
+            write()
+        (tmp_path / "c").mkdir(exist_ok=True)
