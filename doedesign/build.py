@@ -12,7 +12,7 @@ from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
-from fab.stock import STOCK, process_from
+from fab.stock import IDEAL, STOCK, process_from
 from sim.camera import Camera, Colour
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
@@ -79,8 +79,8 @@ def wafer_from_spec(spec: WaferSpec) -> Wafer:
 
 
 def is_process_file(given: object) -> TypeGuard[str | Path]:
-    """Whether a process is given by its file: a path, or a name that is no stock process's."""
-    return isinstance(given, Path) or (isinstance(given, str) and given not in STOCK)
+    """Whether a process is given by its file: a path, or a name that is neither a stock process's nor "ideal"."""
+    return isinstance(given, Path) or (isinstance(given, str) and given not in (*STOCK, IDEAL.name))
 
 
 def resolve_process(

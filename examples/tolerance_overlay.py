@@ -48,7 +48,7 @@ def overlay(run: Path, draws: int = 40, sigma: str = "0.25 um", workers: int | N
     """
     # The whole study. Everything after it only words the answers.
     errors = {"overlay_x": sigma, "overlay_y": sigma}
-    asked = study(run, errors=errors, limits=["strehl >= 0.6"], workers=workers)
+    asked = study(run, process="ideal", errors=errors, limits=["strehl >= 0.6"], workers=workers)
     plates = asked.monte_carlo(draws)
     changes = asked.one_at_a_time()
 

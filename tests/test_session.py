@@ -98,7 +98,7 @@ def test_a_plate_as_fabricated(design: dd.Design):
 
 
 def test_tolerances(design: dd.Design):
-    study = dd.tolerance(design, errors={"overlay_x": "0.5 um"}, limits=["strehl >= 0.6"], draws=4)
+    study = dd.tolerance(design, process="ideal", errors={"overlay_x": "0.5 um"}, limits=["strehl >= 0.6"], draws=4)
     assert study.yield_ is not None
     assert 0 <= study.yield_.share <= 1
     shown(study)

@@ -26,14 +26,15 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-_COMMANDS = (optimize, masks, verify, psf, tolerance, simulate, train, finetune, calibrate)
+_COMMANDS = (optimize, masks, verify, psf, tolerance, simulate, train, finetune)
 for _command in _COMMANDS:
     app.command(_command)
+app.command(calibrate, usage="Usage: doedesign calibrate [OPTIONS] RUN [MEASUREMENT]")
 app.command(reconstruct, usage="Usage: doedesign reconstruct [OPTIONS] [RUN] CAPTURE...")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `doedesign` command."""
-    given = (p for command in (*_COMMANDS, reconstruct) for p in signature(command).parameters.values())
+    given = (p for command in (*_COMMANDS, calibrate, reconstruct) for p in signature(command).parameters.values())
     options = frozenset(p.name.rstrip("_") for p in given if p.kind is p.KEYWORD_ONLY)
     return exit_code(lambda: app(arguments, exit_on_error=False, print_error=False), options)

@@ -30,8 +30,11 @@ class _Stderr(logging.Handler):
 
 @contextlib.contextmanager
 def shown_log() -> Iterator[None]:
-    """Show the log of the library on stderr meanwhile."""
+    """Show the log of the library on stderr meanwhile, once where such blocks are nested."""
     log, handler = logging.getLogger("doedesign"), _Stderr()
+    if any(isinstance(other, _Stderr) for other in log.handlers):
+        yield
+        return
     before, propagate = log.level, log.propagate
     log.addHandler(handler)
     log.setLevel(logging.INFO)
@@ -79,7 +82,7 @@ def exit_code(work: Callable[[], Any], options: Collection[str] = ()) -> int:
         say(f"doedesign: check failed\n{error}")
         return 1
     except CycloptsError as error:
-        say(f"doedesign: {error}\nTry: doedesign --help")
+        say(f"doedesign: {error}\nTry: {' '.join(('doedesign', *(error.command_chain or ()), '--help'))}")
         return 2
     except KeyboardInterrupt:
         say("doedesign: interrupted; what was finished is kept, the same command goes on from there")

@@ -63,7 +63,7 @@ def masks(
 
     Args:
         source: Run folder, or a height map (.exr, .npy, .tif, .png).
-        levels: Number of heights; the run's own by default.
+        levels: Number of heights; the run's own by default. With others a warning says what that costs.
         out: Order folder; masks/NAME by default.
         step: Height of one level, such as "75 nm"; for a bare height map.
         etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.

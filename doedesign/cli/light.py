@@ -1,9 +1,12 @@
 """PSFs and captures of a design: psf, simulate."""
 
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from doedesign.cli.console import print_paths, print_results
-from doedesign.cli.options import AsJson, Flag, Overrides, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
 
 
@@ -11,8 +14,8 @@ def psf(
     run: Path,
     *,
     masks: Path | None = None,
-    depths: tuple[str, ...] = (),
-    field_deg: tuple[float, float] = (0.0, 0.0),
+    depths: Texts = (),
+    field_deg: Annotated[tuple[float, float], Parameter(negative="")] = (0.0, 0.0),
     fabricated: Flag = False,
     process: Path | None = None,
     variation: Path | None = None,

@@ -13,7 +13,7 @@ from fab.errors import InputError
 if TYPE_CHECKING:
     from doedesign.recon.model import Model, PsfPair
 
-Files = Annotated[tuple[Path, ...], Parameter(negative="")]
+Files = Annotated[tuple[Path, ...], Parameter(negative="", show_default=False)]
 PsfFiles = Annotated[
     Files,
     Parameter(
@@ -127,8 +127,7 @@ def finetune(
 
 
 def reconstruct(
-    run: Path,
-    captures: Files = (),
+    captures: Files,
     /,
     *,
     out: Path | None = None,
@@ -146,8 +145,8 @@ def reconstruct(
     """Reconstruct what captures show behind their obstruction. With captures alone, the released model is taken.
 
     Args:
-        run: Run folder with a training, or the folder of a model; may be left out.
-        captures: PNG, TIFF, EXR or RAW files of any size.
+        captures: PNG, TIFF, EXR or RAW files of any size; before them RUN, the run folder with a training or the folder
+            of a model, where it is not the released one.
         out: Folder; "reconstructed" by default. A later call adds to it.
         tile: The most pixels of a tile's side; 1536 by default. Less takes less memory.
         overlap: Pixels that tiles share; 256 by default.
@@ -159,9 +158,9 @@ def reconstruct(
     from doedesign.recon.model import Model
     from doedesign.recon.photos import PHOTO_FILES
 
-    # Captures alone: RUN was left out.
-    alone = run.is_file() or (run.suffix.lower() in PHOTO_FILES and not run.is_dir())
-    files, model = (run, *captures) if alone else captures, Model.released() if alone else Model.open(run)
+    first, *rest = captures
+    alone = first.is_file() or (first.suffix.lower() in PHOTO_FILES and not first.is_dir())
+    files, model = (captures, Model.released()) if alone else (rest, Model.open(first))
     ending = None if kind is None else f".{kind.lower().removeprefix('.')}"
     how: Any = {"tile": tile, "overlap": overlap, "linear": linear, "kind": ending, "beside": beside}
     given = {name: value for name, value in how.items() if value is not None}

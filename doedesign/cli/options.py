@@ -8,10 +8,12 @@ from cyclopts import Parameter
 from fab.errors import InputError
 
 Overrides = Annotated[
-    tuple[str, ...], Parameter(name="--set", negative="", help="Change one value of the spec, KEY=VALUE.")
+    tuple[str, ...],
+    Parameter(name="--set", negative="", show_default=False, help="Change one value of the spec, KEY=VALUE."),
 ]
-Flag = Annotated[bool, Parameter(negative="")]
-AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON instead of paths.")]
+Flag = Annotated[bool, Parameter(negative="", show_default=False)]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", show_default=False, help="Print JSON instead of paths.")]
+Texts = Annotated[tuple[str, ...], Parameter(negative="", show_default=False)]
 
 
 def length_of(option: str, text: str | None) -> float | None:

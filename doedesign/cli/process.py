@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from doedesign.cli.console import print_results, print_text
-from doedesign.cli.options import AsJson, Flag, length_of
+from doedesign.cli.options import AsJson, Flag, Texts, length_of
 from fab.errors import InputError
 
 
@@ -22,7 +22,7 @@ def tolerance(
     corners: Flag = False,
     budget: str | None = None,
     yield_: Annotated[float, Parameter(name="--yield")] = 0.9,
-    limit: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    limit: Texts = (),
     process: Path | None = None,
     masks: Path | None = None,
     draw: str | None = None,
@@ -90,7 +90,7 @@ def calibrate(
     run: Path,
     measurement: Path | None = None,
     *,
-    errors: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    errors: Texts = (),
     process: Path | None = None,
     masks: Path | None = None,
     evaluations: int = 60,

@@ -86,6 +86,8 @@ def write_masks(
         try:
             return predict_sheet(drawn, order.process, design_m, probe_m, moves_m)
         except InputError as error:
+            if isinstance(error.__cause__, OSError):
+                raise  # a full disk is no limit of the model
             log.warning("the run sheet says nothing of the light: %s", error)
             return None
 

@@ -12,6 +12,8 @@ from doedesign.spec.table import SpecTable
 from doedesign.spec.values import Count, NotNegative, Positive, Seed, Steps
 from fab.errors import InputError
 
+USUAL_SIZE = 512
+
 Flag = Annotated[bool, Field(strict=True)]
 
 
@@ -44,7 +46,7 @@ class TrainSpec(SpecTable, frozen=True):
     Attributes:
         steps: training steps.
         batch: scenes per step.
-        size: pixels (binned) per side of a training picture.
+        size: pixels (binned) per side of a training picture; on a sensor with fewer than the usual 512, what it has.
         learning_rate: Adam's step size for the network.
         optics_learning_rate: Adam's step size for the height map, radians of phase at the design wavelength; 0 keeps
             the map as it is.
@@ -68,7 +70,7 @@ class TrainSpec(SpecTable, frozen=True):
 
     steps: Steps = 50_000
     batch: Annotated[int, Field(strict=True, ge=1, le=4096)] = 1
-    size: Annotated[int, Field(strict=True, ge=16, le=8192)] = 512
+    size: Annotated[int, Field(strict=True, ge=16, le=8192)] = USUAL_SIZE
     learning_rate: Positive = 1e-4
     optics_learning_rate: NotNegative = 0.02
     schedule: Literal["cosine", "constant"] = "cosine"

@@ -32,6 +32,7 @@ from doedesign.training.evaluation import Split
 from fab.errors import InputError
 from fab.files import canonical_json, explain_os_error, sha256_bytes, sha256_file
 from sim.light import srgb_from_linear
+from sim.store import read_picture
 
 _PARTS = ("capture", "reference", "mask")
 _ORDER = 2  # apart from the epochs' orders
@@ -148,14 +149,23 @@ def read_pair(files: PairFiles, model: Model, linear: bool | None = None) -> Cap
     capture, reference = (model.channels(read_capture(path, linear).light, str(path)) for path in named)
     mask = np.broadcast_to(np.float32(0), capture.shape[1:])
     if files.mask is not None:
-        # A share of a pixel follows no curve. Colours of a mask are all the same.
-        mask = np.clip(read_capture(files.mask, linear=True).light.mean(axis=0), 0, 1)
+        mask = np.clip(_covered(files.mask), 0, 1)
     wanted, *found = (f"{image.shape[-1]} x {image.shape[-2]}" for image in (capture, reference, mask))
     for path, size in zip((files.reference, files.mask), found, strict=True):
         if size != wanted:
             rule = f"must have the {wanted} pixels of {files.capture.name}"
             raise InputError(str(path), rule, size, "Cut both to the same frame.")
     return CapturePair(capture, srgb_from_linear(reference).astype(np.float32), mask)
+
+
+def _covered(path: Path) -> Float[np.ndarray, "y x"]:
+    """Share of each pixel that was covered, from a grey picture or from the channel M of what `simulate` writes."""
+    if path.suffix.lower() == ".exr":
+        channels, _ = read_picture(path)
+        if set(channels) == {"M"}:
+            return channels["M"]
+    # A share of a pixel follows no curve. Colours of a mask are all the same.
+    return read_capture(path, linear=True).light.mean(axis=0)
 
 
 class Pairs:

@@ -38,6 +38,7 @@ from doedesign.runs.folder import CONTINUOUS, TRAINING
 from doedesign.runs.level_maps import write_design
 from doedesign.runtime.stopping import stoppable
 from doedesign.spec import Spec, spec_digest, spec_from_json, spec_to_json, spec_to_resolved_toml
+from doedesign.spec.training import USUAL_SIZE
 from doedesign.training.evaluation import SCENE_SEED, EvaluationResult, HeldOutScene, Split, judge, split_pictures
 from doedesign.training.history import require_tensorboard
 from doedesign.training.hosts import join_hosts
@@ -159,14 +160,24 @@ def train(
 
 
 def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, Spec]:
-    """The design with a spec whose training has other options, and that spec."""
+    """The design with a spec whose training has other options and a size that the sensor has, and that spec."""
     if design.spec is None:
         raise InputError("design", "must have a spec, which says how to train", "none", "Optimise it from a spec.")
-    if not options:
-        return design, design.spec
-    tables = spec_to_json(design.spec)
-    spec = spec_from_json({**tables, "train": {**tables["train"], **options}}, "train")
+    spec = design.spec
+    if options:
+        tables = spec_to_json(spec)
+        spec = spec_from_json({**tables, "train": {**tables.get("train", {}), **options}}, "train")
+    coarsest = 2**spec.network.depth
+    fitting = _sensor_side(spec) // coarsest * coarsest
+    if spec.train.size == USUAL_SIZE > fitting >= 2 * coarsest:
+        _log.info("training pictures of %d pixels per side, what the sensor has", fitting)
+        spec = spec.model_copy(update={"train": spec.train.model_copy(update={"size": fitting})})
     return replace(design, spec=spec), spec
+
+
+def _sensor_side(spec: Spec) -> int:
+    """Binned pixels of the sensor's shorter side."""
+    return min(spec.sensor.resolution) // spec.sensor.binning
 
 
 def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData, SceneData]:
@@ -305,7 +316,7 @@ def _name(path: Path, folder: Path | None) -> str:
 
 def _require_possible(spec: Spec, source: str) -> None:
     """Refuse a frame larger than the sensor, and a network that the camera's colours do not fit."""
-    side = min(spec.sensor.resolution) // spec.sensor.binning
+    side = _sensor_side(spec)
     if spec.train.size > side:
         rule = f"must be at most the {side} binned pixels of the sensor's shorter side"
         raise InputError(f"{source}: train.size", rule, spec.train.size, "Choose a smaller size.")

@@ -2,7 +2,9 @@
 
 import io
 import json
+import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +13,11 @@ import numpy as np
 import pytest
 
 from doedesign import __version__
-from doedesign.cli import exit_code, main
+from doedesign.cli import app, exit_code, main
 from fab.errors import CheckFailed, InputError
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("optimize", "masks", "verify", "psf", "train", "finetune", "reconstruct")
+COMMANDS = tuple(name for name in app if not name.startswith("-"))
 HEAVY = ("jax", "numba", "numpy", "matplotlib", "klayout", "gdstk", "pint", "OpenEXR")
 
 
@@ -26,6 +28,24 @@ def test_help(command: str, capsys: pytest.CaptureFixture[str]):
     assert f"doedesign {command}".strip() in shown
     if not command:
         assert all(name in shown for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_must_be_given_has_no_default(command: str, capsys: pytest.CaptureFixture[str]):
+    main([command, "--help"])
+    panels = capsys.readouterr().out.replace("│", " ")
+    entries = re.split(r"\n +(?=\* |--|[A-Z]+ )", panels)
+    required = [entry for entry in entries if "[required]" in " ".join(entry.split())]
+    assert required
+    assert not [entry for entry in required if "by default" in entry or "may be left out" in entry]
+
+
+def test_nested_commands_say_things_once(capsys: pytest.CaptureFixture[str]):
+    def work() -> None:
+        logging.getLogger("doedesign").info("once")
+
+    assert exit_code(lambda: exit_code(work)) == 0
+    assert capsys.readouterr().err == "once\n"
 
 
 def test_help_loads_nothing_heavy():
@@ -53,7 +73,7 @@ def test_version(capsys: pytest.CaptureFixture[str]):
         (["psf", "run", "--field-deg", "1"], "--field-deg"),
         (["optimize", "spec.toml", "--set"], "--set"),
         (["finetune", "run"], "--pairs"),
-        (["reconstruct"], "RUN"),
+        (["reconstruct"], "CAPTURES"),
     ],
 )
 def test_usage_mistakes(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]):
@@ -61,8 +81,8 @@ def test_usage_mistakes(arguments: list[str], words: str, capsys: pytest.Capture
     printed = capsys.readouterr()
     assert printed.out == ""
     assert words in printed.err
-    assert "doedesign --help" in printed.err
-    assert len(printed.err.splitlines()) == 2
+    command = f"doedesign {arguments[0]}" if arguments[0] in COMMANDS else "doedesign"
+    assert printed.err.splitlines()[1:] == [f"Try: {command} --help"]
 
 
 def failing(error: BaseException):

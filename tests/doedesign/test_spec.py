@@ -358,6 +358,14 @@ def test_doubts_are_said(overrides: list[str], part: str):
     assert any(part in warning for warning in spec_warnings(load_spec(AUTOMOTIVE, overrides)))
 
 
+def test_an_occlusion_model_that_pictures_will_need_is_told_at_once(tmp_path: Path):
+    text = AUTOMOTIVE.read_text()
+    (tmp_path / "bare.toml").write_text("\n".join(li for li in text.splitlines() if not li.startswith("occlusion")))
+    (warning,) = spec_warnings(load_spec(tmp_path / "bare.toml"))
+    assert warning.startswith("scene.occlusion: not named")
+    assert "reciprocal" in warning
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

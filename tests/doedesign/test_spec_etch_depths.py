@@ -20,6 +20,7 @@ from fab.levels import Levels
 from fab.process import Process
 
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
+IDEAL = 'process={levels = 16, level_step = "75 nm"}'
 DEPTHS = 'process.etch_depths=["80 nm", "150.5 nm", "301 nm", "590 nm"]'
 LEVELS = Levels(16, 75e-9, (80e-9, 150.5e-9, 301e-9, 590e-9))
 
@@ -41,7 +42,7 @@ def test_a_spec_without_them_keeps_its_digest():
 
 
 def test_they_make_the_staircase_and_the_process():
-    process = load_spec(QUICK, [DEPTHS]).process
+    process = load_spec(QUICK, [IDEAL, DEPTHS]).process
     assert levels_from_spec(process) == LEVELS
     assert process_from_spec(process) == Process(LEVELS)
     assert levels_from_spec(load_spec(QUICK).process) == Levels(16, 75e-9)
@@ -50,7 +51,7 @@ def test_they_make_the_staircase_and_the_process():
 
 
 def test_etches_go_from_shallow_to_deep_unless_an_order_is_given():
-    swapped = ["process.levels=4", "process.level_step=300 nm", 'process.etch_depths=["500 nm", "150 nm"]']
+    swapped = [IDEAL, "process.levels=4", "process.level_step=300 nm", 'process.etch_depths=["500 nm", "150 nm"]']
     spec = load_spec(QUICK, swapped)
     assert process_from_spec(spec.process).order == (1, 0)
     said = load_spec(QUICK, [*swapped, "process.etches=[{mask = 0, depth = '500 nm'}, {mask = 1}]"])

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import doedesign.lab.order
 import fab.archive
 from doedesign.cli import main
+from fab.files import os_errors_explained
 from fab.level_map import read_level_map, write_level_map
 from sim.store import write_height
 
@@ -173,6 +175,16 @@ def test_disk_that_takes_no_more(copied, tiny, cli, content, tmp_path, monkeypat
         path.name for folder in (copied.run, copied.order) for path in folder.rglob("*")
     }
     assert not list((tmp_path / "new").glob("*"))
+    assert not (tmp_path / "new order").exists()
+
+
+def test_a_run_sheet_is_not_written_without_its_light_because_a_disk_is_full(copied, cli, tmp_path, monkeypatch):
+    def full(*_):
+        with os_errors_explained(tmp_path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(doedesign.lab.order, "predict_sheet", full)
+    refuse(cli("masks", copied.run, "--out", tmp_path / "new order"), tmp_path, "No space left")
     assert not (tmp_path / "new order").exists()
 
 

@@ -3,6 +3,7 @@
 Networks are as small as they go, for the time goes into compiling steps.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -14,8 +15,10 @@ import pytest
 from doedesign.capture.scenes import Batch
 from doedesign.spec.training import TrainSpec
 from doedesign.training.joint import JointState, Trainer, devices_mesh, rates_at, resting_depths_m
+from doedesign.training.train import _with_options
 from fab.errors import InputError
 from sim.obstruction import Dirt
+from tests.doedesign.calibration_fakes import plate_drawn
 from tests.recon.small_training import PLAIN, batch, heights, small_spec, trainer
 
 COLOURS = ("optics.wavelengths=['640 nm', '550 nm', '460 nm']", "network.width=3")
@@ -25,6 +28,16 @@ LEARNING = ("train.learning_rate=0.01", "train.optics_learning_rate=0.1", 'train
 @pytest.fixture(scope="module")
 def joint() -> Trainer:
     return trainer(*PLAIN, *LEARNING)
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "size"), [((), {}, 480), ((), {"steps": 3}, 480), (("train.size=64",), {}, 64)]
+)
+def test_the_usual_size_is_what_a_small_sensor_has(changes: tuple[str, ...], options: dict[str, Any], size: int):
+    """Also of a spec without a word on training."""
+    spec = small_spec("train={}", "sensor.resolution=[640, 480]", *changes)
+    _, resolved = _with_options(replace(plate_drawn(cells=16), spec=spec), options)
+    assert (resolved.train.size, resolved.train.steps) == (size, options.get("steps", spec.train.steps))
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

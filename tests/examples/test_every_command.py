@@ -1,0 +1,81 @@
+"""Every command works on the quick example as a new user types it, and calibration finds what was hidden."""
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from doedesign.calibration.measurement import ImageSpec, MeasurementSpec, load_measurement
+from doedesign.cli import app
+from doedesign.spec import load_spec, load_variation
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+
+import every_command  # pyright: ignore[reportMissingImports]
+import measure_psfs  # pyright: ignore[reportMissingImports]
+
+QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
+NAMES = {name for name in app if not name.startswith("-")}
+
+
+def test_the_script_leaves_no_command_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    item = tmp_path / "runs" / "quick" / "simulated" / "0000_camera"
+    item.mkdir(parents=True)
+    for name in ("capture", "clean", "mask"):
+        (item / f"{name}.exr").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(every_command, "measure", lambda run, out: out / "measurement.toml")
+    assert len(NAMES) == 10
+    assert {command[0] for command in every_command.commands(QUICK, "quick")} == NAMES
+    assert len(list((tmp_path / "pairs").iterdir())) == 3
+
+
+def test_the_commented_measurement_is_of_the_quick_example():
+    spec, design = load_measurement(measure_psfs.MEASUREMENT), load_spec(QUICK)
+    assert {image.depth_m for image in spec.image} <= {*design.scene.near_m, *design.scene.far_m}
+    assert spec.pixel_m == design.sensor.pixel_m
+
+
+def test_every_key_of_the_commented_measurement_may_be_written(tmp_path: Path):
+    text, count = re.subn(r"(?m)^# (\w+ = )", r"\1", measure_psfs.MEASUREMENT.read_text())
+    (tmp_path / "all.toml").write_text(text)
+    spec = load_measurement(tmp_path / "all.toml")
+    assert count == 10
+    # What is left out of the file are a lab's rare needs.
+    assert MeasurementSpec.model_fields.keys() - spec.model_fields_set == {"fill_factor", "allow_8bit"}
+    assert ImageSpec.model_fields.keys() - spec.image[0].model_fields_set == {"black_level"}
+
+
+def test_commands_of_the_documentation_are_understood():
+    """Every line of a shell block that calls `doedesign`, and every script named there."""
+    root = QUICK.parents[1]
+    pages = "\n".join((root / name).read_text() for name in ("README.md", "masks/README.md", "CONTRIBUTING.md"))
+    text = pages.replace("\\\n", " ")
+    lines = re.findall(r"(?m)^ *(doedesign \w.*?)(?:  +#.*)?$", text)
+    assert len(lines) >= 14
+    for line in lines:
+        app.parse_args(shlex.split(line)[1:], exit_on_error=False, print_error=False)
+    scripts = set(re.findall(r"(?:python |\()(examples/\w+\.\w+)", text))
+    assert scripts
+    assert not [name for name in scripts if not (root / name).is_file()]
+
+
+@pytest.mark.slow
+def test_every_command_runs_with_its_defaults(tmp_path: Path):
+    assert set(every_command.every_command(tmp_path)) == NAMES
+    run = tmp_path / "runs" / "quick"
+    found = json.loads((run / "calibration" / "calibration.json").read_text())
+    assert found["explained"]
+    hidden = load_variation(tmp_path / "measurement" / "hidden.toml")
+    for error in found["errors"]:
+        # Places of masks are relative to mask 0. Five standard deviations: one fit in a million of a good model.
+        key, _, mask = error["name"].partition("[")
+        reference = hidden.value(f"{key}[0]") if mask and key.startswith("overlay") else 0.0
+        assert error["value"] == pytest.approx(hidden.value(error["name"]) - reference, abs=5 * error["sigma"])
+    assert (run / "trained" / "network.npz").is_file()
+    assert (run / "tolerance" / "results.json").is_file()
+    assert (run / "finetuned" / "network.npz").is_file()
+    assert len(list((tmp_path / "reconstructed").iterdir())) == 2
