@@ -23,7 +23,7 @@ TRAINING = ["train.size=64", "train.steps=2", "train.perceptual=0.0", "network.w
 
 def session(folder: Path) -> None:
     """Run every command that writes results into a folder."""
-    bare = str(ROOT / "masks" / "example" / "DOE_EXAMPLE_HEIGHT.npy")
+    bare = str(next((ROOT / "masks" / "example").glob("*_HEIGHT.npy")))
     quick = str(ROOT / "examples" / "quick.toml")
     run, small = str(folder / "quick"), str(folder / "example")
     stock = ["--set", "process.stock=contact_aligner"]

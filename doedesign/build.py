@@ -1,16 +1,17 @@
-"""Values of the physics from the tables of a spec: camera, levels, process, wafer."""
+"""Values of the physics from the tables of a spec: camera, levels, process, wafer, terms of an order."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from doedesign.spec import DefectsSpec, ProcessSpec, Spec, WaferSpec, load_process, process_from_json
+from doedesign.spec import DefectsSpec, OrderSpec, ProcessSpec, Spec, WaferSpec, load_process, process_from_json
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME
 from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
+from fab.order.terms import OrderTerms
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, process_from
 from sim.camera import Camera, Colour
@@ -76,6 +77,11 @@ def process_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Proces
 def wafer_from_spec(spec: WaferSpec) -> Wafer:
     """Return the layout of a wafer, or raise an `InputError` for numbers that do not go together."""
     return Wafer(**spec.model_dump())
+
+
+def terms_from_spec(spec: OrderSpec) -> OrderTerms:
+    """Return the terms of a mask order."""
+    return OrderTerms(**spec.model_dump())
 
 
 def is_process_file(given: object) -> TypeGuard[str | Path]:

@@ -55,6 +55,7 @@ def masks(
     order: Path | None = None,
     process: Path | None = None,
     wafer: Path | None = None,
+    terms: Path | None = None,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -78,10 +79,13 @@ def masks(
         order: With --as-built, the order that was made; masks/NAME by default.
         process: A TOML file with another [process] table; with --as-built, for what was not measured.
         wafer: A TOML file with another [wafer] table.
+        terms: A TOML file with another [order] table, what a mask shop is asked for.
     """
     if as_built is not None:
-        if wafer is not None:
-            raise InputError("--wafer", "does not go with --as-built", wafer, "Leave it out: the order has its wafer.")
+        for option, given in (("--wafer", wafer), ("--terms", terms)):
+            if given is not None:
+                cure = "Leave it out: the order has its own."
+                raise InputError(option, "does not go with --as-built", given, cure)
         from doedesign.lab.as_built import as_built as predict
 
         folder = source / "as-built"
@@ -101,6 +105,7 @@ def masks(
         patch=_patch(patch, mesh_patch),
         process=process,
         wafer=wafer,
+        terms=terms,
         step_m=length_of("--step", step),
         etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
         pitch_m=length_of("--pitch", pitch),

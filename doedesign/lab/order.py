@@ -5,19 +5,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from doedesign.build import camera_from_spec, is_process_file, process_from_spec, resolve_process, wafer_from_spec
+from doedesign.build import (
+    camera_from_spec,
+    is_process_file,
+    process_from_spec,
+    resolve_process,
+    terms_from_spec,
+    wafer_from_spec,
+)
 from doedesign.design.design import Design
 from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
-from doedesign.spec import ProcessSpec, WaferSpec, load_process, load_wafer
+from doedesign.spec import OrderSpec, ProcessSpec, WaferSpec, load_order, load_process, load_wafer
 from fab.errors import InputError
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.order import Order, plan_order
+from fab.order.terms import OrderTerms
 from fab.order.write import WrittenOrder, write_planned
 from fab.process import Process, Variation
 from fab.runsheet.tables import SheetPrediction
@@ -36,6 +44,7 @@ def write_masks(
     patch: Patch | None = None,
     process: Process | str | Path | None = None,
     wafer: Wafer | str | Path | None = None,
+    terms: OrderTerms | str | Path | None = None,
     **geometry: Any,
 ) -> WrittenOrder:
     """Write and prove the mask order of a design or of any height map, with its run sheet.
@@ -49,6 +58,8 @@ def write_masks(
         patch: a window to write as a solid at full resolution, too.
         process: a process, the name of a stock process or a TOML file; that of the run, or an ideal one, by default.
         wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default.
+        terms: what is asked of the mask shop besides the drawing, or a TOML file with it; that of the run, or else
+            revision A and blanks, by default.
         geometry: of a bare height map: `step_m`, `etch_depths_m`, `pitch_m`, `scale_m`, `aperture_m`
             (`doedesign.runs.level_maps.drawing_from`).
 
@@ -63,12 +74,16 @@ def write_masks(
     if not isinstance(wafer, Wafer):
         usual = spec.wafer if spec else WaferSpec()
         wafer = wafer_from_spec(usual if wafer is None else load_wafer(wafer))
+    if not isinstance(terms, OrderTerms):
+        asked = spec.order if spec else OrderSpec()
+        terms = terms_from_spec(asked if terms is None else load_order(terms))
     order = plan_order(
         level_map,
         process=made_by,
         wafer=wafer,
         chrome=_chrome(process, level_map.levels, spec and spec.process),
         patch=patch,
+        terms=terms,
         source=origin,
         on_violation=on_violation,
         waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),

@@ -14,6 +14,7 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good DOE
     wafer       the table of the wafer: dies, mask blanks, chrome
+    order       the table of what a mask shop is asked for
     training    the tables of the network and its training
     variation   files of their own: a process, the errors of one DOE
     checks      rules that join several tables, and warnings; process_checks those of the process
@@ -30,6 +31,7 @@ from typing import Any
 from doedesign.spec.checks import find_problems, spec_warnings
 from doedesign.spec.errors import SpecError, Table, key_as_written, spec_error, validated
 from doedesign.spec.models import Spec
+from doedesign.spec.order import OrderFile, OrderSpec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
@@ -59,6 +61,7 @@ _FILES: dict[type, tuple[str, str]] = {
     Spec: ("a spec", "examples/quick.toml"),
     ProcessFile: ("a process", "the [process] table of examples/automotive.toml"),
     WaferFile: ("a wafer", "`[wafer]` with `dies = [2, 2]`"),
+    OrderFile: ("the terms of an order", '`[order]` with `contact = "..."`'),
     VariationFile: ("a variation", "`[variation]` with `depth_scale = [0.02, 0.0, 0.0, 0.0]`"),
 }
 # The rules between the values of a file.
@@ -121,6 +124,11 @@ def _staircase(levels: Levels) -> dict[str, Any]:
 def load_wafer(path: str | Path) -> WaferSpec:
     """Read a wafer from the `[wafer]` table of a TOML file; see `load_process`."""
     return _load(WaferFile, path, "wafer").wafer
+
+
+def load_order(path: str | Path) -> OrderSpec:
+    """Read the terms of a mask order from the `[order]` table of a TOML file; see `load_process`."""
+    return _load(OrderFile, path, "order").order
 
 
 def process_from_json(data: Mapping[str, Any], source: str) -> ProcessSpec:

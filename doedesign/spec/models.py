@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 
+from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import SpecTable, optional
@@ -202,6 +203,7 @@ class Spec(SpecTable, frozen=True):
     objectives: tuple[ObjectiveSpec, ...] = ()
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
+    order: OrderSpec = optional(OrderSpec())
     network: NetworkSpec = optional(NetworkSpec())
     train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)

@@ -11,6 +11,7 @@ from fab.units import MM, UM
 
 Size = Annotated[float, length(1 * MM, 0.5)]
 Thickness = Annotated[float, length(0.01 * MM, 50 * MM)]
+Rim = Annotated[float, length(0.0, 20 * MM)]
 Move = Annotated[float, length(-100 * UM, 100 * UM)]
 Dies = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
@@ -24,13 +25,16 @@ class WaferSpec(SpecTable, frozen=True):
         diameter_m: diameter of the wafer.
         thickness_m: its thickness.
         blank_m: edge of the square mask blanks.
-        dies: rows and columns of dies; the most that fit, up to 3 x 3, if none are given.
-        pitch_m: distance of the dies; the next whole millimetre that a die needs if none is given.
+        dies: rows and columns of dies; as many as fit if none are given.
+        pitch_m: distance of the dies; the next whole millimetre that a die and a saw lane need if none is given.
+        lane_m: width of the saw lanes.
+        edge_exclusion_m: width of the rim that holds nothing.
+        chrome_to_edge: whether the chrome around the aperture reaches to the edges of the die.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: "liftoff" or "etch".
         compensate: whether masks are drawn against the mean line-width bias of the process.
-        line_splits_m: for each entry one die whose edges of etched areas are drawn so much further out.
-        order_control: whether one die draws the planes in the opposite order of depths.
+        line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out.
+        order_control: whether some dies draw the planes in the opposite order of depths.
     """
 
     diameter_m: Size = optional(_USUAL.diameter_m)
@@ -38,6 +42,9 @@ class WaferSpec(SpecTable, frozen=True):
     blank_m: Size = optional(_USUAL.blank_m)
     dies: tuple[Dies, Dies] | None = optional()
     pitch_m: Size | None = optional()
+    lane_m: Rim = optional(_USUAL.lane_m)
+    edge_exclusion_m: Rim = optional(_USUAL.edge_exclusion_m)
+    chrome_to_edge: Annotated[bool, Field(strict=True)] = optional(_USUAL.chrome_to_edge)
     zero_layer: Annotated[bool, Field(strict=True)] = optional(_USUAL.zero_layer)
     chrome: Literal["liftoff", "etch"] = optional(_USUAL.chrome)
     compensate: Annotated[bool, Field(strict=True)] = optional(_USUAL.compensate)

@@ -131,6 +131,25 @@ class Layout:
         return tuple(dict.fromkeys(layer for cell in reversed(self.cells) for layer in cell.shapes))
 
 
+def placed_boxes(layout: Layout) -> dict[Layer, Box]:
+    """Return the smallest box around all of every layer, what cells place included, database units."""
+    done: dict[str, dict[Layer, Box]] = {}
+    for cell in layout.cells:
+        boxes = [(layer, box) for layer, shapes in cell.shapes.items() if (box := shapes.box) is not None]
+        for at in cell.references:
+            (left, right), (low, high) = (
+                sorted((start, start + (count - 1) * step))
+                for start, count, step in ((at.x, at.columns, at.step_x), (at.y, at.rows, at.step_y))
+            )
+            for layer, (x0, y0, x1, y1) in done[at.cell].items():
+                boxes.append((layer, (x0 + left, y0 + low, x1 + right, y1 + high)))
+        found: dict[Layer, Box] = {}
+        for layer, box in boxes:
+            found[layer] = box_around([box, found.get(layer, box)]) or box
+        done[cell.name] = found
+    return done[layout.top.name]
+
+
 def in_order(cells: Iterable[Cell]) -> tuple[Cell, ...]:
     """Sort cells so that each comes after those that it places, the one top cell last; ValueError if they cannot be."""
     waiting = {}

@@ -6,6 +6,7 @@ has a dot, unlike an O.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,15 @@ _ ..... ..... ..... ..... ..... ..... #####
 _GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {" ": ["....."] * HEIGHT}
 
 
+class Job(NamedTuple):
+    """What tells one job from another: beginning of its names, revision, pixel pitch, digest of its geometry."""
+
+    stem: str
+    revision: str
+    pitch_m: float
+    geometry: str
+
+
 def letter_boxes(text: str) -> NDArray[np.int32]:
     """Return the disjoint rectangles ``(n, 4)`` x0, y0, x1, y1, in strokes, of text that stands on y = 0 from x = 0."""
     odd = sorted(set(text) - set(_GLYPHS))
@@ -87,7 +97,7 @@ def lettering(text: str, height_m: float, dbu_m: float) -> Shapes:
     return Shapes(letter_boxes(text) * np.int32(stroke))
 
 
-def mask_label(job: str, photomask: Photomask, reading: str, digest: str) -> list[str]:
+def mask_label(job: Job, photomask: Photomask, reading: str) -> list[str]:
     """Return what is written on a mask, in capitals, line by line from the top, with 8 digits of the digest."""
     if photomask.bit is not None:
         what = f"mask {photomask.bit + 1} bit {photomask.bit} etch {photomask.depth}"
@@ -95,7 +105,8 @@ def mask_label(job: str, photomask: Photomask, reading: str, digest: str) -> lis
         what = "zero layer - chrome marks" if photomask.makes == "zero layer" else "chrome aperture"
     field = "dark" if photomask.tone == "clear" else "clear"
     tone = f"polygons {photomask.tone} - {field} field plate"
-    return [line.upper() for line in (job, what, tone, reading, f"hash {digest[:8]}")]
+    issue, geometry = f"rev {job.revision} - pitch {format_length(job.pitch_m)}", f"geometry {job.geometry[:8]}"
+    return [line.upper() for line in (job.stem, what, tone, reading, issue, geometry)]
 
 
 def label_block(labels: Sequence[tuple[Photomask, Sequence[str]]], height_m: float, dbu_m: float) -> Part:

@@ -229,14 +229,25 @@ def _what_happens(first: Photomask, photomask: Photomask) -> str:
     )
 
 
+def faint_marks(photomasks: Sequence[Photomask]) -> str:
+    """Return a warning if the marks that all masks are aligned to are etched too shallow to be seen well; else ""."""
+    first = photomasks[0]
+    if first.makes != "etch" or first.depth_m >= _FAINT_M or len(photomasks) == 1:
+        return ""
+    return (
+        f"the alignment marks are etched {first.depth} deep, with {first.name}, and are hard to see: "
+        "etch the deepest mask first, or add a zero layer of chrome marks"
+    )
+
+
 def alignment_notes(photomasks: Sequence[Photomask]) -> tuple[str, ...]:
     """Describe how each mask is aligned and what happens to the marks, a paragraph per photomask."""
     first = photomasks[0]
     etched = first.makes == "etch"
     made = f"etched {first.depth} deep" if etched else "of chrome"
     notes = [f"{first.name.capitalize()}: makes the marks that all other masks are aligned to, {made}."]
-    if etched and first.depth_m < _FAINT_M and len(photomasks) > 1:
-        notes[0] += " Warning: such shallow marks are hard to see. Etch the deepest mask first, or add a zero layer."
+    if warning := faint_marks(photomasks):
+        notes[0] += f" Warning: {warning}."
     for photomask in photomasks[1:]:
         if photomask.tone == "clear":
             seen = "dark field with clear windows: bring the wafer's crosses and frames around the dark squares in them"

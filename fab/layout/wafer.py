@@ -1,5 +1,6 @@
 """The wafer that a mask set is for: its glass, its mask blanks, and how it is filled."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -8,6 +9,7 @@ from fab.units import MM, UM, format_length
 
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
+_NOTCH_M, _NOTCHED_M = 1 * MM, 199 * MM
 
 
 @dataclass(frozen=True)
@@ -19,14 +21,17 @@ class Wafer:
         diameter_m: diameter of the wafer, metres.
         thickness_m: its thickness, metres.
         blank_m: edge of the square mask blanks, metres; 5 inches for a wafer of 100 mm.
-        dies: rows and columns of dies; the most that fit, up to 3 x 3, if None.
-        pitch_m: distance of the dies, metres; the next whole millimetre that a die needs if None.
+        dies: rows and columns of dies; as many as fit if None.
+        pitch_m: distance of the dies, metres; the next whole millimetre that a die and a saw lane need if None.
+        lane_m: width of the saw lanes between the dies, metres.
+        edge_exclusion_m: width of the rim that is held, beaded or ground, and holds nothing, metres.
+        chrome_to_edge: whether the chrome around the aperture reaches to the edges of the die.
         zero_layer: whether marks of chrome are made before the first etch.
         chrome: how the aperture's chrome is made.
         compensate: whether masks are drawn with their edges moved against the line-width bias that the process is
             known for (`Process.expected`).
-        line_splits_m: for each entry one die whose edges of etched areas are drawn so much further out, metres.
-        order_control: whether one die draws the planes in the opposite order of depths (`fab.layout.split`).
+        line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out, metres.
+        order_control: whether some dies draw the planes in the opposite order of depths (`fab.layout.split`).
 
     Raises:
         InputError: a wafer that its blanks do not hold, no die as ordered, or a length that cannot be.
@@ -38,6 +43,9 @@ class Wafer:
     blank_m: float = 127 * MM
     dies: tuple[int, int] | None = None
     pitch_m: float | None = None
+    lane_m: float = 200 * UM
+    edge_exclusion_m: float = 4 * MM
+    chrome_to_edge: bool = True
     zero_layer: bool = False
     chrome: Literal["liftoff", "etch"] = "liftoff"
     compensate: bool = False
@@ -57,17 +65,30 @@ class Wafer:
         if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
             got = ", ".join(format_length(move) for move in self.line_splits_m)
             raise InputError("wafer: line splits", "must lie from 1 nm to 100 um, out or in", got, "Check their unit.")
+        for name, most_m in (("lane_m", 10 * MM), ("edge_exclusion_m", self.diameter_m / 4)):
+            if not 0 <= (value := getattr(self, name)) <= most_m:
+                rule = f"must lie from 0 to {format_length(most_m)}"
+                raise InputError(f"wafer: {name}", rule, format_length(value), "Check its unit.")
         if self.dies is not None:
-            self.require_room(self.dies)
+            self.require_room(self.dies[0] * self.dies[1])
 
-    def require_room(self, dies: tuple[int, int]) -> None:
-        """Check that splits leave a die as ordered on so many rows and columns of dies."""
-        rows, columns = dies
+    def require_room(self, dies: int) -> None:
+        """Check that splits leave a die as ordered of so many."""
         split = len(self.line_splits_m) + self.order_control
-        if split >= rows * columns:
+        if split >= dies:
             rule = "must leave one die or more as ordered"
-            got = f"{split} of {rows * columns} dies"
+            got = f"{split} of {dies} dies"
             raise InputError("wafer: line splits", rule, got, "Take fewer splits, or more dies.")
+
+    @property
+    def flat_y_m(self) -> float:
+        """How far the flat, or the rim where there is none, lies below the middle, metres."""
+        return math.sqrt((self.diameter_m / 2) ** 2 - (self.usual_flat_m / 2) ** 2)
+
+    @property
+    def notch_m(self) -> float:
+        """Depth of the notch that wafers of this diameter usually have, metres; 0 where it is a flat, or nothing."""
+        return _NOTCH_M if self.diameter_m >= _NOTCHED_M else 0.0
 
     @property
     def usual_flat_m(self) -> float:

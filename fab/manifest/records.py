@@ -114,11 +114,11 @@ class DrawnEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class SplitEntry:
-    """A die that draws the DOE differently on purpose: its cell, what is special, which die, and what it draws."""
+    """Dies that draw the DOE differently on purpose: their cell, what is special, which dies, and what they draw."""
 
     cell: str
     words: str
-    die: int
+    dies: list[int]
     layers: list[DrawnEntry]
 
 
@@ -144,6 +144,10 @@ class WaferEntry:
     diameter_mm: float
     thickness_mm: float
     blank_mm: float
+    edge_exclusion_mm: float
+    flat_mm: float
+    notch_mm: float
+    die_mm: float
     die_pitch_mm: float
     dies_mm: list[list[float]]
     places_um: dict[str, Any]
@@ -186,11 +190,13 @@ class Manifest:
     """A whole mask order.
 
     `source` says where the level map came from, in the words of who asked. All but it and the versions of the tools
-    follows from `request` (`fab.order.request`) and the level numbers.
+    follows from `request` (`fab.order.request`) and the level numbers. `geometry_sha256` is
+    `fab.order.order.Order.geometry`.
     """
 
     format: str
     name: str
+    geometry_sha256: str
     source: dict[str, Any]
     conventions: dict[str, Any]
     request: dict[str, Any]

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from fab.files import canonical_json, sha256_bytes
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
-from fab.layout.geometry import Cell, Layer, Layout, merged, pixel_edges
+from fab.layout.geometry import Cell, Layer, Layout, chrome_layer, merged, pixel_edges
 from fab.layout.part import Photomask
 from fab.manifest.cells import cell_entry
 from fab.manifest.records import CONVENTIONS, FORMAT, FileEntry, Manifest, ModelEntry
@@ -87,9 +87,9 @@ def draw(order: Order) -> DrawnOrder:
             order.photomasks,
             level_map,
             splits=order.splits,
-            stem=order.stem,
+            job=order.job,
             minimum_line_m=order.process.minimum_line_m,
-            chrome_m=2 * order.chrome.radii_m(level_map)[1],
+            chrome=does[0].shapes[chrome_layer(level_map.levels)],
             dbu_m=order.dbu_m,
         )
 
@@ -104,10 +104,9 @@ def _mask_file(name: str, kind: str, layout: Layout, layers: Iterable[Layer], do
 
 
 def _paper_names(order: Order) -> Sequence[str]:
-    if not order.papers:
-        return ()
+    always = ("CHECK.drc", "LAYERS.lyp", "ORDER.csv", "ORDER.html", "PREVIEW.png")
     rules = () if order.rules.clean else ("RULES.png",)
-    return ("WAFER.png", "MARKS.png", "RUNSHEET.html", "RUNSHEET.json", *rules)
+    return (*always, *(("WAFER.png", "MARKS.png", "RUNSHEET.html", "RUNSHEET.json", *rules) if order.papers else ()))
 
 
 def file_entries(drawing: DrawnOrder, models: Sequence[ModelEntry]) -> list[FileEntry]:
@@ -116,7 +115,7 @@ def file_entries(drawing: DrawnOrder, models: Sequence[ModelEntry]) -> list[File
     drawn = list(layout.cells[0].shapes)
     plates = [(drawing.plate(photomask), {Layer(photomask.layer)} & {*drawn}) for photomask in order.photomasks]
     others = [model.file for model in models]
-    others += [f"{order.stem}_{ending}" for ending in (*_paper_names(order), "LEVELS.npy", "PREVIEW.png")]
+    others += [f"{order.stem}_{ending}" for ending in (*_paper_names(order), "LEVELS.npy")]
     return [
         _mask_file(f"{order.stem}_ALL.gds", "GDSII", layout, drawn, does),
         *(_mask_file(f"{plate.top.name}.gds", "GDSII", plate, layers, does) for plate, layers in plates),
@@ -141,6 +140,7 @@ def manifest_of(
     return Manifest(
         format=FORMAT,
         name=level_map.name,
+        geometry_sha256=order.geometry,
         source=dict(order.source),
         conventions=CONVENTIONS,
         request=request_of(order),

@@ -89,7 +89,11 @@ def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
         diameter_mm=round(wafer.diameter_m / MM, 9),
         thickness_mm=round(wafer.thickness_m / MM, 9),
         blank_mm=round(wafer.blank_m / MM, 9),
-        die_pitch_mm=round(frame.die_m / MM, 9),
+        edge_exclusion_mm=round(wafer.edge_exclusion_m / MM, 9),
+        flat_mm=round(wafer.usual_flat_m / MM, 9),
+        notch_mm=round(wafer.notch_m / MM, 9),
+        die_mm=round(frame.die_m / MM, 9),
+        die_pitch_mm=round(frame.pitch_m / MM, 9),
         dies_mm=[[round(x / MM, 9), round(y / MM, 9)] for x, y in frame.dies],
         places_um=places,
     )
@@ -98,7 +102,12 @@ def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
 def split_entries(order: Order, drawn: Layout, frame: Frame) -> list[SplitEntry]:
     """Return the manifest's entries of the dies that draw the DOE differently, as the cells of `drawn` do."""
     return [
-        SplitEntry(cell.name, split.words, frame.splits.index(number) + 1, _drawn_entries(order, split, cell))
+        SplitEntry(
+            cell.name,
+            split.words,
+            [n for n, die in enumerate(frame.splits, 1) if die == number],
+            _drawn_entries(order, split, cell),
+        )
         for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
         if number
     ]

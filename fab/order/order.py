@@ -1,6 +1,7 @@
 """A mask order in numbers, before it becomes files: what is drawn, for whom, and what everything is called."""
 
 import logging
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -8,19 +9,23 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 from fab.errors import InputError
+from fab.files import canonical_json, sha256_bytes
 from fab.layout.compensation import edge_moves
 from fab.layout.geometry import Chrome, pixel_edges
+from fab.layout.lettering import Job
+from fab.layout.marks import faint_marks
 from fab.layout.part import Photomask, photomasks_of
 from fab.layout.split import DieSplit, splits_of
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
+from fab.order.terms import OrderTerms
 from fab.process import Process
 from fab.rules.check import RulesReport, check
 from fab.rules.repair import Repair, repaired
 from fab.runsheet.tables import Predictions
 from fab.solids.patch import Patch
 from fab.stock import process_from
-from fab.units import NM
+from fab.units import NM, UM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,8 +35,9 @@ log = logging.getLogger("doedesign")
 
 OnViolation = Literal["warn", "fail", "fix"]
 
-# What is left of 32 characters beside "DOE_" and the longest ending, "_M6_B5_1234P5NM".
-_LONGEST_ID = 13
+# Of names of files and cells, and of the endings of cells other than those of masks ("_ORDER_DIE").
+_LONGEST_NAME, _LONGEST_ENDING = 32, 10
+_FEMTO = 10**15
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class Order:
         source: where the level map came from, for the manifest; JSON values only.
         patch: a window that is wanted as a solid at full resolution, if any.
         repair: how the level map was changed for the process to print it, if it was.
+        terms: what is asked of the mask shop besides the drawing.
         papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
         light: what the run sheet says of the light, if anything.
     """
@@ -67,6 +74,7 @@ class Order:
     source: Mapping[str, Any] = field(default_factory=dict)
     patch: Patch | None = None
     repair: Repair | None = None
+    terms: OrderTerms = field(default_factory=OrderTerms)
     papers: bool = False
     light: Light | None = None
 
@@ -113,14 +121,43 @@ class Order:
         return f"{self.stem}_{'ZERO' if photomask.makes == 'zero layer' else 'CHROME'}"
 
     @property
+    def job(self) -> Job:
+        """What tells this job from others."""
+        return Job(self.stem, self.terms.revision, self.level_map.grid.pitch_m, self.geometry)
+
+    @cached_property
+    def geometry(self) -> str:
+        """SHA-256 of all that the drawing is made from: level map, pixels, depths, chrome, wafer and process."""
+        level_map, process = self.level_map, self.process
+        drawn = {
+            "level map": level_map.digest,
+            "shape": level_map.grid.shape,
+            "pitch": level_map.grid.pitch_m,
+            "aperture": level_map.aperture_m,
+            "depths": level_map.levels.depths_m,
+            "chrome": asdict(self.chrome),
+            "wafer": asdict(self.wafer),
+            "process": (process.order, process.tone, process.minimum_line_m, self.edge_moves()),
+        }
+        return sha256_bytes(canonical_json(_whole(drawn)))
+
+    @cached_property
     def stem(self) -> str:
-        """Beginning of all file names."""
-        return f"DOE_{order_id(self.level_map.name, self.level_map.digest)}"
+        """Identity of the job, with which all names begin: name, revision, pitch (micrometres), digest of geometry."""
+        pitch = f"{self.level_map.grid.pitch_m / UM:.4g}".replace(".", "P")
+        ending = f"_{self.terms.revision}_{pitch}_{self.geometry[:4].upper()}"
+        masks = (len(self._mask_ending(bit)) for bit in range(self.process.masks))
+        room = _LONGEST_NAME - len(ending) - max(_LONGEST_ENDING, *masks)
+        return plain_name(self.level_map.name)[:room].rstrip("_") + ending
 
     def mask_stem(self, bit: int) -> str:
         """Return the name of an etch mask's file (without suffix) and cell."""
-        depth = f"{self.level_map.levels.etch_depth_m(bit) / NM:.1f}".removesuffix(".0").replace(".", "P")
-        return f"{self.stem}_M{bit + 1}_B{bit}_{depth}NM"
+        return f"{self.stem}{self._mask_ending(bit)}"
+
+    def _mask_ending(self, bit: int) -> str:
+        depth_m = self.level_map.levels.etch_depth_m(bit)
+        depth = f"{depth_m / NM:.1f}".removesuffix(".0") + "NM" if depth_m < 10 * UM else f"{depth_m / UM:.4g}UM"
+        return f"_M{bit + 1}_{depth.replace('.', 'P')}"
 
 
 def plan_order(
@@ -130,6 +167,7 @@ def plan_order(
     wafer: Wafer | None = None,
     chrome: Chrome | None = None,
     patch: Patch | None = None,
+    terms: OrderTerms | None = None,
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
@@ -146,7 +184,10 @@ def plan_order(
     if on_violation == "fail" and not report.printable:
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
-    order = Order(report, made_by, wafer or Wafer(), chrome or Chrome(), source or {}, patch, papers=papers)
+    wafer, terms = wafer or Wafer(), terms or OrderTerms()
+    order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, patch, terms=terms, papers=papers)
+    if warning := faint_marks(order.photomasks):
+        log.warning(warning)
     if on_violation == "fix" and not report.clean:
         log.info("repairing the level map")
         repair = repaired(report, waves_per_metre)
@@ -158,12 +199,20 @@ def plan_order(
     return order
 
 
-def order_id(name: str, digest: str) -> str:
-    """Turn a name into what mask shops accept in file and cell names: capitals, digits and _.
-
-    One of more than 13 characters keeps 8, and 4 of the level map's digest, which keeps shortened names apart.
-    """
+def plain_name(name: str) -> str:
+    """Turn a name into what mask shops accept in file and cell names: capitals, digits and _."""
     plain = re.sub(r"[^A-Z0-9]+", "_", name.upper()).strip("_")
     if not plain:
         raise InputError("mask order name", "must hold a letter A-Z or a digit", repr(name), "Choose another name.")
-    return plain if len(plain) <= _LONGEST_ID else f"{plain[:8].rstrip('_')}_{digest[:4].upper()}"
+    return plain
+
+
+def _whole(value: Any) -> Any:
+    """Replace every length in nested values, metres, by whole femtometres, which last digits do not change."""
+    if isinstance(value, Mapping):
+        return {key: _whole(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_whole(item) for item in value]
+    if isinstance(value, float):
+        return round(value * _FEMTO) if math.isfinite(value) else str(value)
+    return value

@@ -1,4 +1,4 @@
-"""The papers of an order: pictures, and the run sheet."""
+"""The papers of an order: pictures, the order form, the run sheet, and the files for KLayout."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -7,8 +7,10 @@ from fab.figure import png_bytes
 from fab.files import canonical_json
 from fab.layout.marks import alignment_site
 from fab.order.drawing import DrawnOrder
+from fab.order.form import form_csv, form_page, form_record
+from fab.order.recheck import drc_deck, layer_properties
 from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
-from fab.runsheet.write import html_page, record
+from fab.runsheet.write import record, run_sheet_page
 
 Paper = Callable[[], bytes]
 
@@ -24,7 +26,13 @@ def papers(drawing: DrawnOrder, plates: Mapping[str, str], psfs: bytes | None = 
     order = drawing.order
     stem = order.stem
     pictures: dict[str, Paper] = {"PREVIEW.png": lambda: png_bytes(order.plot())}
-    sheets: dict[str, Paper] = {}
+    form = form_record(drawing, plates)
+    sheets: dict[str, Paper] = {
+        "ORDER.csv": lambda: form_csv(form),
+        "ORDER.html": lambda: form_page(form, f"{stem}_ORDER.csv"),
+        "LAYERS.lyp": lambda: layer_properties(order, drawing.layout.layers),
+        "CHECK.drc": lambda: drc_deck(order, f"{stem}_ALL.oas"),
+    }
     if order.papers:
         pictures["WAFER.png"] = partial(_wafer, drawing)
         pictures["MARKS.png"] = partial(_marks, drawing)
@@ -33,8 +41,13 @@ def papers(drawing: DrawnOrder, plates: Mapping[str, str], psfs: bytes | None = 
             pictures["RULES.png"] = lambda: png_bytes(order.rules.plot(title=title))
         content = record(run_sheet(drawing, plates))
         sheets["RUNSHEET.json"] = lambda: canonical_json(content)
-        sheets["RUNSHEET.html"] = lambda: html_page(content, f"{stem}_RUNSHEET.json", psfs).encode()
+        sheets["RUNSHEET.html"] = lambda: run_sheet_page(content, f"{stem}_RUNSHEET.json", shown())
     kept = {name: partial(drawing.kept, name, draw) for name, draw in pictures.items()}
+
+    def shown() -> dict[str, bytes]:
+        embedded = {"wafer": kept["WAFER.png"](), "marks": kept["MARKS.png"]()}
+        return embedded if psfs is None else {**embedded, "psfs": psfs}
+
     return {f"{stem}_{name}": make for name, make in {**kept, **sheets}.items()}
 
 

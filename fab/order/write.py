@@ -1,13 +1,14 @@
 """The folder that goes to the lab: every mask as a file, the whole as a review file, and the proof.
 
-    DOE_<ID>_ALL.gds, .oas          all layers, for review
-    DOE_<ID>_M<n>_B<k>_<depth>.gds  one file per etch mask, on its own layer k + 1
-    DOE_<ID>_CHROME.gds             the chrome around the clear aperture
-    DOE_<ID>_ZERO.gds               the chrome marks that are made first, if the wafer has any
-    DOE_<ID>_LEVELS.npy             the level map (uint8, row 0 at the lowest y)
-    DOE_<ID>_PREVIEW.png            a picture for people
-    manifest.json                   what each file is, its digest, its geometry
-    ...                             solids and height maps (`fab.solids.write`), papers (`fab.order.papers`)
+    <JOB>_ALL.gds, .oas           all layers, for review
+    <JOB>_M<n>_<depth>.gds        one file per etch mask n, on its own layer n
+    <JOB>_CHROME.gds              the chrome around the clear aperture
+    <JOB>_ZERO.gds                the chrome marks that are made first, if the wafer has any
+    <JOB>_LEVELS.npy              the level map (uint8, row 0 at the lowest y)
+    manifest.json                 what each file is, its digest, its geometry
+    ...                           solids and height maps (`fab.solids.write`), papers (`fab.order.papers`)
+
+<JOB> is `fab.order.order.Order.stem`, such as QUICK_A_1P85_3F2A.
 
 The folder appears at its final path only after everything in it was read back and found equal to the
 level map.
@@ -34,6 +35,7 @@ from fab.manifest.records import Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
 from fab.order.order import Light, OnViolation, Order, plan_order
 from fab.order.papers import papers
+from fab.order.terms import OrderTerms
 from fab.order.verify import verify
 from fab.process import Process
 from fab.runsheet.tables import SheetPrediction
@@ -128,6 +130,7 @@ def write_order(
     wafer: Wafer | None = None,
     chrome: Chrome | None = None,
     patch: Patch | None = None,
+    terms: OrderTerms | None = None,
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
@@ -136,12 +139,13 @@ def write_order(
 
     Args:
         folder: the final folder; missing, empty, or an earlier order, which is replaced.
-        level_map: the DOE; file names are made from its name.
+        level_map: the DOE; file names begin with its name.
         process: order of the etches, tone of the masks and what is printed, or the name of a stock process; ideal by
             default.
         wafer: what the masks are filled with.
         chrome: how the chrome is drawn.
         patch: a window to write as a solid at full resolution, too.
+        terms: what is asked of the mask shop besides the drawing; revision A and blanks by default.
         source: where the level map came from, for the manifest; JSON values only.
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
@@ -156,6 +160,7 @@ def write_order(
         wafer=wafer,
         chrome=chrome,
         patch=patch,
+        terms=terms,
         source=source,
         on_violation=on_violation,
         waves_per_metre=waves_per_metre,

@@ -1,9 +1,11 @@
 """The picture of a whole photomask: blank, wafer, dies, alignment sites, test structures and labels."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from fab.figure import CHROME, FAINT, INK, LINE, MARK, SMALL, length_text, single
+from fab.layout.frame import WAFER
+from fab.layout.geometry import box_around
 from fab.units import MM
 
 if TYPE_CHECKING:
@@ -13,7 +15,8 @@ if TYPE_CHECKING:
     from fab.layout.geometry import Shapes
     from fab.layout.wafer import Wafer
 
-_SITES = {"SITE": "alignment site", "TEST": "test structures"}
+_CENTRED: Any = {"ha": "center", "va": "center", "fontsize": SMALL}
+_SITES = {"SITE": "A", "TEST": "M"}
 
 
 def plot_wafer(
@@ -24,14 +27,17 @@ def plot_wafer(
     The cells around the DOE are the frame (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
     number. Diameter of the relief and database unit are metres.
     """
-    from matplotlib.patches import Circle, Rectangle
+    from matplotlib.patches import Circle, Polygon, Rectangle
 
     cells = {cell.name: cell for cell in frame.cells}
     top, around = frame.cells[-1], frame.cells[-2]
     with single(ax, (7.0, 7.6), title, _words(wafer, frame)) as axes:
         half = wafer.blank_m / 2 / MM
         axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f3f3f1", edgecolor=INK, lw=1.2))
-        axes.add_patch(Circle((0, 0), wafer.diameter_m / 2 / MM, facecolor="white", edgecolor=LINE, lw=1.2))
+        (outline,) = around.shapes[WAFER].polygons
+        axes.add_patch(Polygon(outline * (dbu_m / MM), facecolor="white", edgecolor=LINE, lw=1.2))
+        usable = (wafer.diameter_m / 2 - wafer.edge_exclusion_m) / MM
+        axes.add_patch(Circle((0, 0), usable, fill=False, edgecolor=FAINT, lw=0.8, ls="--"))
         side = frame.die_m / MM
         for (x_m, y_m), split in zip(frame.dies, frame.splits, strict=True):
             x, y = x_m / MM, y_m / MM
@@ -42,35 +48,40 @@ def plot_wafer(
         for reference in around.references:
             kind = reference.cell.rpartition("_")[2]
             if kind in _SITES:
-                _box(axes, cells[reference.cell].shapes.values(), (reference.x, reference.y), dbu_m, _SITES[kind])
+                at, letter = (reference.x, reference.y), {"color": "white", "weight": "bold", **_CENTRED}
+                x0, y0, x1, y1 = _box(axes, cells[reference.cell].shapes.values(), at, dbu_m)
+                axes.text((x0 + x1) / 2, (y0 + y1) / 2, _SITES[kind], **letter)
         labels = [shapes for layer, shapes in top.shapes.items() if layer.datatype == 3]
-        _box(axes, labels, (0, 0), dbu_m, "labels, one per mask")
+        x0, _, x1, y1 = _box(axes, labels, (0, 0), dbu_m)
+        axes.text((x0 + x1) / 2, y1 + 1.3, "labels, one per mask", **_CENTRED)
+        for layer, shapes in top.shapes.items():
+            for box in shapes.rectangles.tolist() if layer.datatype == 1 else ():
+                _fill(axes, box, dbu_m)
         axes.set(xlim=(-half - 1, half + 1), ylim=(-half - 1, half + 1), aspect="equal")
         axes.set(xlabel="x (mm)", ylabel="y (mm)")
     return axes
 
 
 def _words(wafer: "Wafer", frame: "Frame") -> str:
-    rows, columns = frame.raster
     numbered = " Numbered dies: splits, drawn differently on purpose; the manifest and the run sheet say how."
     return (
         f"Blank of {length_text(wafer.blank_m)}, wafer of {length_text(wafer.diameter_m)} and "
-        f"{length_text(wafer.thickness_m)}, {rows} x {columns} dies {length_text(frame.die_m)} apart. "
-        f"Seen from the etched side, +y up; {wafer.reading}. Grey: reliefs." + (numbered if any(frame.splits) else "")
+        f"{length_text(wafer.thickness_m)}, {len(frame.dies)} dies {length_text(frame.pitch_m)} apart. "
+        f"Seen from the etched side, +y up; {wafer.reading}. Grey: reliefs. "
+        "A: alignment sites, M: process monitors. Dashed: edge exclusion." + (numbered if any(frame.splits) else "")
     )
 
 
-def _box(axes: "Axes", drawn: "Iterable[Shapes]", at: tuple[int, int], dbu_m: float, words: str) -> None:
-    """Draw the box around some shapes where they are placed, with its name beside it."""
+def _box(axes: "Axes", drawn: "Iterable[Shapes]", at: tuple[int, int], dbu_m: float) -> tuple[float, ...]:
+    """Fill the box around some shapes where they are placed, and return its edges in millimetres."""
+    box = box_around(shapes.box for shapes in drawn if shapes.box is not None) or (0, 0, 0, 0)
+    return _fill(axes, [edge + at[axis % 2] for axis, edge in enumerate(box)], dbu_m)
+
+
+def _fill(axes: "Axes", box: "Sequence[int]", dbu_m: float) -> tuple[float, ...]:
+    """Fill a box of database units, and return its edges in millimetres."""
     from matplotlib.patches import Rectangle
 
-    boxes = [shapes.box for shapes in drawn if shapes.box is not None]
-    if not boxes:
-        return
-    unit = dbu_m / MM
-    x0, y0 = ((min(box[k] for box in boxes) + start) * unit for k, start in ((0, at[0]), (1, at[1])))
-    x1, y1 = ((max(box[k] for box in boxes) + start) * unit for k, start in ((2, at[0]), (3, at[1])))
+    x0, y0, x1, y1 = edges = tuple(edge * dbu_m / MM for edge in box)
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=MARK, edgecolor="none", alpha=0.75))
-    centred: Any = {"ha": "center", "va": "center", "fontsize": SMALL}
-    # Away from the wafer's rim, which lies below what is above it.
-    axes.text((x0 + x1) / 2, y1 + 2.2 if y0 > 0 else y0 - 2.2, words, **centred)
+    return edges

@@ -2,6 +2,7 @@
 
 tables        RunSheet: everything the sheet is made from
 recipe        the steps in order
+page          templates of HTML, filled in (those of the order form, too)
 write         the page and the JSON
 as_built      the same JSON with measured numbers filled in
 """

@@ -82,7 +82,9 @@ def tone_words(photomask: Photomask) -> str:
     return "polygons are DARK: glass all over, the polygons are chrome (clear-field plate)"
 
 
-def _printing(photomask: Photomask, file: str, align: str, thickness_m: float, why: str) -> tuple[Action, ...]:
+def _printing(
+    photomask: Photomask, file: str, align: str, thickness_m: float, why: str, rim_m: float
+) -> tuple[Action, ...]:
     """List the actions from the resist to the developed pattern, the same for every photomask."""
     return (
         Action("Prime", "HMDS vapour, so that the resist sticks to the surface."),
@@ -97,13 +99,24 @@ def _printing(photomask: Photomask, file: str, align: str, thickness_m: float, w
             ("temperature (C)", "time (s)"),
         ),
         Action(
+            "Edge bead",
+            f"Take the resist off the rim, no farther in than the {format_length(rim_m)} that hold nothing: a bead "
+            "keeps the plate away from the resist, and every line prints wider.",
+            ("width (mm)",),
+        ),
+        Action(
             "Load the mask",
             f"{photomask.name.capitalize()}, file {file}. The chrome of the plate faces the resist. On the plate: "
             f"{tone_words(photomask)}.",
             ("plate number",),
         ),
         Action("Align", align),
-        Action("Expose", "Vacuum contact. Take the dose from a test exposure.", ("dose (mJ/cm2)",)),
+        Action(
+            "Expose",
+            "Vacuum contact. The wafer is transparent: light that the chuck reflects comes back and widens lines. Put "
+            "something matt and black under it, and take the dose from a test exposure on the same glass there.",
+            ("wavelength (nm)", "dose (mJ/cm2)"),
+        ),
         Action("Develop", "By the resist's data sheet. Rinse and dry.", ("developer, time (s)",)),
     )
 
@@ -114,6 +127,11 @@ def _etch_actions(photomask: Photomask, process: Process) -> tuple[Action, ...]:
     usual = "" if not sigma else f" (usual for this process: within {_TWO_SIGMA * sigma * depth_m / NM:.3g} nm)"
     return (
         Action("Descum", "Oxygen plasma, short, so that no film of resist is left in the openings.", ("time (s)",)),
+        Action(
+            "Hard bake",
+            "By the resist's data sheet, and not so hot that its edges flow: it has to stand the plasma.",
+            ("temperature (C)", "time (s)"),
+        ),
         Action(
             "Etch",
             f"Reactive ions (CHF3 or alike) into the glass, TARGET {photomask.depth}{usual}. Find "
@@ -139,6 +157,9 @@ def _chrome_actions(photomask: Photomask, chrome_m: float, deposition: Depositio
             Action("Lift off", "Remover, warm, then ultrasound. Rinse while wet: flakes that dry stay.", ()),
         )
     return (
+        Action(
+            "Hard bake", "By the resist's data sheet, so that it holds in the etch.", ("temperature (C)", "time (s)")
+        ),
         Action("Etch the chrome", "Wet (ceric ammonium nitrate), until the glass is clear.", ("time (s)",)),
         Action("Strip", "Remover, then oxygen plasma."),
     )
@@ -161,13 +182,23 @@ def least_resist(photomask: Photomask, chrome_m: float, deposition: Deposition) 
     return _THINNEST_M, "It only has to hold in the chrome etch."
 
 
+def _by_the_edge(sheet: RunSheet) -> str:
+    """Return in words how the first mask is brought to the wafer."""
+    wafer = sheet.wafer
+    if wafer.usual_flat_m:
+        return "To the flat: its edge runs in the gaps between the two bars at either end of it, middle on middle."
+    if wafer.notch_m:
+        return "To the notch: its middle lies between the two upright bars below the wafer, middle on middle."
+    return "By eye, middle on middle."
+
+
 def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
     """List the steps of a job, one per photomask in order of use."""
     chrome_m, deposition, process = sheet.chrome_m, sheet.deposition, sheet.process
     steps, deepest_m = [], 0.0
     for number, (photomask, note) in enumerate(zip(sheet.photomasks, alignment_notes(sheet.photomasks), strict=True)):
         deepest_m += photomask.depth_m
-        align = note if number else f"To the flat of the wafer, by eye, middle on middle. {note}"
+        align = note if number else f"{_by_the_edge(sheet)} {note}"
         thickness_m, why = least_resist(photomask, chrome_m, deposition)
         how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
         if number == 0:
@@ -176,7 +207,9 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
         if photomask.makes != "etch" and not lifts_off(photomask):
             how = f"Chrome all over, {format_length(chrome_m)}, {deposition}."
             before.append(Action("Deposit", how, ("thickness (nm)",)))
-        before += _printing(photomask, sheet.files[photomask.name].file, align, thickness_m, why)
+        before += _printing(
+            photomask, sheet.files[photomask.name].file, align, thickness_m, why, sheet.wafer.edge_exclusion_m
+        )
         after = (
             _etch_actions(photomask, process)
             if photomask.makes == "etch"

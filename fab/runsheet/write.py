@@ -8,6 +8,7 @@ import base64
 from collections.abc import Iterator, Mapping
 from math import degrees
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fab.files import canonical_json, write_atomic
@@ -15,6 +16,7 @@ from fab.layout.marks import BOXES, VERNIER_STEP_M
 from fab.layout.part import Photomask
 from fab.layout.structures import BAR_WIDTHS_UM, PAD_SIDES_UM
 from fab.process import Normal
+from fab.runsheet.page import html_page
 from fab.runsheet.recipe import (
     RATES_M_PER_S,
     Action,
@@ -26,7 +28,7 @@ from fab.runsheet.recipe import (
     tone_words,
 )
 from fab.runsheet.tables import Predictions, RunSheet
-from fab.units import MM, NM, UM, format_length
+from fab.units import MM, NM, UM
 
 FORMAT = "doedesign run sheet 1"
 
@@ -34,7 +36,12 @@ FORMAT = "doedesign run sheet 1"
 BARS: Mapping[str, float] = {f"{w:g} um {kind}": w * UM for w in BAR_WIDTHS_UM for kind in ("line", "gap")}
 PADS: Mapping[str, float] = {f"{side:g} um": side * UM for side in PAD_SIDES_UM}
 
+# The pad whose depth is compared over the wafer: wide enough for a stylus, and in all monitors.
+_COMPARED = "100 um"
+
 _TWO_SIGMA = 2.0
+_NONE: dict[str, str | None] = dict.fromkeys(("wafer", "marks", "psfs"))
+_NO_PICTURES: Mapping[str, bytes] = MappingProxyType({})
 _MISSES_NM = (-10.0, -5.0, 5.0, 10.0)
 
 
@@ -102,6 +109,22 @@ def _depth_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
     ]
 
 
+def _uniformity_rows(sheet: RunSheet, photomask: Photomask) -> list[dict[str, Any]]:
+    """List the places of one pad of a photomask in every process monitor, for the depth over the wafer."""
+    places = _named(sheet, f"depth pad {_COMPARED}, ", photomask)
+    return [{"pad": _COMPARED, "where": where, **place} for where, place in places]
+
+
+def _inspected(sheet: RunSheet) -> list[dict[str, Any]]:
+    """List the first place of every staircase and grating."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, place in sheet.places.items():
+        where, _, own = name.rpartition(": ")
+        if own.startswith(("staircase", "grating")) and own not in found:
+            found[own] = {"what": own, "where": where, **_mm(place)}
+    return list(found.values())
+
+
 def _marks(sheet: RunSheet, photomask: Photomask, key: str, *kinds: str, prefix: str = "") -> list[dict[str, Any]]:
     """List where the marks of a photomask are, except for the first one, to which all others are aligned."""
     found = (
@@ -133,6 +156,7 @@ def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> d
             for rate in RATES_M_PER_S
         ],
         "pads": _depth_rows(sheet, photomask),
+        "over_the_wafer": _uniformity_rows(sheet, photomask),
         "next": following.name if following else None,
         "corrections": corrections,
     }
@@ -247,6 +271,10 @@ def record(sheet: RunSheet) -> dict[str, Any]:
             "thickness_mm": round(wafer.thickness_m / MM, 6),
             "finish": "both faces polished",
             "mask_blank_mm": round(wafer.blank_m / MM, 6),
+            "edge_exclusion_mm": round(wafer.edge_exclusion_m / MM, 6),
+            "flat_mm": round(wafer.usual_flat_m / MM, 6) or None,
+            "notch_mm": round(wafer.notch_m / MM, 6) or None,
+            "saw_lane_mm": round(wafer.lane_m / MM, 6),
         },
         "dies": [{"name": die.name, **_mm((die.x_m, die.y_m)), "note": die.note} for die in sheet.dies],
         "chrome": {"thickness_nm": _nm(sheet.chrome_m), "deposition": sheet.deposition},
@@ -254,37 +282,27 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "reference": sheet.photomasks[0].name,
         "steps": [_step_record(sheet, number, step) for number, step in enumerate(steps_of(sheet), start=1)],
         "staircase_nm": [_nm(depth) for depth in depths_m(sheet.level_map.levels)],
+        "inspected": _inspected(sheet),
         "places_mm": {name: [*_mm(place).values()] for name, place in sheet.places.items()},
         "predicted": None if sheet.predictions is None else _predicted_record(sheet.predictions),
         "measured": _blanks(sheet),
     }
 
 
-def html_page(content: Mapping[str, Any], json_name: str, picture: bytes | None = None) -> str:
+def run_sheet_page(content: Mapping[str, Any], json_name: str, pictures: Mapping[str, bytes] = _NO_PICTURES) -> bytes:
     """Return what `record` returned as one page of HTML that needs nothing else, for A4 and for the screen.
 
-    The page tells the reader to fill in the JSON file, and shows the PNG of the PSFs if there is one.
+    The page tells the reader to fill in the JSON file. `pictures` are PNGs of the "wafer", of the "marks" and of the
+    "psfs" that the camera should show; each may be left out.
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=lambda value: f"{value:.10g}" if isinstance(value, float) else value,  # 75.0 as 75
-    )
-    environment.filters["clock"] = lambda seconds: "{}:{:02d}".format(*divmod(round(seconds), 60))
-    environment.filters["distance"] = format_length
-    source = None if picture is None else "data:image/png;base64," + base64.b64encode(picture).decode()
-    return environment.get_template("runsheet.html").render(sheet=content, json_name=json_name, picture=source)
+    sources = {name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in pictures.items()}
+    return html_page("runsheet.html", sheet=content, json_name=json_name, pictures=_NONE | sources)
 
 
-def write_run_sheet(folder: Path, sheet: RunSheet, picture: bytes | None = None) -> tuple[str, str]:
-    """Write "<stem>_RUNSHEET.html" and ".json", with a PNG of the PSFs if there is one; return both names."""
+def write_run_sheet(folder: Path, sheet: RunSheet, pictures: Mapping[str, bytes] = _NO_PICTURES) -> tuple[str, str]:
+    """Write "<stem>_RUNSHEET.html" and ".json", with the pictures of `run_sheet_page`; return both names."""
     names = tuple(f"{sheet.stem}_RUNSHEET.{suffix}" for suffix in ("html", "json"))
     content = record(sheet)
-    write_atomic(folder / names[0], html_page(content, names[1], picture).encode())
+    write_atomic(folder / names[0], run_sheet_page(content, names[1], pictures))
     write_atomic(folder / names[1], canonical_json(content))
     return names[0], names[1]

@@ -1,13 +1,13 @@
 """The solids and height maps of an order, for people and programs that read no masks.
 
-    DOE_<ID>_PLATE.step     one die of glass with its chrome and the place of the relief; with its rings
+    <JOB>_PLATE.step     one die of glass with its chrome and the place of the relief; with its rings
                             as exact circles if the map is radial
-    DOE_<ID>_WAFER.step     the wafer with the chrome and the place of the relief of every die
-    DOE_<ID>_RELIEF.3mf     the relief as a closed mesh, block-reduced where it is large; also .glb and _MM.stl
-    DOE_<ID>_PATCH.step     on request a window at full resolution, also as .3mf, .glb and _MM.stl
-    DOE_<ID>_HEIGHT.tif     heights in 16 bits; also .npy, in metres
-    DOE_<ID>_GREY.png       the picture for greyscale and two-photon writers
-    DOE_<ID>_SAG.DAT        grid sag for ray tracers: the middle of the relief
+    <JOB>_WAFER.step     the wafer with the chrome and the place of the relief of every die
+    <JOB>_RELIEF.3mf     the relief as a closed mesh, block-reduced where it is large; also .glb and _MM.stl
+    <JOB>_PATCH.step     on request a window at full resolution, also as .3mf, .glb and _MM.stl
+    <JOB>_HEIGHT.tif     heights in 16 bits; also .npy, in metres
+    <JOB>_GREY.png       the picture for greyscale and two-photon writers
+    <JOB>_SAG.DAT        grid sag for ray tracers: the middle of the relief
 
 A new kind of file is a `ModelKind` in a module of its own and a place in `KINDS`.
 """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.layout.geometry import Box, Cell, Layer, Layout, box_around, require_name
+from fab.layout.geometry import Cell, Layout, placed_boxes, require_name
 from fab.layout.polygons import MAX_VERTICES, doubled_area
 from fab.units import format_length
 
@@ -84,24 +84,10 @@ def _crosses(points: NDArray[np.int64]) -> bool:
 
 def _place_problems(layout: Layout, blank_m: float) -> list[str]:
     """Check that all of every layer, with what its cell places, lies on the blank."""
-    done: dict[str, dict[Layer, Box]] = {}
-    for cell in layout.cells:
-        boxes = [(layer, box) for layer, shapes in cell.shapes.items() if (box := shapes.box) is not None]
-        for at in cell.references:
-            (left, right), (low, high) = (
-                sorted((start, start + (count - 1) * step))
-                for start, count, step in ((at.x, at.columns, at.step_x), (at.y, at.rows, at.step_y))
-            )
-            for layer, (x0, y0, x1, y1) in done[at.cell].items():
-                boxes.append((layer, (x0 + left, y0 + low, x1 + right, y1 + high)))
-        found: dict[Layer, Box] = {}
-        for layer, box in boxes:
-            found[layer] = box_around([box, found.get(layer, box)]) or box
-        done[cell.name] = found
     most = round(blank_m / 2 / layout.dbu_m)
     return [
         f"layer {layer} reaches {format_length(reach * layout.dbu_m)} from the middle, beyond the blank of "
         f"{format_length(blank_m)}"
-        for layer, box in done[layout.top.name].items()
+        for layer, box in placed_boxes(layout).items()
         if (reach := max(abs(edge) for edge in box)) > most
     ]

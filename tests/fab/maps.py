@@ -9,6 +9,9 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 
+# What the names of the order of `tests/fab/conftest.py` begin with; its last part is the digest of its geometry.
+SMALL = "SMALL_A_1P85_2887"
+
 
 def level_map_from(
     level: ArrayLike,

@@ -14,6 +14,7 @@ from fab.layout.geometry import Chrome
 from fab.levels import Levels, height_of, planes, quantise
 from fab.order.write import write_order
 from tests.fab.maps import wide_map
+from tests.orders import named
 
 LEVELS = Levels(16, 75e-9)
 GRID = Grid((4, 4), 2e-6)
@@ -80,6 +81,6 @@ def test_the_depths_of_all_open_masks_make_the_height():
 def test_oasis_draws_the_same_way_up(tmp_path):
     write_order(tmp_path / "o", wide_map(one_pixel(3, 1, 14), LEVELS, GRID, "up"), chrome=Chrome(overlap_m=1e-6))
     layout = kdb.Layout()
-    layout.read(str(tmp_path / "o" / "DOE_UP_ALL.oas"))
-    box = layout.cell("DOE_UP_DOE").bbox(layout.find_layer(1, 0))
+    layout.read(str(named(tmp_path / "o", "ALL.oas")))
+    box = layout.cell(f"{layout.top_cell().name}_DOE").bbox(layout.find_layer(1, 0))
     assert (box.left, box.bottom, box.right, box.top) == (-2000, 2000, 0, 4000)

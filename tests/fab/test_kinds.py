@@ -10,6 +10,7 @@ from fab.solids import write
 from fab.solids.model import ModelKind, model_entry
 from tests.fab.maps import level_map_from
 from tests.fab.mended import mend, told
+from tests.orders import named
 
 
 def counts_entry(path, model):
@@ -40,21 +41,25 @@ def order(tmp_path, monkeypatch):
     return write_order(tmp_path / "o", level_map_from(level, aperture_m=18e-6, name="toy"))
 
 
+def counts(order):
+    return named(order.folder, "COUNTS.txt").name
+
+
 def test_it_is_written_listed_and_proved(order):
     manifest = read_manifest(order.folder)
     listed = {entry.file: entry for entry in manifest.files}
-    assert listed["DOE_TOY_COUNTS.txt"].format == "TXT"
+    assert listed[counts(order)].format == "TXT"
     assert not any("NONE" in file for file in listed)
-    assert {model.file: model.content for model in manifest.models}["DOE_TOY_COUNTS.txt"].startswith("how many")
-    assert [c.passed for c in verify(order).checks if c.file == "DOE_TOY_COUNTS.txt"] == [True, True]
+    assert {model.file: model.content for model in manifest.models}[counts(order)].startswith("how many")
+    assert [c.passed for c in verify(order).checks if c.file == counts(order)] == [True, True]
 
 
 def test_what_is_wrong_in_it_is_told(order):
-    (order.folder / "DOE_TOY_COUNTS.txt").write_text("1 2 3")
-    mend(order.folder, "DOE_TOY_COUNTS.txt")
-    assert "other numbers of pixels" in told(order.folder, "DOE_TOY_COUNTS.txt")
+    (order.folder / counts(order)).write_text("1 2 3")
+    mend(order.folder, counts(order))
+    assert "other numbers of pixels" in told(order.folder, counts(order))
 
 
 def test_a_kind_that_nobody_knows_is_told(order, monkeypatch):
     monkeypatch.setattr(write, "KINDS", write.KINDS[:-2])
-    assert "models: DOE_TOY_COUNTS.txt should not be there" in told(order.folder, "manifest.json")
+    assert f"models: {counts(order)} should not be there" in told(order.folder, "manifest.json")

@@ -5,7 +5,7 @@ import pytest
 
 from fab.errors import InputError
 from fab.layout.geometry import Layer, Shapes
-from fab.layout.lettering import HEIGHT, label_block, letter_boxes, lettering, mask_label, written
+from fab.layout.lettering import HEIGHT, Job, label_block, letter_boxes, lettering, mask_label, written
 from fab.layout.part import Part, photomasks_of
 from fab.levels import Levels
 from fab.units import MM, NM, UM
@@ -76,21 +76,22 @@ def test_letters_below_the_unit_are_refused():
 
 def test_a_label_says_what_the_mask_is():
     zero, deep, *_, chrome = PLATES
-    digest = "0123456789abcdef" * 4
-    assert mask_label("AUTO_V1", deep, "right-reading chrome down", digest) == [
-        "AUTO_V1",
+    job = Job("AUTO_A_1P85_0123", "A", 1.85e-6, "0123456789abcdef" * 4)
+    assert mask_label(job, deep, "right-reading chrome down") == [
+        "AUTO_A_1P85_0123",
         "MASK 4 BIT 3 ETCH 600 NM",
         "POLYGONS CLEAR - DARK FIELD PLATE",
         "RIGHT-READING CHROME DOWN",
-        "HASH 01234567",
+        "REV A - PITCH 1.85 UM",
+        "GEOMETRY 01234567",
     ]
-    assert mask_label("A", chrome, "x", digest)[1:3] == ["CHROME APERTURE", "POLYGONS DARK - CLEAR FIELD PLATE"]
-    assert mask_label("A", zero, "x", digest)[1] == "ZERO LAYER - CHROME MARKS"
+    assert mask_label(job, chrome, "x")[1:3] == ["CHROME APERTURE", "POLYGONS DARK - CLEAR FIELD PLATE"]
+    assert mask_label(job, zero, "x")[1] == "ZERO LAYER - CHROME MARKS"
 
 
 def test_labels_of_all_masks_stand_below_each_other():
     labels = [
-        (plate, mask_label("AUTO_V1", plate, "right-reading chrome down", f"{k}" * 64))
+        (plate, mask_label(Job("AUTO_A_1_0123", "A", 1e-6, f"{k}" * 64), plate, "right-reading chrome down"))
         for k, plate in enumerate(PLATES)
     ]
     part = label_block(labels, 0.7 * MM, NM)

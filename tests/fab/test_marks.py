@@ -230,7 +230,7 @@ def test_notes_say_what_is_done_in_each_window():
     assert "so the steps stay" in deep[1]
     assert "before the deposition" in deep[-1]
     shallow = alignment_notes(photomasks_of(SIXTEEN, SHALLOW, "clear", "liftoff", False))
-    assert "etched 75 nm deep. Warning: such shallow marks" in shallow[0]
+    assert "etched 75 nm deep. Warning: the alignment marks are etched 75 nm deep, with mask 1" in shallow[0]
     wet = alignment_notes(JOBS["wet etch"])
     assert wet[0] == "Zero layer: makes the marks that all other masks are aligned to, of chrome."
     assert "shield the glass" in wet[1]

@@ -10,13 +10,14 @@ from fab.manifest.records import read_manifest
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
 from fab.solids.substrate import ChromeRing, Substrate, substrate_step
 from fab.units import MM
+from tests.fab.maps import SMALL
 from tests.fab.mended import mend, restate, told
 
 
 @pytest.mark.parametrize("end", [".3mf", ".glb", "_MM.stl"])
 @pytest.mark.parametrize("what", ["mirrored", "a column moved", "in micrometres"])
 def test_a_mesh_of_something_else_is_named(order_folder, end, what):
-    file = f"DOE_SMALL_RELIEF{end}"
+    file = f"{SMALL}_RELIEF{end}"
     mesh = read_mesh(order_folder / file, "mm" if end == "_MM.stl" else None)
     vertices, triangles = mesh.vertices_m.copy(), mesh.triangles
     if what == "mirrored":  # closed, of the same volume
@@ -36,17 +37,17 @@ def test_a_mesh_of_something_else_is_named(order_folder, end, what):
 def test_a_solid_of_something_else_is_named(order_folder):
     pitch = read_manifest(order_folder).wafer.die_pitch_mm * MM
     glass, ring = Substrate("die", pitch, 0.5 * MM), ChromeRing(9.8e-6, 0.6 * MM, 200e-9)
-    substrate_step(order_folder / "DOE_SMALL_PLATE.step", glass, 29.6e-6, ring)
-    mend(order_folder, "DOE_SMALL_PLATE.step")
-    assert "CHROME: " in told(order_folder, "DOE_SMALL_PLATE.step")
-    path = order_folder / "DOE_SMALL_WAFER.step"
+    substrate_step(order_folder / f"{SMALL}_PLATE.step", glass, 29.6e-6, ring)
+    mend(order_folder, f"{SMALL}_PLATE.step")
+    assert "CHROME: " in told(order_folder, f"{SMALL}_PLATE.step")
+    path = order_folder / f"{SMALL}_WAFER.step"
     path.write_bytes(path.read_bytes().replace(b"SI_UNIT(.MILLI.,.METRE.)", b"SI_UNIT(.CENTI.,.METRE.)"))
     mend(order_folder, path.name)
     assert "SUBSTRATE: " in told(order_folder, path.name)
 
 
 def test_a_wafer_that_is_said_to_lie_the_other_way_round_is_named(order_folder):
-    path = order_folder / "DOE_SMALL_WAFER.step"
+    path = order_folder / f"{SMALL}_WAFER.step"
     manifest = read_manifest(order_folder)
     entry = next(model for model in manifest.models if model.file == path.name)
     x, y, z = entry.centres_mm["SUBSTRATE"]
@@ -59,7 +60,7 @@ def test_a_wafer_that_is_said_to_lie_the_other_way_round_is_named(order_folder):
 
 
 def test_height_maps_upside_down_or_in_another_unit_are_named(order_folder):
-    tif, npy, sag = (order_folder / f"DOE_SMALL_{end}" for end in ("HEIGHT.tif", "HEIGHT.npy", "SAG.DAT"))
+    tif, npy, sag = (order_folder / f"{SMALL}_{end}" for end in ("HEIGHT.tif", "HEIGHT.npy", "SAG.DAT"))
     tifffile.imwrite(tif, tifffile.imread(tif)[::-1])
     np.save(npy, np.load(npy) * 1e6)
     header, rest = sag.read_bytes().split(b"\r\n", 1)

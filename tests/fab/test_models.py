@@ -24,6 +24,7 @@ from fab.solids.step import step_bodies
 from fab.solids.write import model_problems, write_models
 from fab.units import MM, NM, UM
 from tests.fab.maps import level_map_from
+from tests.orders import named
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
 
@@ -104,7 +105,7 @@ def test_a_patch_is_written_in_every_format_and_read_back(patched):
     for entry in found.values():
         assert entry.window_px == [12, 7, 8, 8]
         assert "8 x 8 pixels of 1.85 um about -8.325 um, 7.4 um of the DOE" in entry.content
-    level_map = np.load(patched / "DOE_PATCH_LEVELS.npy")
+    level_map = np.load(named(patched, "LEVELS.npy"))
     heights = PixelWindow(12, 7, 8, 8).cut(level_map) * 75e-9 + 10e-6
     volume = heights.sum() * 1.85e-6**2 / MM**3
     assert found["PATCH.step"].volumes_mm3["PATCH"] == pytest.approx(volume, rel=1e-12)

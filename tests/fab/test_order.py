@@ -10,33 +10,39 @@ from fab.files import sha256_file
 from fab.gds.reader import read_gds
 from fab.grid import Grid
 from fab.layout.geometry import Chrome, Layer, pixel_edges
+from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.order.order import order_id
+from fab.order.order import plain_name, plan_order
+from fab.order.terms import OrderTerms
 from fab.order.write import write_order
 from fab.verification.files import read_drawn_levels
-from tests.fab.maps import wide_map
+from tests.fab.maps import SMALL, level_map_from, wide_map
 
 NAMES = [
-    "DOE_SMALL_ALL.gds",
-    "DOE_SMALL_ALL.oas",
-    "DOE_SMALL_CHROME.gds",
-    "DOE_SMALL_GREY.png",
-    "DOE_SMALL_HEIGHT.npy",
-    "DOE_SMALL_HEIGHT.tif",
-    "DOE_SMALL_LEVELS.npy",
-    "DOE_SMALL_M1_B0_75NM.gds",
-    "DOE_SMALL_M2_B1_150NM.gds",
-    "DOE_SMALL_M3_B2_300NM.gds",
-    "DOE_SMALL_M4_B3_600NM.gds",
-    "DOE_SMALL_PLATE.step",
-    "DOE_SMALL_PREVIEW.png",
-    "DOE_SMALL_RELIEF.3mf",
-    "DOE_SMALL_RELIEF.glb",
-    "DOE_SMALL_RELIEF_MM.stl",
-    "DOE_SMALL_SAG.DAT",
-    "DOE_SMALL_WAFER.step",
+    f"{SMALL}_ALL.gds",
+    f"{SMALL}_ALL.oas",
+    f"{SMALL}_CHECK.drc",
+    f"{SMALL}_CHROME.gds",
+    f"{SMALL}_GREY.png",
+    f"{SMALL}_HEIGHT.npy",
+    f"{SMALL}_HEIGHT.tif",
+    f"{SMALL}_LAYERS.lyp",
+    f"{SMALL}_LEVELS.npy",
+    f"{SMALL}_M1_75NM.gds",
+    f"{SMALL}_M2_150NM.gds",
+    f"{SMALL}_M3_300NM.gds",
+    f"{SMALL}_M4_600NM.gds",
+    f"{SMALL}_ORDER.csv",
+    f"{SMALL}_ORDER.html",
+    f"{SMALL}_PLATE.step",
+    f"{SMALL}_PREVIEW.png",
+    f"{SMALL}_RELIEF.3mf",
+    f"{SMALL}_RELIEF.glb",
+    f"{SMALL}_RELIEF_MM.stl",
+    f"{SMALL}_SAG.DAT",
+    f"{SMALL}_WAFER.step",
     "manifest.json",
 ]
 
@@ -48,18 +54,18 @@ def test_the_folder_holds_the_files_of_a_mask_order(written_order):
 
 def test_every_mask_file_holds_its_own_layer_in_a_cell_of_its_own_name(written_order):
     for bit, depth in enumerate((75, 150, 300, 600)):
-        stem = f"DOE_SMALL_M{bit + 1}_B{bit}_{depth}NM"
+        stem = f"{SMALL}_M{bit + 1}_{depth}NM"
         layout = read_gds(written_order / f"{stem}.gds")
         assert layout.top.name == stem
         assert list(layout.cells[0].shapes) == [Layer(bit + 1)]
-    assert list(read_gds(written_order / "DOE_SMALL_CHROME.gds").cells[0].shapes) == [Layer(5)]
-    assert len(read_gds(written_order / "DOE_SMALL_ALL.gds").cells[0].shapes) == 5
+    assert list(read_gds(written_order / f"{SMALL}_CHROME.gds").cells[0].shapes) == [Layer(5)]
+    assert len(read_gds(written_order / f"{SMALL}_ALL.gds").cells[0].shapes) == 5
 
 
 def test_the_level_map_is_stored_and_drawn(written_order, level_map, levels, grid):
     blank = level_map.level
-    assert np.array_equal(np.load(written_order / "DOE_SMALL_LEVELS.npy"), blank)
-    drawn = read_drawn_levels(written_order / "DOE_SMALL_ALL.gds", levels, pixel_edges(grid), "DOE_SMALL_DOE")
+    assert np.array_equal(np.load(written_order / f"{SMALL}_LEVELS.npy"), blank)
+    drawn = read_drawn_levels(written_order / f"{SMALL}_ALL.gds", levels, pixel_edges(grid), f"{SMALL}_DOE")
     assert np.array_equal(drawn, blank)
     assert read_manifest(written_order).level_map_sha256 == level_map.digest
 
@@ -113,9 +119,9 @@ def test_orders_of_every_kind_verify(tmp_path, caplog, count, step_nm, shape, fi
     level_map = rng.integers(0, count, shape) if fill is None else np.full(shape, fill)
     given = wide_map(level_map, levels, grid, "kind")
     assert write_order(tmp_path / "o", given, chrome=Chrome(1e-6)).report.passed
-    first, second = caplog.messages[:2]
-    assert (second if "what flat glass does" in first else first) == "drawing the masks"
-    assert ("what flat glass does" in first) == (fill is not None)
+    warnings = caplog.messages[: caplog.messages.index("drawing the masks")]
+    assert any("what flat glass does" in line for line in warnings) == (fill is not None)
+    assert any("are hard to see" in line for line in warnings) == (step_nm < 150 and count > 1)
     manifest = read_manifest(tmp_path / "o")
     assert len(manifest.masks) == levels.bits
     assert manifest.chrome.layer == max(5, levels.bits + 1)
@@ -145,7 +151,7 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
 def test_an_earlier_order_is_replaced(order_folder, level_map):
     write_order(order_folder, replace(level_map, name="other"))
     assert read_manifest(order_folder).name == "other"
-    assert not (order_folder / "DOE_SMALL_ALL.gds").exists()
+    assert not (order_folder / f"{SMALL}_ALL.gds").exists()
 
 
 def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_map):
@@ -155,7 +161,7 @@ def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_
     (order_folder / "notes.txt").write_text("from the lab")
     with pytest.raises(InputError, match=r"notes\.txt"):
         write(order_folder)
-    assert (order_folder / "DOE_SMALL_ALL.gds").exists()
+    assert (order_folder / f"{SMALL}_ALL.gds").exists()
     run = tmp_path / "run"
     run.mkdir()
     (run / "manifest.json").write_text('{"format": "a run"}')
@@ -170,21 +176,38 @@ def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_
 
 
 @pytest.mark.parametrize(
-    ("name", "plain"),
-    [
-        ("small", "SMALL"),
-        ("Auto motive-2", "AUTO_MOTIVE_2"),
-        ("exactly13char", "EXACTLY13CHAR"),
-        ("fourteen_chars", "FOURTEEN_AB12"),
-        ("main", "MAIN"),
-        ("größe", "GR_SSE"),
-    ],
+    ("name", "plain"), [("small", "SMALL"), ("Auto motive-2", "AUTO_MOTIVE_2"), ("main", "MAIN"), ("größe", "GR_SSE")]
 )
 def test_names_become_what_mask_shops_accept(name, plain):
-    assert order_id(name, "ab12cd") == plain
-    assert len(f"DOE_{plain}_M6_B5_1234P5NM") <= 32
+    assert plain_name(name) == plain
+
+
+def job(name="lens", pitch_m=1.85e-6, step_m=75e-9, revision="A", **wafer):
+    """The order of a bare map."""
+    level = np.random.default_rng(3).integers(0, 16, (9, 9))
+    drawn = level_map_from(level, Levels(16, step_m), pitch_m, 9 * pitch_m, name)
+    return plan_order(drawn, wafer=Wafer(**wafer), terms=OrderTerms(revision=revision))
+
+
+def test_jobs_that_draw_something_else_have_other_names():
+    """Revision and pitch can be read, and the digest differs with all that is drawn."""
+    jobs = [job(), job(pitch_m=2e-6), job(step_m=80e-9), job(revision="B"), job(zero_layer=True), job(dies=(1, 1))]
+    assert len({one.stem for one in jobs}) == len(jobs)
+    assert jobs[0].stem == f"LENS_A_1P85_{jobs[0].geometry[:4].upper()}"
+    assert jobs[1].stem.startswith("LENS_A_2_")
+    assert jobs[3].stem.startswith("LENS_B_1P85_")
+    assert jobs[3].geometry == jobs[0].geometry
+    assert job("other").geometry == jobs[0].geometry
+
+
+@pytest.mark.parametrize(("pitch_m", "step_m"), [(1.2345e-6, 123.45e-9), (12.34e-9, 9.4e-6), (999e-6, 75e-9)])
+def test_the_longest_names_fit_thirty_two_characters(pitch_m, step_m):
+    order = job("a_very_long_name_of_a_lens", pitch_m, step_m, "XYZ")
+    assert order.stem.startswith("A_V")
+    assert max(len(order.mask_stem(bit)) for bit in range(4)) <= 32
+    assert len(f"{order.stem}_ORDER_DIE") <= 32
 
 
 def test_a_name_of_which_nothing_is_left_is_refused():
     with pytest.raises(InputError, match="mask order name"):
-        order_id("***", "ab12cd")
+        plain_name("***")

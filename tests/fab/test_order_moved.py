@@ -19,6 +19,7 @@ from fab.order.write import write_order
 from fab.process import Normal, Process
 from fab.verification.files import read_drawn_levels
 from tests.fab.maps import wide_map
+from tests.orders import named
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
     assert [mask.edge_move_nm for mask in manifest.masks] == [-100, -100, 200, -100]
     levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
     drawn = read_drawn_levels(moved / manifest.combined_gds, levels, edges, manifest.doe_cell, manifest.edge_moves())
-    assert np.array_equal(drawn, np.load(plain / "DOE_SMALL_LEVELS.npy"))
+    assert np.array_equal(drawn, np.load(named(plain, "LEVELS.npy")))
     # The process moves every edge by its bias: printed like that, by KLayout, the drawing is the plane again.
     for mask in manifest.masks:
         regions = []
@@ -56,7 +57,7 @@ def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
 def test_an_edge_that_was_moved_otherwise_is_told_by_both_readers(compensated, tmp_path):
     folder = tmp_path / "order"
     shutil.copytree(compensated[0], folder)
-    file = "DOE_SMALL_M3_B2_300NM.gds"
+    file = named(folder, "M3_300NM.gds").name
     layout = read_gds(folder / file)
     doe, *around = layout.cells
     rects = doe.shapes[Layer(3)].rectangles.copy()

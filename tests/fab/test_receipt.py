@@ -20,11 +20,12 @@ from fab.layout.geometry import Cell, Layer, Layout, Shapes
 from fab.manifest.records import Manifest
 from fab.order.verify import verify
 from fab.verification.shop_checks import drawing_problems
+from tests.fab.maps import SMALL
 from tests.fab.mended import mend, restate, told
 
-ALL, OASIS = "DOE_SMALL_ALL.gds", "DOE_SMALL_ALL.oas"
-CHROME, M1, M2 = "DOE_SMALL_CHROME.gds", "DOE_SMALL_M1_B0_75NM.gds", "DOE_SMALL_M2_B1_150NM.gds"
-SITE = "DOE_SMALL_SITE"
+ALL, OASIS = f"{SMALL}_ALL.gds", f"{SMALL}_ALL.oas"
+CHROME, M1, M2 = f"{SMALL}_CHROME.gds", f"{SMALL}_M1_75NM.gds", f"{SMALL}_M2_150NM.gds"
+SITE = f"{SMALL}_SITE"
 NOTHING = np.empty((0, 4), dtype=np.int32)
 
 
@@ -161,7 +162,7 @@ def moved(shapes: Shapes) -> Shapes:
 
 @pytest.mark.parametrize("file", [ALL, M1])
 def test_a_vertex_off_the_raster_is_named(order_folder, file):
-    redraw(order_folder, file, "DOE_SMALL_DOE", moved, Layer(1))
+    redraw(order_folder, file, f"{SMALL}_DOE", moved, Layer(1))
     mend(order_folder, file)
     problems = told(order_folder, file)
     assert "layer 1/0: 1 rectangles are off the pixel raster, the first is number 3" in problems
@@ -177,7 +178,7 @@ def turned(shapes: Shapes) -> Shapes:
 
 @pytest.mark.parametrize("file", [ALL, CHROME])
 def test_a_vertex_of_the_chrome_that_moved_by_a_nanometre_is_named(order_folder, file):
-    redraw(order_folder, file, "DOE_SMALL_DOE", turned, Layer(5))
+    redraw(order_folder, file, f"{SMALL}_DOE", turned, Layer(5))
     mend(order_folder, file)
     assert "layer 5/0: the chrome has another vertex, or one elsewhere" in told(order_folder, file)
 
@@ -201,7 +202,7 @@ def test_two_mask_files_exchanged_are_named(order_folder):
     (order_folder / M1).write_bytes(other)
     (order_folder / M2).write_bytes(one)
     mend(order_folder, M1, M2)
-    assert "the top cell is named 'DOE_SMALL_M2_B1_150NM' instead of 'DOE_SMALL_M1_B0_75NM'" in told(order_folder, M1)
+    assert f"the top cell is named '{SMALL}_M2_150NM' instead of '{SMALL}_M1_75NM'" in told(order_folder, M1)
     assert "layer 2/0 should be empty" in told(order_folder, M1)
     assert "layer 1/0" in told(order_folder, M2)
 

@@ -10,12 +10,12 @@ import pytest
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.runsheet.recipe import depths_m, least_resist, next_target_m
-from fab.runsheet.write import BARS, PADS, html_page, record, write_run_sheet
+from fab.runsheet.write import BARS, PADS, record, run_sheet_page, write_run_sheet
 from fab.units import NM, UM
 from tests.fab.sheets import DIGEST, STEM, predictions, sheet, spreads_of
 
 VOID = {"meta", "img", "br"}
-PICTURE = b"\x89PNG not really"
+PICTURES = {name: b"\x89PNG not really" for name in ("wafer", "marks", "psfs")}
 
 
 class Page(HTMLParser):
@@ -48,8 +48,8 @@ class Page(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.words))
 
 
-def page_of(content, picture: bytes | None = PICTURE) -> Page:
-    return Page(html_page(content, f"{STEM}_RUNSHEET.json", picture))
+def page_of(content, pictures=PICTURES) -> Page:
+    return Page(run_sheet_page(content, f"{STEM}_RUNSHEET.json", pictures).decode())
 
 
 @pytest.mark.parametrize("count", [2, 4, 16, 64])
@@ -73,18 +73,18 @@ def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, ze
 
 
 def test_the_page_needs_nothing_else_and_repeats_job_and_digest_on_every_printed_page():
-    text = html_page(record(sheet(predictions=predictions())), "x.json", PICTURE)
+    text = run_sheet_page(record(sheet(predictions=predictions())), "x.json", PICTURES).decode()
     page = Page(text)
     assert not [tag for tag, _ in page.tags if tag in ("script", "link", "iframe")]
     sources = [attrs["src"] or "" for _, attrs in page.tags if "src" in attrs]
-    assert len(sources) == 1
-    assert sources[0].startswith("data:image/png;base64,")
+    assert len(sources) == 3
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert "http" not in text
     style = text[text.index("<style>") : text.index("</style>")]
     assert f'content: "Run sheet {STEM}"' in style
     assert f'content: "level map {DIGEST[:12]}"' in style
     assert "size: A4" in style
-    assert "break-before: page" in style
+    assert "table, dl, .warning, .sign, figure, .keep { break-inside: avoid; }" in style
 
 
 def test_words_from_outside_stay_words():
@@ -94,7 +94,7 @@ def test_words_from_outside_stay_words():
 
 
 def test_without_predictions_the_page_promises_none():
-    assert "Strehl" not in page_of(record(sheet()), None).text
+    assert "Strehl" not in page_of(record(sheet()), {}).text
     seen = page_of(record(sheet(predictions=predictions()))).text
     for words in ("0.810 / 0.810", "3.21 / 3.21", "0.654", "infinity", "50 mm", "552.1 nm", "6.45 % over-etched"):
         assert words in seen, words
@@ -106,7 +106,7 @@ def test_the_same_sheet_gives_the_same_bytes_and_is_json(tmp_path):
     bytes_of = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        names = write_run_sheet(tmp_path / name, sheet(predictions=predictions()), PICTURE)
+        names = write_run_sheet(tmp_path / name, sheet(predictions=predictions()), PICTURES)
         assert names == (f"{STEM}_RUNSHEET.html", f"{STEM}_RUNSHEET.json")
         bytes_of.append([(tmp_path / name / file).read_bytes() for file in names])
     assert bytes_of[0] == bytes_of[1]

@@ -15,15 +15,16 @@ from fab.levels import Levels
 from fab.manifest.records import read_manifest
 from fab.order.verify import verify
 from fab.verification.files import read_drawn_levels
+from tests.fab.maps import SMALL
 
 MASKS = [
-    "DOE_SMALL_ALL.gds",
-    "DOE_SMALL_ALL.oas",
-    "DOE_SMALL_CHROME.gds",
-    "DOE_SMALL_M1_B0_75NM.gds",
-    "DOE_SMALL_M2_B1_150NM.gds",
-    "DOE_SMALL_M3_B2_300NM.gds",
-    "DOE_SMALL_M4_B3_600NM.gds",
+    f"{SMALL}_ALL.gds",
+    f"{SMALL}_ALL.oas",
+    f"{SMALL}_CHROME.gds",
+    f"{SMALL}_M1_75NM.gds",
+    f"{SMALL}_M2_150NM.gds",
+    f"{SMALL}_M3_300NM.gds",
+    f"{SMALL}_M4_600NM.gds",
 ]
 
 
@@ -57,7 +58,7 @@ def test_a_whole_order_passes_every_question(written_order):
         assert file.endswith(".oas") or (file, "own reader, every pixel") in asked
 
 
-@pytest.mark.parametrize("file", [*MASKS, "DOE_SMALL_LEVELS.npy", "DOE_SMALL_PREVIEW.png"])
+@pytest.mark.parametrize("file", [*MASKS, f"{SMALL}_LEVELS.npy", f"{SMALL}_PREVIEW.png"])
 @pytest.mark.parametrize("where", [0.0, 0.1, 0.37, 0.5, 0.63, 0.9, 0.9999])
 def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
     path = order_folder / file
@@ -141,7 +142,7 @@ def test_a_chrome_that_is_no_annulus_is_told(order_folder, change, words):
 
 def around(layout, name, change):
     """The layout with one of the cells around the DOE changed."""
-    cells = (replace(cell, **change(cell)) if cell.name == f"DOE_SMALL{name}" else cell for cell in layout.cells)
+    cells = (replace(cell, **change(cell)) if cell.name == f"{SMALL}{name}" else cell for cell in layout.cells)
     return replace(layout, cells=tuple(cells))
 
 
@@ -171,11 +172,11 @@ def shifted(cell):
 @pytest.mark.parametrize(
     ("cell", "change", "words"),
     [
-        ("_SITE", mirrored, "cell DOE_SMALL_SITE: layer 1/1"),
+        ("_SITE", mirrored, f"cell {SMALL}_SITE: layer 1/1"),
         ("_SITE", one_moved, "or elsewhere"),
         ("_DIE", relayered, "is missing"),
-        ("_WAFER", shifted, "cell DOE_SMALL_WAFER: it places other cells, or elsewhere"),
-        ("_DIE", shifted, "cell DOE_SMALL_DIE: it places other cells, or elsewhere"),
+        ("_WAFER", shifted, f"cell {SMALL}_WAFER: it places other cells, or elsewhere"),
+        ("_DIE", shifted, f"cell {SMALL}_DIE: it places other cells, or elsewhere"),
         ("_TEST", lambda cell: {"name": "OTHER"}, "OTHER"),
     ],
     ids=["mirrored marks", "a nanometre", "another datatype", "dies elsewhere", "DOE off its die", "another name"],
@@ -183,9 +184,9 @@ def shifted(cell):
 def test_whatever_changes_around_the_doe_is_told_by_both_readers(order_folder, cell, change, words):
     layout = around(read_gds(order_folder / MASKS[0]), cell, change)
     if words == "OTHER":
-        wafer = layout.cell("DOE_SMALL_WAFER")
+        wafer = layout.cell(f"{SMALL}_WAFER")
         assert wafer is not None
-        renamed = tuple(replace(r, cell="OTHER") if r.cell == "DOE_SMALL_TEST" else r for r in wafer.references)
+        renamed = tuple(replace(r, cell="OTHER") if r.cell == f"{SMALL}_TEST" else r for r in wafer.references)
         layout = around(layout, "_WAFER", lambda _: {"references": renamed})
     write_gds(order_folder / MASKS[0], layout)
     for question in ("own reader", "gdstk"):
@@ -197,7 +198,7 @@ def test_an_altered_oasis_file_that_still_parses_is_compared_pixel_by_pixel(orde
 
     layout = kdb.Layout()
     layout.read(str(order_folder / MASKS[1]))
-    shapes = layout.cell("DOE_SMALL_DOE").shapes(layout.find_layer(3, 0))
+    shapes = layout.cell(f"{SMALL}_DOE").shapes(layout.find_layer(3, 0))
     shapes.clear()
     options = kdb.SaveLayoutOptions()
     options.format = "OASIS"
@@ -210,7 +211,7 @@ def test_another_cell_name_or_unit_is_told(order_folder):
     layout = read_gds(order_folder / MASKS[3])
     write_gds(order_folder / MASKS[3], Layout(2e-9, (*layout.cells[:-1], replace(layout.top, name="OTHER"))))
     problems = " ".join(problems_of(order_folder, MASKS[3]))
-    assert "named 'OTHER' instead of 'DOE_SMALL_M1_B0_75NM'" in problems
+    assert f"named 'OTHER' instead of '{SMALL}_M1_75NM'" in problems
     assert "database unit is 2 nm instead of 1 nm" in problems
 
 
@@ -244,7 +245,7 @@ def seal(folder, file):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_damaged_oasis_file_whose_digest_matches_crashes_nothing(order_folder, seed, capfd):
     """Nearly every changed byte of a packed cell crashes gdstk."""
-    rng, path = np.random.default_rng(seed), order_folder / "DOE_SMALL_ALL.oas"
+    rng, path = np.random.default_rng(seed), order_folder / f"{SMALL}_ALL.oas"
     data = bytearray(path.read_bytes())
     data[rng.integers(len(data) // 4, len(data) // 2)] ^= 1 << int(rng.integers(8))
     path.write_bytes(data)
@@ -256,24 +257,24 @@ def test_a_damaged_oasis_file_whose_digest_matches_crashes_nothing(order_folder,
 
 
 def test_a_damaged_level_map_does_not_put_the_blame_on_the_masks(order_folder):
-    flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
-    assert {d.split(":")[0] for d in verify(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
-    (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
-    assert {d.split(":")[0] for d in verify(order_folder).differences} == {"DOE_SMALL_LEVELS.npy"}
+    flip(order_folder / f"{SMALL}_LEVELS.npy", -1)
+    assert {d.split(":")[0] for d in verify(order_folder).differences} == {f"{SMALL}_LEVELS.npy"}
+    (order_folder / f"{SMALL}_LEVELS.npy").write_bytes(b"ruin")
+    assert {d.split(":")[0] for d in verify(order_folder).differences} == {f"{SMALL}_LEVELS.npy"}
 
 
 def test_without_any_level_map_there_is_nothing_to_compare_with(order_folder):
-    (order_folder / "DOE_SMALL_LEVELS.npy").write_bytes(b"ruin")
+    (order_folder / f"{SMALL}_LEVELS.npy").write_bytes(b"ruin")
     (order_folder / MASKS[0]).write_bytes(b"ruin")
     with pytest.raises(CheckFailed, match=r"LEVELS\.npy"):
         verify(order_folder)
 
 
 def test_a_damaged_map_and_a_damaged_mask_are_both_told(order_folder):
-    flip(order_folder / "DOE_SMALL_LEVELS.npy", -1)
+    flip(order_folder / f"{SMALL}_LEVELS.npy", -1)
     redraw(order_folder, MASKS[0], lambda s: {**s, Layer(1): Shapes(s[Layer(1)].rectangles[1:])})
     files = {d.split(":")[0] for d in verify(order_folder).differences}
-    assert {"DOE_SMALL_LEVELS.npy", MASKS[0]} <= files
+    assert {f"{SMALL}_LEVELS.npy", MASKS[0]} <= files
 
 
 def test_verifying_changes_nothing(order_folder):

@@ -16,6 +16,7 @@ from doedesign.cli import main
 from fab.files import os_errors_explained
 from fab.level_map import read_level_map, write_level_map
 from sim.store import write_height
+from tests.orders import named
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 
@@ -400,7 +401,7 @@ def mask_files(order: Path) -> list[str]:
 @pytest.mark.slow
 def test_one_flipped_byte_fails_verify_and_is_named(copied, cli):
     rng = np.random.default_rng(11)
-    names = [*mask_files(copied.order), "DOE_TINY_LEVELS.npy", "DOE_TINY_PREVIEW.png"]
+    names = [*mask_files(copied.order), *(named(copied.order, end).name for end in ("LEVELS.npy", "PREVIEW.png"))]
     assert len(names) == 9
     for name in names:
         path = copied.order / name
@@ -435,13 +436,13 @@ def test_files_missing_or_too_many_fail_verify(copied, cli):
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_drawing_cut_off(copied, cli, content, share):
-    gds = copied.order / "DOE_TINY_ALL.gds"
+    gds = named(copied.order, "ALL.gds")
     cut(gds, share)
     before = content(copied.run)
     refuse(cli("psf", copied.run, "--masks", copied.order), gds)
     done = cli("verify", copied.order)
     assert done.code == 1
-    assert "DOE_TINY_ALL.gds" in done.err
+    assert gds.name in done.err
     assert content(copied.run) == before
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from fab.manifest.records import read_manifest
 from fab.rules.check import Rules, check
+from tests.orders import named
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_by_default_it_warns_and_shows_where(coarse, cli, tmp_path):
     manifest = read_manifest(tmp_path / "order")
     assert not manifest.rules["clean"]
     assert manifest.rules["headlines"][0] in done.err
-    assert (tmp_path / "order" / "DOE_TINY_RULES.png").stat().st_size > 10_000
+    assert named(tmp_path / "order", "RULES.png").stat().st_size > 10_000
 
 
 def test_on_request_it_refuses_and_leaves_nothing(coarse, cli, tmp_path):

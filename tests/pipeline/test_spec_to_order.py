@@ -13,8 +13,9 @@ from fab.files import sha256_file
 from fab.level_map import read_level_map
 from fab.levels import Levels, height_of
 from sim.store import read_bank, read_height
+from tests.orders import named
 
-MASKS = {"M1_B0_75NM.gds", "M2_B1_150NM.gds", "M3_B2_300NM.gds", "M4_B3_600NM.gds", "CHROME.gds"}
+MASKS = {"M1_75NM.gds", "M2_150NM.gds", "M3_300NM.gds", "M4_600NM.gds", "CHROME.gds"}
 
 
 def test_stdout_holds_paths_and_stderr_the_talk(finished):
@@ -62,7 +63,7 @@ def test_the_order_holds_what_its_manifest_lists(finished):
     manifest = json.loads((finished.order / "manifest.json").read_text())
     listed = {entry["file"]: entry for entry in manifest["files"]}
     assert {path.name for path in finished.order.iterdir()} == {*listed, "manifest.json"}
-    assert {name.removeprefix("DOE_TINY_") for name in listed} >= MASKS | {"ALL.gds", "ALL.oas", "PREVIEW.png"}
+    assert {name.split("_", 4)[-1] for name in listed} >= MASKS | {"ALL.gds", "ALL.oas", "PREVIEW.png"}
     for name, entry in listed.items():
         assert sha256_file(finished.order / name) == entry["sha256"]
         assert (finished.order / name).stat().st_size == entry["bytes"]
@@ -86,7 +87,7 @@ def test_the_psf_folder_holds_what_its_manifest_lists(finished):
 
 def test_what_is_drawn_is_what_was_optimised(finished):
     height = read_height(finished.run / "height.exr").height_m
-    level = np.load(finished.order / "DOE_TINY_LEVELS.npy")
+    level = np.load(named(finished.order, "LEVELS.npy"))
     drawn = height_of(level, Levels(16, 75e-9)).astype(np.float32)
     y, x = np.indices(height.shape) - 31.5
     inside = y**2 + x**2 <= 32**2
@@ -147,7 +148,7 @@ def test_folders_are_called_after_the_design(tiny, cli, tmp_path, monkeypatch):
     name = "--set=name=plate_1.2-b"
     assert cli("optimize", tiny, "--set", "optimize.steps=0", name).out == "runs/plate_1.2-b\n"
     assert cli("masks", "runs/plate_1.2-b").out.splitlines()[0] == "masks/plate_1.2-b"
-    assert (tmp_path / "masks/plate_1.2-b/DOE_PLATE_1_2_B_ALL.gds").is_file()
+    assert named(tmp_path / "masks/plate_1.2-b", "ALL.gds").name.startswith("PLATE_1_A_1P85_")
     done = cli("psf", "runs/plate_1.2-b")
     assert "runs/plate_1.2-b/psf/from_masks.exr" in done.out.splitlines()
 
@@ -186,7 +187,7 @@ def test_fewer_levels_come_from_the_continuous_design(finished, cli, tmp_path):
     assert (manifest["levels"], manifest["step_nm"]) == (4, 300)
     own = read_level_map(finished.run / "level_map.npz")
     assert manifest["source"]["level_map_sha256"] == own.digest
-    level = np.load(tmp_path / "order" / "DOE_TINY_LEVELS.npy")
+    level = np.load(named(tmp_path / "order", "LEVELS.npy"))
     continuous = read_height(finished.run / "height_continuous.exr").height_m
     y, x = np.indices(level.shape) - 31.5
     inside = y**2 + x**2 <= 32**2

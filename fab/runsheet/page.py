@@ -1,0 +1,23 @@
+"""Pages of HTML that need nothing else, for A4 and for the screen."""
+
+from pathlib import Path
+from typing import Any
+
+from fab.units import format_length
+
+
+def html_page(template: str, **values: Any) -> bytes:
+    """Fill a template of this package; what it asks for and does not get is an error, no blank."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: f"{value:.10g}" if isinstance(value, float) else value,  # 75.0 as 75
+    )
+    environment.filters["clock"] = lambda seconds: "{}:{:02d}".format(*divmod(round(seconds), 60))
+    environment.filters["distance"] = format_length
+    return environment.get_template(template).render(**values).encode()

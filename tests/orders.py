@@ -1,0 +1,9 @@
+"""Files of a mask order by what their names end with."""
+
+from pathlib import Path
+
+
+def named(folder: Path, ending: str) -> Path:
+    """The one file whose name ends so."""
+    (path,) = folder.glob(f"*_{ending}")
+    return path
