@@ -63,7 +63,7 @@ class OrderTerms:
             if isinstance(value, str) and not (value.isprintable() and 0 < len(value.strip()) <= _LONGEST_TEXT):
                 rule = f"must be one line of 1 to {_LONGEST_TEXT} characters"
                 raise InputError(where, rule, repr(value)[:60], "Shorten it, or leave it out.")
-            if field.name.endswith("_m") and value is not None and not 0 < value < 0.1:
+            if field.name.endswith("_m") and isinstance(value, int | float) and not 0 < value < 0.1:
                 raise InputError(where, "must be positive and below 100 mm", format_length(value), "Check its unit.")
         if not _REVISION.fullmatch(self.revision):
             rule = "must be one to three capitals A-Z or digits"

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from fab.layout.geometry import Layer
+from fab.layout.geometry import Cell, Layer
 from fab.layout.part import Part
 
 
-def region(part: Part, *layers: Layer):
-    """What KLayout makes of some layers of a part, not merged."""
+def region(part: Part | Cell, *layers: Layer):
+    """What KLayout makes of some layers of a part or a cell, not merged."""
     from klayout import db
 
     out = db.Region()
