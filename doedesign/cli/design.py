@@ -56,6 +56,7 @@ def masks(
     process: Path | None = None,
     wafer: Path | None = None,
     terms: Path | None = None,
+    direct_write: Flag = False,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -80,6 +81,7 @@ def masks(
         process: A TOML file with another [process] table; with --as-built, for what was not measured.
         wafer: A TOML file with another [wafer] table.
         terms: A TOML file with another [order] table, what a mask shop is asked for.
+        direct_write: Also write one layer per level, merged, as OASIS and DXF, and a table of doses.
     """
     if as_built is not None:
         for option, given in (("--wafer", wafer), ("--terms", terms)):
@@ -106,6 +108,7 @@ def masks(
         process=process,
         wafer=wafer,
         terms=terms,
+        direct_write=direct_write,
         step_m=length_of("--step", step),
         etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
         pitch_m=length_of("--pitch", pitch),

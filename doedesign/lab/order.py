@@ -45,6 +45,7 @@ def write_masks(
     process: Process | str | Path | None = None,
     wafer: Wafer | str | Path | None = None,
     terms: OrderTerms | str | Path | None = None,
+    direct_write: bool = False,
     **geometry: Any,
 ) -> WrittenOrder:
     """Write and prove the mask order of a design or of any height map, with its run sheet.
@@ -60,6 +61,7 @@ def write_masks(
         wafer: the wafer to fill, or a TOML file with it; that of the run, or the usual one, by default.
         terms: what is asked of the mask shop besides the drawing, or a TOML file with it; that of the run, or else
             revision A and blanks, by default.
+        direct_write: whether to write files for direct-write and greyscale exposure, too.
         geometry: of a bare height map: `step_m`, `etch_depths_m`, `pitch_m`, `scale_m`, `aperture_m`
             (`doedesign.runs.level_maps.drawing_from`).
 
@@ -84,6 +86,7 @@ def write_masks(
         chrome=_chrome(process, level_map.levels, spec and spec.process),
         patch=patch,
         terms=terms,
+        direct_write=direct_write,
         source=origin,
         on_violation=on_violation,
         waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),

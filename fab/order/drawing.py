@@ -47,7 +47,9 @@ class DrawnOrder:
     def model(self) -> DoeModel:
         """The DOE as solids and height maps show it."""
         order, frame = self.order, self.frame
-        return DoeModel(order.level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch)
+        return DoeModel(
+            order.level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch, order.direct_write
+        )
 
     def kept(self, what: str, make: Callable[[], T]) -> T:
         """Return what was made from this very order before, or make it."""

@@ -63,6 +63,7 @@ class Order:
         patch: a window that is wanted as a solid at full resolution, if any.
         repair: how the level map was changed for the process to print it, if it was.
         terms: what is asked of the mask shop besides the drawing.
+        direct_write: whether files for direct-write and greyscale exposure come with the masks.
         papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
         light: what the run sheet says of the light, if anything.
     """
@@ -75,6 +76,7 @@ class Order:
     patch: Patch | None = None
     repair: Repair | None = None
     terms: OrderTerms = field(default_factory=OrderTerms)
+    direct_write: bool = False
     papers: bool = False
     light: Light | None = None
 
@@ -168,6 +170,7 @@ def plan_order(
     chrome: Chrome | None = None,
     patch: Patch | None = None,
     terms: OrderTerms | None = None,
+    direct_write: bool = False,
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
@@ -185,7 +188,8 @@ def plan_order(
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
-    order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, patch, terms=terms, papers=papers)
+    asked = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
+    order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
     if warning := faint_marks(order.photomasks):
         log.warning(warning)
     if on_violation == "fix" and not report.clean:

@@ -131,6 +131,7 @@ def write_order(
     chrome: Chrome | None = None,
     patch: Patch | None = None,
     terms: OrderTerms | None = None,
+    direct_write: bool = False,
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
@@ -146,6 +147,7 @@ def write_order(
         chrome: how the chrome is drawn.
         patch: a window to write as a solid at full resolution, too.
         terms: what is asked of the mask shop besides the drawing; revision A and blanks by default.
+        direct_write: whether to write one layer per level with merged polygons (OASIS, DXF) and a table of doses, too.
         source: where the level map came from, for the manifest; JSON values only.
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
@@ -161,6 +163,7 @@ def write_order(
         chrome=chrome,
         patch=patch,
         terms=terms,
+        direct_write=direct_write,
         source=source,
         on_violation=on_violation,
         waves_per_metre=waves_per_metre,

@@ -88,7 +88,7 @@ def write_npy(path: str | Path, level_map: LevelMap) -> float:
     return 1.0
 
 
-def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 8) -> float:
+def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 16) -> float:
     """Write a grey PNG for greyscale and two-photon writers, first row at the highest y; return the metres per count.
 
     Black is the deepest floor and white the blank surface; between them counts are linear in height, rounded, and exact
@@ -211,6 +211,8 @@ _TOP_ROW = "first row at the highest y"
 KINDS = (
     _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", lambda levels: _exact_scale(levels)[1], write_tiff, read_pixels),
     _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda _: 1.0, write_npy, np.load),
-    _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", lambda levels: _full_scale(levels, 255)[1], write_greymap, read_pixels),
+    _kind(
+        "_GREY.png", f"{_BLANK}, {_TOP_ROW}", lambda levels: _full_scale(levels, 65535)[1], write_greymap, read_pixels
+    ),
     ModelKind("_SAG.DAT", _sag_entry, _write_sag, partial(_problems, read=_read_sag)),
 )

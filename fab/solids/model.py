@@ -39,7 +39,8 @@ class MeshedRelief:
 class DoeModel:
     """A DOE on its glass, as all models show it: chrome, edge of its die and middles of the dies on the wafer, metres.
 
-    A `patch` is the window that is wanted at full resolution, if any.
+    A `patch` is the window that is wanted at full resolution, if any; `direct_write` whether files for direct-write and
+    greyscale exposure are wanted.
     """
 
     level_map: LevelMap
@@ -48,6 +49,7 @@ class DoeModel:
     die_m: float
     dies: Sequence[tuple[float, float]]
     patch: Patch | None = None
+    direct_write: bool = False
 
     @cached_property
     def relief(self) -> MeshedRelief:

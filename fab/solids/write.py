@@ -16,7 +16,7 @@ from pathlib import Path
 
 from fab.errors import CheckFailed, InputError
 from fab.manifest.records import ModelEntry
-from fab.solids import height_files, mesh_files, step_files
+from fab.solids import direct_write, height_files, mesh_files, step_files
 from fab.solids.model import DoeModel, ModelKind
 
 KINDS: tuple[ModelKind, ...] = (
@@ -26,6 +26,7 @@ KINDS: tuple[ModelKind, ...] = (
     step_files.PATCH,
     *mesh_files.PATCHES,
     *height_files.KINDS,
+    *direct_write.KINDS,
 )
 
 
