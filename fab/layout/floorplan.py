@@ -1,4 +1,4 @@
-"""Which place on a wafer belongs to what: two alignment sites, five process monitors, and dies in all the rest.
+"""The plan of a wafer: two alignment sites, five process monitors, and dies in all the rest.
 
 The monitors lie in the middle and toward the four quarters, where a process differs most. On a wafer with room for many
 dies they take the places of dies; on one with room for few, or with as many dies as somebody asked for, they go where

@@ -70,7 +70,7 @@ _GLYPHS = {line[0]: line[2:].split() for line in _FONT.strip().splitlines()} | {
 
 
 class Job(NamedTuple):
-    """What tells one job from another: beginning of its names, revision, pixel pitch, digest of its geometry."""
+    """Identity of a job: beginning of its names, revision, pixel pitch (metres), digest of its geometry."""
 
     stem: str
     revision: str

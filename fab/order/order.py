@@ -124,7 +124,7 @@ class Order:
 
     @property
     def job(self) -> Job:
-        """What tells this job from others."""
+        """Identity of the job, as its labels tell it."""
         return Job(self.stem, self.terms.revision, self.level_map.grid.pitch_m, self.geometry)
 
     @cached_property

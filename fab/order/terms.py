@@ -1,4 +1,4 @@
-"""What a customer asks of a mask shop besides the drawing."""
+"""Terms of a mask order: everything asked of a mask shop besides the drawing."""
 
 import re
 from dataclasses import dataclass, fields

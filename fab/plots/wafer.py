@@ -4,8 +4,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from fab.figure import CHROME, FAINT, INK, LINE, MARK, SMALL, length_text, single
-from fab.layout.frame import WAFER
-from fab.layout.geometry import box_around
 from fab.units import MM
 
 if TYPE_CHECKING:
@@ -16,6 +14,8 @@ if TYPE_CHECKING:
     from fab.layout.wafer import Wafer
 
 _CENTRED: Any = {"ha": "center", "va": "center", "fontsize": SMALL}
+# The layer of its outline.
+_WAFER = 101
 _SITES = {"SITE": "A", "TEST": "M"}
 
 
@@ -34,7 +34,7 @@ def plot_wafer(
     with single(ax, (7.0, 7.6), title, _words(wafer, frame)) as axes:
         half = wafer.blank_m / 2 / MM
         axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f3f3f1", edgecolor=INK, lw=1.2))
-        (outline,) = around.shapes[WAFER].polygons
+        (outline,) = next(drawn for layer, drawn in around.shapes.items() if layer.number == _WAFER).polygons
         axes.add_patch(Polygon(outline * (dbu_m / MM), facecolor="white", edgecolor=LINE, lw=1.2))
         usable = (wafer.diameter_m / 2 - wafer.edge_exclusion_m) / MM
         axes.add_patch(Circle((0, 0), usable, fill=False, edgecolor=FAINT, lw=0.8, ls="--"))
@@ -74,8 +74,9 @@ def _words(wafer: "Wafer", frame: "Frame") -> str:
 
 def _box(axes: "Axes", drawn: "Iterable[Shapes]", at: tuple[int, int], dbu_m: float) -> tuple[float, ...]:
     """Fill the box around some shapes where they are placed, and return its edges in millimetres."""
-    box = box_around(shapes.box for shapes in drawn if shapes.box is not None) or (0, 0, 0, 0)
-    return _fill(axes, [edge + at[axis % 2] for axis, edge in enumerate(box)], dbu_m)
+    low_x, low_y, high_x, high_y = zip(*(shapes.box for shapes in drawn if shapes.box is not None), strict=True)
+    x, y = at
+    return _fill(axes, (min(low_x) + x, min(low_y) + y, max(high_x) + x, max(high_y) + y), dbu_m)
 
 
 def _fill(axes: "Axes", box: "Sequence[int]", dbu_m: float) -> tuple[float, ...]:

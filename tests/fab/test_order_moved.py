@@ -45,10 +45,10 @@ def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
     # The process moves every edge by its bias: printed like that, by KLayout, the drawing is the plane again.
     for mask in manifest.masks:
         regions = []
-        for folder in (moved, plain):
+        for order in (manifest, read_manifest(plain)):
             layout = kdb.Layout()
-            layout.read(str(folder / mask.file))
-            shapes = layout.cell(manifest.doe_cell).shapes(layout.layer(mask.layer, 0))
+            layout.read(str((moved if order is manifest else plain) / order.masks[mask.bit].file))
+            shapes = layout.cell(order.doe_cell).shapes(layout.layer(mask.layer, 0))
             regions.append(kdb.Region(shapes).merged())
         assert not (regions[0] ^ regions[1]).is_empty()
         assert (regions[0].sized(round(-mask.edge_move_nm), 2) ^ regions[1]).is_empty()
