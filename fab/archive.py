@@ -43,8 +43,7 @@ def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             # A compressed member was not written here, and could unfold to more than memory holds.
-            members = [member for member in archive.infolist() if member.compress_type == zipfile.ZIP_STORED]
-            raw = {member.filename.removesuffix(".npy"): archive.read(member) for member in members}
+            raw = {each.filename.removesuffix(".npy"): archive.read(each) for each in _members(archive, len(data))}
         arrays = {name: np.lib.format.read_array(io.BytesIO(each), allow_pickle=False) for name, each in raw.items()}
         header = json.loads(arrays.pop(_HEADER).tobytes()) if _HEADER in arrays else None
     # What a damaged archive raises depends on where the damage is.
@@ -56,6 +55,14 @@ def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict
     if header.pop(_DIGEST, None) != _digest(header, arrays):
         raise InputError(str(path), rule, "a file changed since it was written", cure)
     return header, arrays
+
+
+def _members(archive: zipfile.ZipFile, size: int) -> list[zipfile.ZipInfo]:
+    """List the members that this module may have written: compressed ones could unfold to more than memory holds."""
+    members = [member for member in archive.infolist() if member.compress_type == zipfile.ZIP_STORED]
+    if sum(member.file_size for member in members) > size:
+        raise ValueError("members that lie over each other")
+    return members
 
 
 def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:

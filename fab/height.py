@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import read_npy
 from fab.grid import Grid
-from fab.pictures import MOST_PIXELS, TIFF_FILES, read_pixels
+from fab.pictures import TIFF_FILES, read_pixels
 from fab.units import format_length, metres
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _load(path: Path) -> NDArray[Any]:
     if suffix != ".npy" and suffix not in _PICTURES:
         kinds = ", ".join(sorted((".npy", *_PICTURES)))
         raise InputError(str(path), f"the file must be one of {kinds}", path.suffix or "no suffix", "Convert it first.")
-    values = read_npy(path, MOST_PIXELS) if suffix == ".npy" else read_pixels(path)
+    values = read_npy(path) if suffix == ".npy" else read_pixels(path)
     if values.ndim != 2:
         rule = "a height map must have two axes, and no colours"
         raise InputError(str(path), rule, f"shape {values.shape}", "Give one plane of heights, [y, x].")

@@ -7,8 +7,10 @@ decoding a large JPEG at a fraction of its size. Such a PNG is written by pypng,
 """
 
 import io
+import re
 import warnings
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
@@ -21,7 +23,15 @@ from fab.errors import InputError
 from fab.files import explain_os_error, read_bytes, write_atomic
 
 TIFF_FILES = (".tif", ".tiff")
-MOST_PIXELS = 1 << 28
+# A file of a few kilobytes can stand for gigabytes of black; one that is large itself may hold more.
+MOST_PIXELS, MOST_PER_BYTE = 1 << 26, 8
+_BYTES_PER_PIXEL = 4
+# Ways to pack a TIFF that cannot unfold to more than its size says, or are looked at before: none, LZW, Deflate (both
+# numbers), PackBits.
+_PACKED, _DEFLATE = (1, 5, 8, 32773, 32946), (8, 32946)
+_SMALL_STRIP = 1 << 18
+# Others of Pillow start programs (EPS) or are hardly ever tested.
+_DISPLAYED = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")
 
 _CURE = "Save it again from its source."
 
@@ -39,7 +49,8 @@ def decoding(
     except Exception as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise explain_os_error(error, path) from error
-        got = " ".join(str(error).replace(f"'{path}'", "it").split()) or type(error).__name__
+        text = re.sub(rf"'{re.escape(str(path))}'|<_io\.\w+ object at \w+>", "it", str(error))
+        got = " ".join(text.split()) or type(error).__name__
         raise InputError(str(path), rule, f'"{got}"', cure) from error
 
 
@@ -48,16 +59,26 @@ def _require(fits: bool, path: Path, got: str, rule: str = "the file must hold o
         raise InputError(str(path), rule, got, _CURE)
 
 
-def _size(most_pixels: int) -> str:
-    return f"a picture must have from 1 to {most_pixels} pixels"
+def require_size(path: Path, shape: Sequence[int], file_bytes: int, itemsize: int = 1) -> None:
+    """Refuse a picture of more pixels than memory should be given for, before it is decoded.
+
+    Args:
+        path: its file, for the message.
+        shape: rows, columns and, if any, planes.
+        file_bytes: size of the file.
+        itemsize: bytes of a value.
+    """
+    most = max(MOST_PIXELS, MOST_PER_BYTE * file_bytes)
+    fits = 0 < shape[0] * shape[1] <= most and prod(shape) * itemsize <= _BYTES_PER_PIXEL * most
+    rule = f"a picture must have from 1 to {most} pixels, of {_BYTES_PER_PIXEL} bytes at the most"
+    _require(fits, path, f"values of shape {tuple(shape)}, {itemsize} bytes each", rule)
 
 
-def read_pixels(path: str | Path, *, most_pixels: int = MOST_PIXELS, others: str | None = None) -> NDArray[Any]:
+def read_pixels(path: str | Path, *, others: str | None = None) -> NDArray[Any]:
     """Read the values of a PNG or TIFF, which its ending says it is, as they are; its orientation is left alone.
 
     Args:
         path: the file.
-        most_pixels: number above which a picture is refused before anything is decoded.
         others: mode of Pillow, such as "RGBA", into which pixels that are not plain counts (a palette, single bits) are
             converted; they are refused if None.
 
@@ -72,34 +93,46 @@ def read_pixels(path: str | Path, *, most_pixels: int = MOST_PIXELS, others: str
     with decoding(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # libraries warn of what is refused, or does not matter
         if path.suffix.lower() in TIFF_FILES:
-            return _tiff_pixels(path, data, most_pixels, others)[::-1]
-        return _png_pixels(path, data, most_pixels, others)[::-1]
+            return _tiff_pixels(path, data, others)[::-1]
+        return _png_pixels(path, data, others)[::-1]
 
 
-def _tiff_pixels(path: Path, data: bytes, most_pixels: int, others: str | None) -> NDArray[Any]:
-    import imageio.v3 as imageio
+def _tiff_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
+    import tifffile
 
-    opened: Any = imageio.imopen(data, "r", plugin="tifffile")  # its stubs lack `page`
-    with opened as file:
-        pages, *shape = file.properties(index=..., page=...).shape
-        _require(pages == 1, path, f"{pages} pages")
-        _require(len(shape) in (2, 3), path, f"pixels of shape {(*shape,)}")
-        _require(0 < prod(shape) <= 4 * most_pixels, path, f"values of shape {(*shape,)}", _size(most_pixels))
-        tags = file.metadata(index=0)
-        kind = getattr(tags["PhotometricInterpretation"], "name", str(tags["PhotometricInterpretation"])).lower()
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        _require(len(file.pages) == 1, path, f"{len(file.pages)} pages")
+        page: Any = file.pages[0]
+        _require(len(page.shape) in (2, 3), path, f"pixels of shape {page.shape}")
+        separate = page.planarconfig == 2 and len(page.shape) == 3
+        shape = (*page.shape[1:], page.shape[0]) if separate else page.shape
+        require_size(path, shape, len(data), page.dtype.itemsize)
+        kind = getattr(page.photometric, "name", str(page.photometric)).lower()
         plain = kind in ("minisblack", "rgb")
-        _require(plain or others is not None, path, f"{kind} pixels of shape {(*shape,)}")
+        _require(plain or others is not None, path, f"{kind} pixels of shape {page.shape}")
         if plain:
-            values = file.read(index=0)
-            planes_first = getattr(tags["planar_configuration"], "name", "") == "SEPARATE" and values.ndim == 3
-            return values.transpose(1, 2, 0) if planes_first else values
+            _require_bounded(path, page, data)
+            values = page.asarray()
+            return values.transpose(1, 2, 0) if separate else values
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=["TIFF"]) as image:
         return np.asarray(image.convert(others))
 
 
-def _png_pixels(path: Path, data: bytes, most_pixels: int, others: str | None) -> NDArray[Any]:
+def _require_bounded(path: Path, page: Any, data: bytes) -> None:
+    """Refuse packed strips or tiles that unfold to more than their size says: tifffile would unfold them whole."""
+    if page.compression not in _PACKED:
+        how = getattr(page.compression, "name", str(page.compression))
+        _require(False, path, f"compression {how}", "a TIFF must be packed by LZW, Deflate, PackBits or not at all")
+    most = prod(page.chunks) * page.dtype.itemsize
+    for start, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+        if page.compression in _DEFLATE and count > _SMALL_STRIP:
+            found = len(zlib.decompressobj().decompress(data[start : start + count], most + 1))
+            _require(found <= most, path, f"more than {most} bytes", "a strip must unfold to its size")
+
+
+def _png_pixels(path: Path, data: bytes, others: str | None) -> NDArray[Any]:
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
@@ -107,19 +140,18 @@ def _png_pixels(path: Path, data: bytes, most_pixels: int, others: str | None) -
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
         count = getattr(image, "n_frames", 1)
         _require(count == 1, path, f"an animation of {count} pictures")
-        _require(
-            0 < image.width * image.height <= most_pixels, path, f"{image.width} x {image.height}", _size(most_pixels)
-        )
         plain = image.mode in ("L", "LA", "RGB", "RGBA") or image.mode.startswith("I")
         _require(plain or others is not None, path, f"pixels of the kind {image.mode}")
         deep = image.mode == "RGB" and any(tile.args == "RGB;16B" for tile in image.tile)
+        planes = len(image.getbands())
+        require_size(path, (image.height, image.width, planes), len(data), 1 + (deep or planes == 1))
         values = np.asarray(image if plain else image.convert(others))
     if deep:
         # Pillow keeps the upper byte of a colour's two. Told that the lower one comes first, it keeps the other.
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
             image.tile = [tile._replace(args="RGB;16L") for tile in image.tile]
             return values.astype(np.uint16) << 8 | np.asarray(image)
-    return values if values.dtype == np.uint8 else values.astype(np.uint16)
+    return values if values.dtype == np.uint8 else values.astype(np.uint16, copy=False)
 
 
 def read_display(path: str | Path, most_px: int | None = None) -> NDArray[np.uint8]:
@@ -133,26 +165,38 @@ def read_display(path: str | Path, most_px: int | None = None) -> NDArray[np.uin
     """
     from PIL import Image, ImageOps
 
-    with decoding(path, "must be a whole picture", "Replace or remove the file."), Image.open(path) as image:
-        if not 0 < image.width * image.height <= MOST_PIXELS:
-            raise ValueError(f"{image.width} x {image.height} pixels, more than {MOST_PIXELS}")
+    data, path = read_bytes(path), Path(path)
+    with (
+        decoding(path, "must be a whole picture", "Replace or remove the file."),
+        Image.open(io.BytesIO(data), formats=_DISPLAYED) as image,
+    ):
+        require_size(path, (image.height, image.width), len(data))
         if image.mode in ("F", "LAB", "HSV"):
             raise ValueError(f"pixels of the kind {image.mode}, which are no display values")
         if most_px is not None:
             # A JPEG can be decoded at an eighth of its size and up in much less time.
             shrink = most_px / min(image.size)
             image.draft("RGB", (round(image.width * shrink), round(image.height * shrink)))
-        if image.mode.startswith("I"):  # sixteen bits of grey
-            counts = (np.asarray(image).astype(np.int64) * 255 + 32767) // 65535
-            rgb = Image.fromarray(counts.clip(0, 255).astype(np.uint8)).convert("RGB")
-        else:
-            rgb = image.convert("RGB")
-        upright = ImageOps.exif_transpose(rgb)
+        ImageOps.exif_transpose(image, in_place=True)
+        upright = image if image.mode == "RGB" else _eight_bits(image).convert("RGB")
         shorter = min(upright.size)
         if most_px is not None and shorter > most_px:
             width, height = (max(1, round(n * most_px / shorter)) for n in upright.size)
             upright = upright.resize((width, height), Image.Resampling.BOX)
         return np.ascontiguousarray(np.asarray(upright, np.uint8)[::-1])
+
+
+def _eight_bits(image: Any) -> Any:
+    """Round sixteen bits of grey to eight; other pictures stay."""
+    if not image.mode.startswith("I"):
+        return image
+    from PIL import Image
+
+    counts = np.asarray(image).clip(0, 65535).astype(np.uint32)
+    counts *= 255
+    counts += 32767
+    counts //= 65535
+    return Image.fromarray(counts.astype(np.uint8))
 
 
 def write_pixels(

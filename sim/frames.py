@@ -5,6 +5,7 @@ OpenEXR (through `sim.store`), 16-bit or floating-point TIFF, 16-bit grey PNG, a
 are taken as they lie, the others marked as not valid. Arrays have row 0 at the lowest y, a picture's last row.
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from fab.errors import InputError
-from fab.pictures import MOST_PIXELS, decoding, read_pixels
+from fab.files import opened
+from fab.pictures import decoding, read_pixels, require_size
 
 Channel = Literal["red", "green", "blue"]
 
@@ -106,8 +108,10 @@ def open_raw(path: Path) -> Iterator[Any]:
         cure = "pip install 'doedesign[raw]', or convert the file to TIFF without any processing first."
         raise InputError(str(path), "camera RAW needs rawpy", "no such package", cure) from error
     with decoding(path):
-        path.stat()  # a missing file in the system's own words
+        with opened(path) as stream:  # what cannot be read is told in the system's own words
+            file_bytes = os.fstat(stream.fileno()).st_size
         with rawpy.imread(str(path)) as raw:
+            require_size(path, (raw.sizes.raw_height, raw.sizes.raw_width), file_bytes, 2)
             yield raw
 
 
@@ -118,7 +122,7 @@ def _read_raw(path: Path, channel: Channel | None) -> CameraFrame:
         names = raw.color_desc.decode()
         mosaic = len(set(names[: raw.num_colors])) > 1 and int(colours.max()) > 0
         black, white = float(np.mean(raw.black_level_per_channel)), float(raw.white_level)
-    if counts.ndim != 2 or not 0 < counts.size <= MOST_PIXELS:
+    if counts.ndim != 2:
         raise InputError(str(path), "a RAW image must hold one value per pixel", counts.shape, "Give the sensor's own.")
     valid = np.ones(counts.shape, bool)
     if mosaic:

@@ -20,7 +20,7 @@ import io
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,6 +29,7 @@ from jaxtyping import Float
 
 from fab.errors import InputError
 from fab.files import canonical_json, read_bytes, write_atomic
+from fab.pictures import MOST_PER_BYTE
 
 if TYPE_CHECKING:
     import sim.psf_bank
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 _BANK = "psf_bank"
 _DIGEST = "sha256"
 _GUARDED = ("aperture_m", "pitch_m", _BANK)
+# A file of a few kilobytes can stand for gigabytes of zeros; one that is large itself may hold more.
+_MOST_VALUES, _MOST_CHANNELS = 1 << 27, 4096
 _SILENT = threading.Lock()
 
 
@@ -252,17 +255,19 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     data = read_bytes(path)
     try:
         with _silence() as said:
+            _require_size(path, OpenEXR.File(io.BytesIO(data), header_only=True).parts, len(data))
             file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
             parts = [(dict(part.header), dict(part.channels)) for part in file.parts]
+    except InputError:
+        raise
     except Exception as error:  # the binding raises RuntimeError, ValueError, MemoryError ... for broken content
         raise _broken(path, str(error)) from error
     if not parts:
         raise _broken(path, said() or "no picture in it")
-    if len(parts) > 1:
-        raise InputError(str(path), "the file must have one part", f"{len(parts)} parts", "Save one part alone.")
     header, channels = parts[0]
     shape = _window_shape(path, header)
     pictures = {name: np.ascontiguousarray(channel.pixels) for name, channel in channels.items()}
+    del file, parts, channels  # each picture is turned over below, and not all of them kept twice
     for name, pixels in pictures.items():
         if pixels.shape != shape or pixels.dtype.kind not in "fu":
             raise _broken(path, f"channel {name} with {pixels.dtype} pixels of shape {pixels.shape} for {shape}")
@@ -271,7 +276,21 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         rule = "pixels and lengths must match the digest written with them"
         cure = f"Restore the file; if it was edited on purpose, remove its attribute {_DIGEST}."
         raise InputError(str(path), rule, "a file that has changed since", cure)
-    return {k: np.ascontiguousarray(v[::-1], np.float32) for k, v in pictures.items()}, texts
+    return {name: np.ascontiguousarray(pictures.pop(name)[::-1], np.float32) for name in list(pictures)}, texts
+
+
+def _require_size(path: Path, parts: Sequence[Any], file_bytes: int) -> None:
+    """Refuse by its header what would take gigabytes to decode, and what is no plain picture."""
+    if len(parts) > 1:
+        raise InputError(str(path), "the file must have one part", f"{len(parts)} parts", "Save one part alone.")
+    for part in parts:
+        (x0, y0), (x1, y1) = np.asarray(part.header["dataWindow"], np.int64).tolist()
+        channels = len(part.header["channels"])
+        most = max(_MOST_VALUES, MOST_PER_BYTE * file_bytes)
+        if channels > _MOST_CHANNELS or (y1 - y0 + 1) * (x1 - x0 + 1) * channels > most:
+            rule = f"a picture may have at most {_MOST_CHANNELS} channels and {most} values in all"
+            got = f"{channels} channels of {x1 - x0 + 1} x {y1 - y0 + 1}"
+            raise InputError(str(path), rule, got, "Save fewer or smaller channels.")
 
 
 def _window_shape(path: Path, header: dict[str, Any]) -> tuple[int, int]:

@@ -29,7 +29,6 @@ from sim.store import read_picture, write_picture
 WRITTEN_FILES = (".png", ".tif", ".tiff", ".exr")
 PHOTO_FILES = (*WRITTEN_FILES, *RAW_FILES)
 
-_MOST_PIXELS = 1 << 27
 _CURE = "Save it again from its source as one picture, grey or in red, green and blue."
 
 
@@ -68,7 +67,7 @@ def read_capture(path: str | Path, linear: bool | None = None) -> Photo:
         return _finite(Photo(read_image(path.parent, stored), 16, True, str(path)))
     if suffix in RAW_FILES:
         return _finite(Photo(_raw_light(path), 16, True, str(path)))
-    return photo_from_array(read_pixels(path, most_pixels=_MOST_PIXELS), linear, str(path))
+    return photo_from_array(read_pixels(path), linear, str(path))
 
 
 def _finite(photo: Photo) -> Photo:

@@ -29,13 +29,14 @@ from numpy.typing import ArrayLike
 from doedesign.training.backbones import LEAST_PX, Backbone, backbone_of, convolutions, taps_of, weight_shapes
 from doedesign.training.similarity import Images, MsSsim
 from fab.errors import InputError
-from fab.files import sha256_file
+from fab.files import opened, sha256_file
 from fab.pictures import decoding
 
 # Mean and spread of each colour that the backbones were trained with, for values from -1 to 1.
 _MEAN = np.array([-0.030, -0.088, -0.188], np.float32)
 _SPREAD = np.array([0.458, 0.448, 0.450], np.float32)
 _TINY = 1e-10
+_MOST_BYTES = 1 << 30  # of the weights in a file; VGG16 with its classifier, in half precision or single, is smaller
 
 _CURE = "Make the file with examples/convert_lpips.py."
 
@@ -158,7 +159,11 @@ def read_lpips(paths: Sequence[Path]) -> Lpips:
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     """Weights of one file; numpy leaves a damaged archive open, so it is opened here."""
     rule = "must be a whole .npz file of numbers"
-    with decoding(path, rule, _CURE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+    with decoding(path, rule, _CURE), opened(path) as stream, np.load(stream, allow_pickle=False) as archive:
+        # A few kilobytes can stand for gigabytes of zeros.
+        size = sum(member.file_size for member in archive.zip.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"{size} bytes of weights, where {_MOST_BYTES} are the most")
         return {key: archive[key] for key in archive.files if re.fullmatch(r"features\..*|lin\d+", key)}
 
 

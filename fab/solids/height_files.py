@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import write_atomic
+from fab.files import read_npy, write_atomic
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest.records import ModelEntry
@@ -210,7 +210,7 @@ _FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
 _TOP_ROW = "first row at the highest y"
 KINDS = (
     _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", lambda levels: _exact_scale(levels)[1], write_tiff, read_pixels),
-    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda _: 1.0, write_npy, np.load),
+    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda _: 1.0, write_npy, read_npy),
     _kind(
         "_GREY.png", f"{_BLANK}, {_TOP_ROW}", lambda levels: _full_scale(levels, 65535)[1], write_greymap, read_pixels
     ),

@@ -21,6 +21,8 @@ from fab.units import MM
 # What is left of a volume: picometres as text or single precision.
 _RELATIVE_ERROR, _SINGLE = 1e-6, 2.0**-23
 
+_MOST_PER_CELL = 20  # triangles; about five are written
+
 _Shown = Callable[[DoeModel], MeshedRelief | None]
 
 
@@ -46,8 +48,10 @@ def _write(path: Path, model: DoeModel, shown: _Shown, write: Callable[[Path, Me
 
 
 def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
-    mesh, window = read_mesh(path, "mm" if path.suffix == ".stl" else None), window_of(entry)
+    window = window_of(entry)
     cells = reduced_cells(model.level_map, MESH_CELLS) if window is None else window_cells(model.level_map, window)
+    most = _MOST_PER_CELL * cells.height_m.size + 1000
+    mesh = read_mesh(path, "mm" if path.suffix == ".stl" else None, most)
     return volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3}) + _top_problems(mesh, cells)
 
 

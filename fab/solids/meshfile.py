@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import os_errors_explained, write_atomic
+from fab.files import opened, read_bytes, write_atomic
 from fab.solids.mesh import Mesh
 from fab.units import MM, UM
 
@@ -135,13 +135,36 @@ def write_stl(path: str | Path, mesh: Mesh, unit: Unit = "mm") -> None:
 
 
 _CHUNK = 1 << 20  # bytes; by itself the parser asks for two thousand at a time
+_TEXT_PER_TRIANGLE = 300  # bytes, with its share of the vertices; written are about 100
+_MOST_TRIANGLES = 1 << 24
 
 
-def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float]:
+def _require_bounded(path: Path, kind: str, most: int) -> None:
+    """Refuse by sizes and counts what is larger than `most` triangles, or would fetch other files."""
+    data = read_bytes(path)
+    if kind == ".stl":
+        count = int.from_bytes(data[80:84], "little")
+        if len(data) != 84 + 50 * count or count > most:
+            raise ValueError(f"{len(data)} bytes for {count} triangles, of which it may have {most}")
+        return
+    length = int.from_bytes(data[12:16], "little")
+    if length > _CHUNK or data[:4] != b"glTF":
+        raise ValueError(f"a header of {length} bytes")
+    value = json.loads(data[20 : 20 + length])
+    counts = [each["count"] for each in value["accessors"] if each["bufferView"] >= 0 and "sparse" not in each]
+    if len(counts) < len(value["accessors"]) or not all(0 <= count <= 3 * most for count in counts):
+        raise ValueError(f"accessors of {counts} values, where {3 * most} are the most")
+    if any("uri" in each for key in ("buffers", "images") for each in value.get(key, ())):
+        raise ValueError("data in other files")
+
+
+def _read_3mf(path: Path, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32], float]:
     """Read the one object of a 3MF file as a stream; a tree of millions of elements would take gigabytes."""
     numbers, corners, seen = array("d"), array("i"), {"object": 0, "unit": ""}
 
     def start(tag: str, values: dict[str, str]) -> None:
+        if max(len(numbers), len(corners)) > 9 * most:
+            raise ValueError(f"more than {most} triangles")
         if tag == "triangle":
             corners.extend((int(values["v1"]), int(values["v2"]), int(values["v3"])))
         elif tag == "vertex":
@@ -155,7 +178,10 @@ def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float
 
     parser = ParserCreate()
     parser.StartElementHandler = start
-    with zipfile.ZipFile(path) as archive, archive.open("3D/3dmodel.model") as model:
+    with opened(path) as file, zipfile.ZipFile(file) as archive, archive.open("3D/3dmodel.model") as model:
+        size, largest = archive.getinfo(model.name).file_size, _CHUNK + _TEXT_PER_TRIANGLE * most
+        if size > largest:
+            raise ValueError(f"a model of {size} bytes, where {largest} are the most for {most} triangles")
         for text in iter(lambda: model.read(_CHUNK), b""):
             parser.Parse(text)
     parser.Parse(b"", True)
@@ -166,27 +192,31 @@ def _read_3mf(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], float
     return vertices, np.frombuffer(corners, dtype=np.int32).reshape(-1, 3), scale
 
 
-def read_mesh(path: str | Path, unit: Unit | None = None) -> Mesh:
+def read_mesh(path: str | Path, unit: Unit | None = None, most: int = _MOST_TRIANGLES) -> Mesh:
     """Read a one-mesh file with a parser that did not write it: trimesh, and for 3MF Python's own for XML.
 
     `unit` says what the numbers of an STL file mean. The triangles come back in metres, z up, also from glTF.
+
+    Raises:
+        InputError: the file is missing, damaged, holds another number of meshes or more than `most` triangles.
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (".3mf", ".glb", ".stl") or (kind == ".stl") != (unit is not None):
         rule = "the file must be .3mf or .glb, or .stl with its unit given"
         raise InputError(str(path), rule, f"{kind} and unit {unit}", "Give the unit of an STL file only.")
-    with os_errors_explained(path):
-        path.open("rb").close()
     try:
         if kind == ".3mf":
-            vertices, triangles, scale = _read_3mf(path)
+            vertices, triangles, scale = _read_3mf(path, most)
         else:
+            _require_bounded(path, kind, most)
             import trimesh
 
             parts: Any = trimesh.load_scene(path, process=False).dump()
             (part,) = parts
             vertices, triangles, scale = part.vertices, part.faces, _UNIT_M[unit] if unit else 1.0
+    except InputError:
+        raise
     # Each parser raises what it likes on a damaged file.
     except Exception as error:
         cure = "Write the file again from its source."

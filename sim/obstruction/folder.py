@@ -29,8 +29,6 @@ from sim.obstruction.view import CameraView
 
 MASK_FILES = (".png", *TIFF_FILES)
 
-_MOST_PIXELS = 1 << 26
-
 
 class MaskPicture(NamedTuple):
     """One mask as its file holds it."""
@@ -161,7 +159,7 @@ def _averages(rows: Float[np.ndarray, "n m"], count: int, step: float, start: fl
 
 def read_mask(path: Path) -> MaskPicture:
     """Read a mask and its size; an InputError for no picture, one that covers nothing, or a size that is no length."""
-    values = read_pixels(path, most_pixels=_MOST_PIXELS, others="RGBA")
+    values = read_pixels(path, others="RGBA")
     full = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     values = np.clip(np.nan_to_num(values.astype(np.float32)) / np.float32(full), 0, 1)
     mask, colour = _parted(values.reshape(*values.shape[:2], -1))

@@ -1,17 +1,25 @@
 """Small files that stand for immense things: each is refused by counting, before anything is unfolded."""
 
+import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
+from fab.files import read_npy
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds, write_gds
 from fab.grid import Grid
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes, in_order, pixel_edges
 from fab.layout.limits import MOST, Tally
+from fab.pictures import read_display, read_pixels, write_pixels
+from fab.solids.columns import reduced_cells
+from fab.solids.mesh import relief_mesh
+from fab.solids.meshfile import read_mesh, write_glb
 from fab.units import NM, UM
 from tests.campaign import bombs
 
@@ -87,3 +95,93 @@ def test_a_long_chain_is_sorted_and_counted_at_once():
         InputError, match=r"f\.gds: a drawing may hold at most 32 cells placed one within another, but got"
     ):
         Tally("f.gds").add_places(ordered)
+
+
+# --- pictures, meshes and arrays --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.png", lambda: bombs.png_bomb(8200, 8200), "from 1 to 67108864 pixels"),
+        ("a.tif", lambda: bombs.tiff_bomb(8200, 8200, 1), "from 1 to 67108864 pixels"),
+        ("a.tif", lambda: bombs.tiff_bomb(100, 100, 1 << 20), "a strip must unfold to its size"),
+        ("a.tif", lambda: bombs.tiff_bomb(100, 100, 1 << 20, 34925), "must be packed by LZW, Deflate, PackBits"),
+    ],
+)
+def test_a_picture_that_decodes_to_gigabytes_is_refused_by_its_header(tmp_path: Path, monkeypatch, name, data, says):
+    monkeypatch.setattr("fab.pictures._SMALL_STRIP", 100)
+    (tmp_path / name).write_bytes(data())
+    with pytest.raises(InputError, match=says):
+        read_pixels(tmp_path / name)
+
+
+def test_a_photograph_that_promises_gigabytes_is_refused_by_its_header(tmp_path: Path):
+    (tmp_path / "a.jpg").write_bytes(bombs.jpeg_bomb(9000, 9000))
+    with pytest.raises(InputError, match="from 1 to 67108864 pixels"):
+        read_display(tmp_path / "a.jpg", 100)
+
+
+def test_a_large_picture_in_a_large_file_is_read(tmp_path: Path, monkeypatch):
+    # As many pixels as the limit, and more in a file that has a byte for every eight.
+    monkeypatch.setattr("fab.pictures.MOST_PIXELS", 100)
+    values = np.random.default_rng(0).integers(0, 256, (40, 40), np.uint8)
+    write_pixels(tmp_path / "a.png", values)
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png"), values)
+    write_pixels(tmp_path / "b.png", values * 0)
+    with pytest.raises(InputError, match="pixels"):
+        read_pixels(tmp_path / "b.png")
+
+
+def test_other_kinds_of_pictures_are_not_even_tried(tmp_path: Path):
+    # EPS would start another program, and GIF was never promised.
+    (tmp_path / "a.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n")
+    with pytest.raises(InputError, match="must be a whole picture"):
+        read_display(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.3mf", lambda: bombs.mesh_3mf_bomb(40_000), "more than 1000 triangles"),
+        ("a.3mf", lambda: bombs.mesh_3mf_bomb(0, 4 << 20), "a model of .* bytes, where .* are the most"),
+        ("a.glb", bombs.glb_bomb, "bufferView"),
+        ("a.stl", lambda: bytes(80) + b"\xff\xff\xff\x7f", "84 bytes for 2147483647 triangles"),
+    ],
+)
+def test_a_mesh_that_unfolds_without_bounds_is_refused(tmp_path: Path, name, data, says):
+    (tmp_path / name).write_bytes(data())
+    with pytest.raises(InputError, match=says):
+        read_mesh(tmp_path / name, "mm" if name == "a.stl" else None, most=1000)
+
+
+def test_a_mesh_with_data_in_other_files_is_refused(tmp_path: Path, level_map):
+    mesh = relief_mesh(reduced_cells(level_map, 10), 1e-3)
+    write_glb(tmp_path / "a.glb", mesh)
+    assert len(read_mesh(tmp_path / "a.glb").triangles) == len(mesh.triangles)
+    whole = (tmp_path / "a.glb").read_bytes()
+    here = b'"buffers": [{"byteLength": '
+    elsewhere = b'"buffers":[{"uri":"a","b":'.ljust(len(here))
+    (tmp_path / "a.glb").write_bytes(whole.replace(here, elsewhere))
+    with pytest.raises(InputError, match="data in other files"):
+        read_mesh(tmp_path / "a.glb")
+
+
+def test_an_array_that_promises_more_than_it_holds_is_refused(tmp_path: Path):
+    (tmp_path / "a.npy").write_bytes(bombs.npy_bomb())
+    with pytest.raises(InputError, match=r"whole \.npy file"):
+        read_npy(tmp_path / "a.npy")
+
+
+def test_an_archive_whose_members_lie_over_each_other_is_refused(tmp_path: Path):
+    write_archive(tmp_path / "a.npz", {}, {"a": np.zeros(1000)})
+    data = (tmp_path / "a.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        start = archive.start_dir
+    # The directory lists the same members fifty times.
+    end = data.rindex(b"PK\5\6")
+    entries = data[start:end] * 50
+    tail = struct.pack("<HHHHIIH", 0, 0, 100, 100, len(entries), start, 0)
+    (tmp_path / "a.npz").write_bytes(data[:start] + entries + b"PK\5\6" + tail)
+    with pytest.raises(InputError, match="lie over each other"):
+        read_archive(tmp_path / "a.npz", "archive", "Write it again.")

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from fab.errors import InputError
 from sim.psf_bank import PsfBank
 from sim.store import read_bank, read_height, read_picture, write_bank, write_height, write_picture
+from tests.campaign import bombs
 
 ROOT = Path(__file__).parents[2]
 MEASURED = ROOT.parent / "shared" / "data" / "optics_reference" / "measured_psf" / "diffusercam_psf_sample.tif"
@@ -262,3 +263,16 @@ def test_threads_that_read_at_once_leave_the_terminal_as_it_was(tmp_path: Path):
         list(pool.map(read_picture, paths * 50))
     assert sys.stdout is before
     assert os.path.samestat(os.fstat(2), place)
+
+
+@pytest.mark.parametrize("size", [(12_000, 12_000, 1), (8, 8, 4097)])
+def test_a_picture_that_decodes_to_gigabytes_is_refused_by_its_header(tmp_path: Path, size: tuple[int, int, int]):
+    (tmp_path / "a.exr").write_bytes(bombs.exr_bomb(*size))
+    with pytest.raises(InputError, match="at most 4096 channels and 134217728 values in all"):
+        read_picture(tmp_path / "a.exr")
+
+
+def test_a_header_of_an_immense_picture_is_refused(tmp_path: Path):
+    (tmp_path / "a.exr").write_bytes(bombs.exr_promise())
+    with pytest.raises(InputError, match="whole OpenEXR picture"):
+        read_picture(tmp_path / "a.exr")
