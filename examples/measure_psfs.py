@@ -40,9 +40,14 @@ MARGIN, OFF = 32, (3, -5)  # pixels round the design's window; of the chief ray 
 
 
 def hidden_errors(design: Design, process: Process, seed: int) -> Variation:
-    """Errors of a plate: those looked for by default drawn from a process, all others at its means."""
+    """Errors of a plate: those looked for by default drawn from a process, all others at its means.
+
+    Places are relative to mask 0, by whose marks all others and the chrome are aligned.
+    """
     drawn = variation_at(process, seed, max(design.camera.grid.extent_m), "normal/0")
-    return replace(process.expected(), **{name: getattr(drawn, name) for name in HIDDEN})
+    found = {name: getattr(drawn, name) for name in HIDDEN}
+    found |= {name: tuple(m - found[name][0] for m in found[name]) for name in ("overlay_y_m", "overlay_x_m")}
+    return replace(process.expected(), **found)
 
 
 def light_of(design: Design, process: Process, errors: Variation, spec: MeasurementSpec) -> list[np.ndarray]:
