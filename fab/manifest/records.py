@@ -35,7 +35,7 @@ CONVENTIONS = {
     "masks": "bit k of (L-1-level) set = mask k opens and etches its depth_nm; bit k is layer k+1, datatype 0",
     "axes": "seen from the etched side, +x right, +y up, origin at the centre of the wafer; not mirrored",
     "datatypes": "0 the DOE, 1 alignment marks, 2 test structures, 3 lettering; one mask carries them all",
-    "outlines": "layers 100 to 110 show the blank, the wafer, the clear aperture and the die; they are on no mask",
+    "outlines": "layers 100 to 110 show the blank, the wafer, the relief and the die; they are on no mask",
     "level map": "uint8 [y, x], row 0 at the lowest y; its digest is the SHA-256 of these bytes row by row",
     "plane digests": "SHA-256 of the rows packed to bytes, first pixel in the highest bit, 1 = etched",
 }
