@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -9,6 +10,7 @@ from typing import Any, cast
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 from doedesign.design.objectives import (
     BUILT_IN,
@@ -18,6 +20,7 @@ from doedesign.design.objectives import (
     import_objectives,
     near_spread,
     source_digests,
+    spot_weights,
     terms_from_spec,
     window_loss,
 )
@@ -76,11 +79,100 @@ def test_window_loss_counts_what_is_not_there() -> None:
 
 
 def test_handcrafted_is_zero_at_its_targets() -> None:
-    from doedesign.design.objectives import spot_weights
-
     spots = spot_weights(CAMERA)[0]
     assert float(handcrafted(view(even(), spots / spots.sum()))) == pytest.approx(0.0, abs=1e-5)
     assert float(handcrafted(view(point(), even()))) > 1.0
+
+
+def test_handcrafted_off_its_targets_by_hand() -> None:
+    """Light scaled by a is (1 - a)^2 of its target's square away, in every colour; a point is 4 of N^2 pixels."""
+    colours = tuple(Colour(name, (wave,), (1.0,)) for name, wave in (("blue", 450e-9), ("red", 650e-9)))
+    camera = replace(CAMERA, colours=colours, focal_length_m=20e-3)
+    spots = spot_weights(camera)
+    assert spots[0].sum() < 0.7 * spots[1].sum()
+    targets = spots / spots.sum(axis=(1, 2), keepdims=True)
+    far = np.stack([0.5 * targets[0], 0.8 * targets[1]])[:, None]
+    near = np.broadcast_to(point(), (2, 1, 64, 64))
+    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.ones((2, 1)), camera)
+    missed, spread = (0.5**2 + 0.2**2) / 2, np.log(1 + (64**2 / 4 - 1))
+    assert float(handcrafted(psfs)) == pytest.approx(missed + spread, rel=1e-5)
+    assert float(handcrafted(psfs, near_weight=3.0)) == pytest.approx(missed + 3 * spread, rel=1e-5)
+    assert float(handcrafted(view(1.5 * even(), targets[0]))) > np.log(1.25)
+
+
+def test_target_pattern_off_its_target_by_hand() -> None:
+    """Light scaled by a is (1 - a)^2 away, and light on two other pixels than the target's two is 2 away."""
+    target = np.zeros((64, 64), np.float32)
+    target[3, 4:6] = 0.5
+    other = np.roll(target, 9, axis=0)
+    for image, wanted in ((0.4 * target, 0.36), (1.5 * target, 0.25), (0 * target, 1.0), (other, 2.0)):
+        assert float(BUILT_IN["target_pattern"](view(even(), image), target=target)) == pytest.approx(wanted, rel=1e-6)
+    both = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.stack([0.4 * target, other])[None], jnp.zeros((1, 0)), CAMERA)
+    assert float(BUILT_IN["target_pattern"](both, target=target)) == pytest.approx((0.36 + 2) / 2, rel=1e-6)
+
+
+def test_spots_are_airy_patterns_at_the_points_of_a_grid() -> None:
+    """Against (2 J1(v) / v)^2 with v = pi D r / (lambda f), columns along x."""
+    options = {"pattern": "spots", "count": (3, 2), "spacing": "60 um"}
+    found = target_image(CAMERA, options, None, "objective")
+    axis = (np.arange(64) - 31.5) * 4e-6
+    wanted = np.zeros((64, 64))
+    for x in (-60e-6, 0.0, 60e-6):
+        for y in (-30e-6, 30e-6):
+            v = np.pi * 0.64e-3 * np.hypot(axis[:, None] - y, axis - x) / (550e-9 * 5e-3)
+            wanted += (2 * special.j1(v) / v) ** 2
+    # The zero is taken at 1.2197 lambda f / D and 3.8317, both to five digits.
+    np.testing.assert_allclose(found, wanted / wanted.sum(), rtol=1e-3, atol=1e-7)
+    single = target_image(replace(CAMERA, window=65), options | {"count": (1, 1)}, None, "objective")
+    assert single[32, 32] == single.max()
+    with pytest.raises(InputError, match=r"window, 0\.252 mm, but got 0\.36 mm"):
+        target_image(CAMERA, options | {"count": (7, 2)}, None, "objective")
+    # Those in the middle of the outermost pixels are still within.
+    assert target_image(CAMERA, options | {"count": (2, 1), "spacing": "252 um"}, None, "objective").sum() > 0
+
+
+@pytest.mark.parametrize("count", [None, [3, 3], (3,), (3, 3, 3), (0, 3), (3, -1), (3, 2.0)])
+def test_a_grid_of_spots_needs_two_numbers(count: Any) -> None:
+    options = {"pattern": "spots", "count": count, "spacing": "60 um"}
+    with pytest.raises(InputError, match="count: must be two positive whole numbers"):
+        target_image(CAMERA, options, None, "objective")
+
+
+def test_squares_and_discs_are_as_large_as_they_say() -> None:
+    axis = np.abs((np.arange(64) - 31.5) * 4e-6)
+    square = target_image(CAMERA, {"pattern": "square", "width": "50 um"}, None, "objective")
+    # Pixels of 4 um about the middle: six wholly, and a quarter of the one beyond, on either side.
+    line = np.where(axis < 23e-6, 1.0, np.where(axis < 27e-6, 0.25, 0.0)) / 12.5
+    np.testing.assert_allclose(square, np.outer(line, line), atol=1e-8)
+    disc = target_image(CAMERA, {"pattern": "disc", "diameter": "160 um"}, None, "objective")
+    r = np.hypot(axis[:, None], axis)
+    # Wholly within by half a pixel's diagonal, every pixel holds its share of pi r^2; without, nothing.
+    np.testing.assert_allclose(disc[r < 77e-6], 16 / (np.pi * 80**2), rtol=2e-3)
+    assert not disc[r > 83e-6].any()
+
+
+@pytest.mark.parametrize("width", ["0 um", "-3 um", "3", "wide"])
+def test_a_length_that_is_none(width: str) -> None:
+    with pytest.raises(InputError, match='For example width = "250 um"') as caught:
+        target_image(CAMERA, {"pattern": "square", "width": width}, None, "objective[0] target_pattern")
+    assert "objective[0] target_pattern: width: must be" in str(caught.value)
+
+
+def test_pictures_of_other_kinds_hold_the_same_light(tmp_path: Path) -> None:
+    """Alpha is left out, grey with one channel is grey, and colours count by their luminance."""
+    grey = np.zeros((64, 64), np.uint8)
+    grey[:, :32] = 255
+    cases = {
+        "grey": grey,
+        "alpha": np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1),
+        "unlike": np.stack([grey, 0 * grey, grey[:, ::-1]], axis=-1),
+    }
+    for name, values in cases.items():
+        write_pixels(tmp_path / f"{name}.png", values)
+        found = target_image(CAMERA, {}, tmp_path / f"{name}.png", "objective")
+        left = found[:, :32].sum(dtype=np.float64)
+        # Red on the left and blue on the right, by the weights of Rec. 709.
+        assert left == pytest.approx(0.2125 / (0.2125 + 0.0721) if name == "unlike" else 1.0, abs=1e-4)
 
 
 def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:

@@ -1,0 +1,196 @@
+"""Change one operator or number of the code at a time, and see whether the tests that are meant for it notice.
+
+    python -m tests.mutants                             # of what changed since the last commit
+    python -m tests.mutants --since v0.1                # since a tag
+    python -m tests.mutants --sample 500 --all          # 500 of everything, chosen by the seed
+    python -m tests.mutants doedesign/design/patterns.py
+
+Cosmic Ray makes the changes, in a copy of the project. The tests meant for a file are those that bear its name
+(`test_sensor.py`, `test_sensor_noise.py` for `sensor.py`) and those that import it, of the fast tier. A mutant that
+survives, but harms nothing, is listed with the reason in `mutants.toml`.
+"""
+
+import argparse
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+
+ROOT = Path(__file__).parents[1]
+HARMLESS = Path(__file__).with_suffix(".toml")
+# Where a wrong number is a wrong result.
+EVERYTHING = (
+    "sim/**/*.py",
+    "fab/**/*.py",
+    "doedesign/design/*.py",
+    "doedesign/calibration/*.py",
+    "doedesign/tolerancing/*.py",
+)
+_COPIED = ("doedesign", "fab", "sim", "tests", "bench", "examples", "masks", "pyproject.toml", "README.md")
+_COPIED += ("CONTRIBUTING.md", "Makefile", "constraints.txt")
+
+
+class Mutant(NamedTuple):
+    """One change of one file; lines are without the space around them."""
+
+    file: str
+    line: int
+    was: str
+    now: str
+    code: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}\n    - {self.was}\n    + {self.now}"
+
+
+def mutants(file: str) -> Iterator[list[Mutant]]:
+    """Every place of a file that can be changed, with its changes. Annotations are left alone."""
+    code = (ROOT / file).read_text("utf-8")
+    tree, notes = get_ast(code), _annotations(code)
+    places: dict[tuple[int, int], list[tuple[Any, int]]] = defaultdict(list)
+    for name in operator_names():
+        kind: Any = get_operator(name)
+        if kind.arguments():
+            continue
+        found = [at for node in ast_nodes(tree) for at in kind().mutation_positions(node)]
+        for occurrence, (start, _) in enumerate(found):
+            if not any(first <= start < last for first, last in notes):
+                places[start].append((kind(), occurrence))
+    for (line, _), changes in sorted(places.items()):
+        made = [(line, mutate_code(code, operator, occurrence)) for operator, occurrence in changes]
+        yield [mutant for line, new in made if new is not None for mutant in _mutant(file, line, code, new)]
+
+
+def _mutant(file: str, line: int, code: str, new: str) -> list[Mutant]:
+    pairs = zip(code.splitlines(), new.splitlines(), strict=False)
+    was, now = next(((a, b) for a, b in pairs if a != b), ("", ""))
+    return [Mutant(file, line, was.strip(), now.strip(), new)] if was != now else []
+
+
+def _annotations(code: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Begin and end (line, column) of every annotation."""
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        for note in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+            if isinstance(note, ast.expr):
+                end = (note.end_lineno or 0, note.end_col_offset or 0)
+                found.append(((note.lineno, note.col_offset), end))
+    return found
+
+
+def tests_for(file: str) -> list[str]:
+    """Test files that are meant for a file, those with its name first."""
+    path = Path(file)
+    module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    imported = re.compile(rf"^\s*(from|import) {re.escape(module)}\b", re.MULTILINE)
+    named, importing = [], []
+    for test in sorted((ROOT / "tests").rglob("test_*.py")):
+        if test.stem == f"test_{path.stem}" or test.stem.startswith(f"test_{path.stem}_"):
+            named.append(test)
+        elif imported.search(test.read_text("utf-8")):
+            importing.append(test)
+    return [str(test.relative_to(ROOT)) for test in named + importing]
+
+
+def survives(mutant: Mutant, tree: Path, limit_s: float) -> bool:
+    """Whether the tests of a file pass although it is changed; `tree` is a copy of the project."""
+    path = tree / mutant.file
+    code = path.read_text("utf-8")
+    try:
+        path.write_text(mutant.code, "utf-8")
+        return _passes(tree, tests_for(mutant.file), limit_s)
+    finally:
+        path.write_text(code, "utf-8")
+
+
+def _passes(tree: Path, tests: Sequence[str], limit_s: float) -> bool:
+    how = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not slow"]
+    command = [sys.executable, "-B", "-m", "pytest", *how, *tests]
+    environment = os.environ | {"PYTHONPATH": str(tree)}
+    try:
+        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, check=False, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        return False
+    if done.returncode not in (0, 1, 2):
+        print(done.stdout.decode(errors="replace")[-2000:])
+    return done.returncode == 0
+
+
+def chosen(files: Sequence[str], count: int | None, seed: int) -> list[Mutant]:
+    """Mutants of files: one for each place, or for `count` random places, with a random change."""
+    rng = np.random.default_rng(seed)
+    places = [changes for file in files for changes in mutants(file) if changes]
+    if count is not None and count < len(places):
+        places = [places[k] for k in sorted(rng.choice(len(places), count, replace=False))]
+    return [changes[rng.integers(len(changes))] for changes in places]
+
+
+def _changed_files(since: str) -> list[str]:
+    command = ["git", "diff", "--name-only", "--diff-filter=AM", since, "--", *(p.split("*")[0] for p in EVERYTHING)]
+    named = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    return [name for name in named if name.endswith(".py")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run mutants and print those that survive; 1 if one of them is not known to be harmless."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("file", nargs="*", help="files to change")
+    parser.add_argument("--all", action="store_true", help="change everything in which a number is a result")
+    parser.add_argument("--since", default="HEAD~1", help="change what differs from this commit; the last by default")
+    parser.add_argument("--sample", type=int, help="how many places to change; all by default")
+    parser.add_argument("--seed", type=int, default=0, help="which places, and how")
+    asked = parser.parse_args(arguments)
+    every = sorted(str(path.relative_to(ROOT)) for pattern in EVERYTHING for path in ROOT.glob(pattern))
+    files = asked.file or (every if asked.all else _changed_files(asked.since))
+    known = {(one["file"], one["was"], one["now"]): one["why"] for one in tomllib.loads(HARMLESS.read_text())["mutant"]}
+    survived, harmless, untested = [], 0, []
+    with tempfile.TemporaryDirectory(prefix="doedesign-mutants-") as folder:
+        tree = Path(folder)
+        for name in _COPIED:
+            source = ROOT / name
+            (shutil.copytree if source.is_dir() else shutil.copy2)(source, tree / name)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(tree / "compiled"))
+        limits: dict[str, float] = {}
+        picked = chosen(files, asked.sample, asked.seed)
+        print(f"{len(picked)} mutants of {len({m.file for m in picked})} files, seed {asked.seed}", flush=True)
+        for number, mutant in enumerate(picked, 1):
+            if mutant.file not in limits:
+                tests, began = tests_for(mutant.file), time.monotonic()
+                if tests and not _passes(tree, tests, 1800.0):
+                    raise SystemExit(f"the tests of {mutant.file} fail as it is: {', '.join(tests)}")
+                limits[mutant.file] = 30.0 + 3 * (time.monotonic() - began)
+            if not tests_for(mutant.file):
+                untested.append(mutant)
+                print(f"{number}: no test is meant for {mutant}", flush=True)
+            elif not survives(mutant, tree, limits[mutant.file]):
+                print(f"{number}: killed {mutant}", flush=True)
+            elif why := known.get((mutant.file, mutant.was, mutant.now)):
+                harmless += 1
+                print(f"{number}: harmless, {why} {mutant}", flush=True)
+            else:
+                survived.append(mutant)
+                print(f"{number}: SURVIVED {mutant}", flush=True)
+    lost = len(survived) + len(untested)
+    print(f"\n{len(picked) - lost - harmless} killed, {harmless} harmless, {len(survived)} survived", end="")
+    print(f", {len(untested)} without a test" if untested else "")
+    for mutant in survived + untested:
+        print(mutant)
+    return 1 if lost else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
