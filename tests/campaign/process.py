@@ -150,7 +150,11 @@ def _serve(pipe: Connection, said: Path) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_DATA, (_DATA_BYTES, resource.RLIM_INFINITY))
     sys.addaudithook(_watch)
+    parent = multiprocessing.parent_process()
     while True:
+        while not pipe.poll(2.0):
+            if parent is None or not parent.is_alive():
+                return
         try:
             job = pipe.recv()
         except EOFError:

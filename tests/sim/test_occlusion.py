@@ -1,6 +1,7 @@
 """Occlusion models on numbers that can be computed by hand: imaging that moves no light."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,10 +20,10 @@ class Plain:
     def __init__(self, *energies: float) -> None:
         self.energies = energies
 
-    def one(self, layer: int, light, unit: bool):
+    def one(self, layer: int, light: Any, unit: bool) -> Any:
         return light * (1.0 if unit else self.energies[layer])
 
-    def total(self, lights: Sequence):
+    def total(self, lights: Sequence) -> Any:
         return sum(energy * light for energy, light in zip(self.energies, lights, strict=True))
 
 
