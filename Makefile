@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 PINS := constraints.txt
 FORMATTED := doedesign fab sim tests bench examples
 
-.PHONY: demo train-demo test test-slow campaign lint bench clean
+.PHONY: demo train-demo test test-slow campaign mutants lint bench clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.base
@@ -28,6 +28,10 @@ test-slow: $(VENV)/.dev
 # Minutes; hours with a count: make campaign CAMPAIGN="kills mutations --count 10000"
 campaign: $(VENV)/.dev
 	$(BIN)/python -m tests.campaign $(CAMPAIGN)
+
+# Of what changed since the last commit; of everything: make mutants MUTANTS="--all --sample 500"
+mutants: $(VENV)/.dev
+	$(BIN)/python -m tests.mutants $(MUTANTS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check $(FORMATTED)

@@ -21,7 +21,7 @@ import tempfile
 import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,8 +44,17 @@ _COPIED = ("doedesign", "fab", "sim", "tests", "bench", "examples", "masks", "py
 _COPIED += ("CONTRIBUTING.md", "Makefile", "constraints.txt")
 
 
+class Change(NamedTuple):
+    """A way to change a place: an operator of Cosmic Ray and which of its places in the file it is."""
+
+    file: str
+    line: int
+    operator: Any
+    occurrence: int
+
+
 class Mutant(NamedTuple):
-    """One change of one file; lines are without the space around them."""
+    """A changed file; the lines that differ are without the space around them."""
 
     file: str
     line: int
@@ -57,28 +66,28 @@ class Mutant(NamedTuple):
         return f"{self.file}:{self.line}\n    - {self.was}\n    + {self.now}"
 
 
-def mutants(file: str) -> Iterator[list[Mutant]]:
+def places(file: str) -> list[list[Change]]:
     """Every place of a file that can be changed, with its changes. Annotations are left alone."""
     code = (ROOT / file).read_text("utf-8")
-    tree, notes = get_ast(code), _annotations(code)
-    places: dict[tuple[int, int], list[tuple[Any, int]]] = defaultdict(list)
+    nodes, notes = list(ast_nodes(get_ast(code))), _annotations(code)
+    found: dict[tuple[int, int], list[Change]] = defaultdict(list)
     for name in operator_names():
         kind: Any = get_operator(name)
         if kind.arguments():
             continue
-        found = [at for node in ast_nodes(tree) for at in kind().mutation_positions(node)]
-        for occurrence, (start, _) in enumerate(found):
+        for occurrence, (start, _) in enumerate(at for node in nodes for at in kind().mutation_positions(node)):
             if not any(first <= start < last for first, last in notes):
-                places[start].append((kind(), occurrence))
-    for (line, _), changes in sorted(places.items()):
-        made = [(line, mutate_code(code, operator, occurrence)) for operator, occurrence in changes]
-        yield [mutant for line, new in made if new is not None for mutant in _mutant(file, line, code, new)]
+                found[start].append(Change(file, start[0], kind(), occurrence))
+    return [changes for _, changes in sorted(found.items())]
 
 
-def _mutant(file: str, line: int, code: str, new: str) -> list[Mutant]:
+def mutant_of(change: Change) -> Mutant:
+    """Make a change."""
+    code = (ROOT / change.file).read_text("utf-8")
+    new = mutate_code(code, change.operator, change.occurrence) or code
     pairs = zip(code.splitlines(), new.splitlines(), strict=False)
     was, now = next(((a, b) for a, b in pairs if a != b), ("", ""))
-    return [Mutant(file, line, was.strip(), now.strip(), new)] if was != now else []
+    return Mutant(change.file, change.line, was.strip(), now.strip(), new)
 
 
 def _annotations(code: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -133,10 +142,10 @@ def _passes(tree: Path, tests: Sequence[str], limit_s: float) -> bool:
 def chosen(files: Sequence[str], count: int | None, seed: int) -> list[Mutant]:
     """Mutants of files: one for each place, or for `count` random places, with a random change."""
     rng = np.random.default_rng(seed)
-    places = [changes for file in files for changes in mutants(file) if changes]
-    if count is not None and count < len(places):
-        places = [places[k] for k in sorted(rng.choice(len(places), count, replace=False))]
-    return [changes[rng.integers(len(changes))] for changes in places]
+    every = [changes for file in files for changes in places(file)]
+    if count is not None and count < len(every):
+        every = [every[k] for k in sorted(rng.choice(len(every), count, replace=False))]
+    return [mutant_of(changes[rng.integers(len(changes))]) for changes in every]
 
 
 def _changed_files(since: str) -> list[str]:

@@ -22,10 +22,23 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.campaign.families import FAMILIES
 from tests.campaign.field import Field, clear
+from tests.campaign.full_disk import FULL_DISK
 from tests.campaign.ground import Ground
+from tests.campaign.kills import KILLS, SIGNALLED
+from tests.campaign.mutations import MUTATIONS
+from tests.campaign.orders import BOMBS
 from tests.campaign.process import Worker
+from tests.campaign.two_processes import TWO_PROCESSES
+
+FAMILIES = {
+    "kills": KILLS,
+    "signals": SIGNALLED,
+    "full_disk": FULL_DISK,
+    "two_processes": TWO_PROCESSES,
+    "mutations": MUTATIONS,
+    "bombs": BOMBS,
+}
 
 
 class Result(NamedTuple):

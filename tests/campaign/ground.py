@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -99,6 +100,7 @@ class Ground:
 
     def __init__(self, folder: Path, worker: Worker) -> None:
         self.folder, self.worker = folder, worker
+        self._lock = threading.Lock()
         self._contents: dict[str, dict[str, bytes]] = {}
         if not (folder / "made").exists():
             self._make()
@@ -160,11 +162,12 @@ class Ground:
         """The folder after the undisturbed command, and how that ended; computed at the first call."""
         place = self.folder / "whole" / name
         ended = place / "end.json"
-        if not ended.exists():
-            for _ in range(2):  # the second time everything is compiled
+        with self._lock:
+            if not ended.exists():
                 self.lay(name, place)
-                end = self._run(place, *COMMANDS[name].arguments)
-                ended.write_text(json.dumps(end))
+                self._run(place, *COMMANDS[name].arguments)  # everything is compiled from here on
+                self.lay(name, place)
+                ended.write_text(json.dumps(self._run(place, *COMMANDS[name].arguments)))
         *rest, calls, read = json.loads(ended.read_text())
         return place / "work", End(*rest, calls=tuple(calls), read=tuple(read))
 

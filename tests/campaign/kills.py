@@ -1,4 +1,7 @@
-"""kill -9, and the same command again: at a random moment, or in the middle of a random call that changes the disk."""
+"""kill -9, SIGINT, SIGTERM and SIGHUP, then the same command again.
+
+They come at a random moment, or in the middle of a random call that changes the disk.
+"""
 
 import signal
 from collections.abc import Iterator
@@ -7,6 +10,7 @@ import numpy as np
 
 from tests.campaign.field import Family, Field, disturbed
 from tests.campaign.ground import COMMANDS, Ground
+from tests.campaign.process import SIGNALS
 from tests.campaign.shim import Fault
 
 WRITING = tuple(name for name, command in COMMANDS.items() if command.writes is not None)
@@ -24,12 +28,12 @@ def moments(ground: Ground, seed: int, count: int) -> Iterator[tuple[str, str]]:
             yield name, f"after={rng.uniform(0, 1.1 * end.wall_s):.3f}"
 
 
-def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
+def _kills(ground: Ground, seed: int, count: int) -> Iterator[str]:
     for name, moment in moments(ground, seed, count):
         yield f"{name}:{moment}"
 
 
-def _problems(field: Field, case: str) -> list[str]:
+def _killed(field: Field, case: str) -> list[str]:
     name, moment = case.split(":")
     kind, _, value = moment.partition("=")
     killed = (-signal.SIGKILL,)
@@ -38,4 +42,20 @@ def _problems(field: Field, case: str) -> list[str]:
     return disturbed(field, name, Fault(), killed, kill_after_s=float(value))
 
 
-KILLS = Family("kill -9, then the same command again", 40, _cases, _problems)
+KILLS = Family("kill -9, then the same command again", 40, _kills, _killed)
+
+
+def _signals(ground: Ground, seed: int, count: int) -> Iterator[str]:
+    rng = np.random.default_rng(seed)
+    for name, moment in moments(ground, seed, count):
+        yield f"{name}:{SIGNALS[rng.integers(len(SIGNALS))].name}:{moment}"
+
+
+def _signalled(field: Field, case: str) -> list[str]:
+    name, number, moment = case.split(":")
+    kind, _, value = moment.partition("=")
+    fault = Fault(call=int(value)) if kind == "call" else Fault(after_s=float(value))
+    return disturbed(field, name, fault._replace(number=signal.Signals[number]), (130,), words="interrupted")
+
+
+SIGNALLED = Family("Ctrl-C, kill and a closed terminal, then the same command again", 40, _signals, _signalled)

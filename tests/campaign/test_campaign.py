@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaign.__main__ import Campaign, table
-from tests.campaign.families import FAMILIES
+from tests.campaign.__main__ import FAMILIES, Campaign, table
 from tests.campaign.field import Field, disturbed, said_badly
 from tests.campaign.process import End
 from tests.campaign.shim import Fault, shimmed

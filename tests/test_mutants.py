@@ -1,0 +1,32 @@
+"""Mutants: what is changed, which tests are meant for a file, and the list of those that harm nothing."""
+
+import tomllib
+
+from tests.mutants import HARMLESS, ROOT, chosen, mutant_of, places
+from tests.mutants import tests_for as meant_for
+
+
+def test_tests_are_found_by_name_first_and_by_what_they_import():
+    found = meant_for("sim/noise.py")
+    assert "tests/sim/test_noise.py" in found[:2]
+    assert all((ROOT / test).is_file() for test in found)
+    assert meant_for("doedesign/design/patterns.py") == ["tests/doedesign/test_objectives.py"]
+
+
+def test_a_place_is_changed_in_every_way_and_annotations_are_left_alone():
+    file = "doedesign/runs/results.py"
+    found = [mutant_of(change) for changes in places(file) for change in changes]
+    lines = (ROOT / file).read_text().splitlines()
+    assert found
+    assert all(mutant.was in lines[mutant.line - 1] for mutant in found)
+    assert not any(mutant.was.startswith("def ") and "| None" in mutant.was for mutant in found)
+    assert len({mutant.code for mutant in found}) == len(found)
+    assert [mutant.code for mutant in chosen([file], 2, 5)] == [mutant.code for mutant in chosen([file], 2, 5)]
+
+
+def test_what_is_harmless_is_still_there_and_says_why():
+    for mutant in tomllib.loads(HARMLESS.read_text())["mutant"]:
+        lines = [line.strip() for line in (ROOT / mutant["file"]).read_text().splitlines()]
+        assert mutant["was"] in lines, mutant
+        assert mutant["was"] != mutant["now"]
+        assert len(mutant["why"]) > 20
