@@ -128,7 +128,7 @@ def _resume(
     parameters = first_parameters(run.spec, jnp.zeros(problem.optic.shape, jnp.float32))
     template = jax.eval_shape(lambda: (parameters, optimiser_of(run.spec).init(parameters)))
     leaves, tree = jax.tree.flatten(template)
-    stored = load_checkpoint(run, [leaf.shape for leaf in leaves])
+    stored = load_checkpoint(run, leaves)
     if stored is None:
         log.info(f'starting from "{run.spec.optimize.start}"')
         return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []

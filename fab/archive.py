@@ -46,13 +46,15 @@ def read_archive(path: Path, what: str, cure: str) -> tuple[dict[str, Any], dict
             raw = {each.filename.removesuffix(".npy"): archive.read(each) for each in _members(archive, len(data))}
         arrays = {name: np.lib.format.read_array(io.BytesIO(each), allow_pickle=False) for name, each in raw.items()}
         header = json.loads(arrays.pop(_HEADER).tobytes()) if _HEADER in arrays else None
+        stated = header.pop(_DIGEST, None) if isinstance(header, dict) else None
+        found = _digest(header, arrays) if isinstance(header, dict) else None
     # What a damaged archive raises depends on where the damage is.
     except Exception as error:
         got = f'"{error}"' if str(error) else type(error).__name__
         raise InputError(str(path), rule, got, cure) from error
     if not isinstance(header, dict):
         raise InputError(str(path), rule, "another archive, without a header", cure)
-    if header.pop(_DIGEST, None) != _digest(header, arrays):
+    if stated != found:
         raise InputError(str(path), rule, "a file changed since it was written", cure)
     return header, arrays
 
@@ -69,6 +71,8 @@ def _digest(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """SHA-256 over the header, then over names, kinds, shapes and numbers of the arrays in their order."""
     digest = hashlib.sha256(canonical_json(header))
     for name, array in arrays.items():
+        if array.dtype.kind not in "biufc":
+            raise TypeError(f"{name} holds {array.dtype}, which is no kind of number")
         digest.update(canonical_json([name, array.dtype.str, list(array.shape)]))
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -1,6 +1,28 @@
 """The two errors that a caller is expected to catch; everything else is a defect."""
 
+import unicodedata
 from collections.abc import Sequence
+
+# Control characters (an escape begins a terminal's command), marks that turn the direction of text, bytes that are no
+# text, and ends of lines.
+_NOT_SHOWN = ("Cc", "Cf", "Cs", "Zl", "Zp")
+_LONGEST = 1000
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return text as a terminal may show it: what would move the cursor or hide something is written as an escape."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in _NOT_SHOWN and c not in keep else c
+        for c in text
+    )
+
+
+def _short(got: object) -> str:
+    """Return a value as a message shows it: of a long one, its beginning."""
+    text = str(got)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
 class InputError(ValueError):
@@ -19,7 +41,7 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         """Return the one-line message that the command line prints."""
-        return f"{self.where}: {self.rule}, but got {self.got}. {self.cure}"
+        return printable(f"{self.where}: {self.rule}, but got {_short(self.got)}. {self.cure}")
 
 
 class CheckFailed(Exception):
@@ -31,4 +53,4 @@ class CheckFailed(Exception):
 
     def __str__(self) -> str:
         """Return the differences, one per line."""
-        return "\n".join(self.differences)
+        return "\n".join(map(printable, self.differences))

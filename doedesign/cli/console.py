@@ -13,12 +13,12 @@ from cyclopts import CycloptsError
 
 from doedesign.cli.options import in_options
 from doedesign.runtime.stopping import interruptible
-from fab.errors import CheckFailed, InputError
+from fab.errors import CheckFailed, InputError, printable
 
 
 def say(text: str) -> None:
     """Print a message to stderr."""
-    print(text, file=sys.stderr, flush=True)
+    print(printable(text, "\n"), file=sys.stderr, flush=True)
 
 
 class _Stderr(logging.Handler):
@@ -51,7 +51,7 @@ def print_text(text: str) -> None:
     """Print a result; what the terminal's encoding lacks is escaped."""
     encoding = sys.stdout.encoding or "utf-8"
     try:
-        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+        print(printable(text, "\n\t").encode(encoding, "backslashreplace").decode(encoding), flush=True)
     except OSError as error:
         # What could not be printed would be tried again, and fail again, when Python ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -62,7 +62,7 @@ def print_text(text: str) -> None:
 def print_paths(paths: Sequence[Path], as_json: bool, **more: Any) -> None:
     """Print paths, or JSON with what else there is to say."""
     names = [str(path) for path in paths]
-    print_text(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(names))
+    print_text(json.dumps({"paths": names, **more}, sort_keys=True) if as_json else "\n".join(map(printable, names)))
 
 
 def print_results(folder: Path, as_json: bool, **more: Any) -> None:

@@ -17,16 +17,16 @@ Anything else that JSON can say may stand beside them: digests of spec and desig
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from doedesign.recon.network import Network, NetworkShape
+from doedesign.recon.network import Network, NetworkShape, Variant
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from sim.camera import Camera
@@ -78,9 +78,8 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
     if header.get("format") != FORMAT:
         cure = "Give the network.npz of a training or of a released model, written by this version."
         raise InputError(str(path), f'the format must be "{FORMAT}"', repr(header.get("format")), cure)
-    said: Any = header.get("layout")
     try:
-        layout = NetworkShape(**said)
+        layout = _layout(header.get("layout"), sum(array.size for array in arrays.values()))
     except (TypeError, ValueError) as error:
         rule, cure = "the layout must be one that this version knows", "Use the version that wrote it."
         raise InputError(str(path), rule, f'"{error}"', cure) from error
@@ -88,6 +87,20 @@ def read_network(path: str | Path) -> tuple[Network, dict[str, Any]]:
     if not isinstance(about, dict):
         raise InputError(str(path), "must say what it is about", repr(about), _CURE)
     return _filled(path, layout, arrays), about
+
+
+def _layout(said: Any, weights: int) -> NetworkShape:
+    """The layout that a file says, for so many weights; a TypeError or ValueError if it cannot be."""
+    layout = NetworkShape(**said)
+    for field in fields(layout):
+        if type(value := getattr(layout, field.name)) is not type(field.default):
+            raise TypeError(f"{field.name} is {value!r}")
+    if layout.variant not in get_args(Variant):
+        raise ValueError(f"variant is {layout.variant!r}")
+    # A network to compare with is made before anything else, and must not be larger than the file.
+    if layout.width**2 > weights:
+        raise ValueError(f"a width of {layout.width} for {weights} weights")
+    return layout
 
 
 def _named(tree: Any) -> dict[str, Any]:

@@ -296,18 +296,34 @@ def save_checkpoint(run: Run, arrays: Sequence[np.ndarray], step: int, history: 
     write_archive(run.path(CHECKPOINT), header, {f"array{i}": array for i, array in enumerate(arrays)})
 
 
-def load_checkpoint(
-    run: Run, shapes: Sequence[tuple[int, ...]]
-) -> tuple[list[np.ndarray], int, list[dict[str, Any]]] | None:
-    """Return what `save_checkpoint` stored, or None if there is no checkpoint yet."""
+def load_checkpoint(run: Run, like: Sequence[Any]) -> tuple[list[np.ndarray], int, list[dict[str, Any]]] | None:
+    """Return what `save_checkpoint` stored, or None if there is no checkpoint yet.
+
+    Raises:
+        InputError: the file is damaged, or its arrays have other shapes or kinds of number than those of `like`.
+    """
     path = run.path(CHECKPOINT)
     if not path.exists():
         return None
     cure = f"Remove {path.name} to start this run again from the beginning."
     header, arrays = read_archive(path, "checkpoint", cure)
-    if header.get("spec") != spec_digest(run.spec) or [a.shape for a in arrays.values()] != list(shapes):
+    kinds, wanted = ([(tuple(a.shape), str(a.dtype)) for a in each] for each in (arrays.values(), like))
+    if header.get("spec") != spec_digest(run.spec) or kinds != wanted:
         raise InputError(str(path), "must belong to this run's spec", "a checkpoint of another spec", cure)
-    return list(arrays.values()), header["step"], header["history"]
+    step, history = header.get("step"), header.get("history")
+    if type(step) is not int or not (isinstance(history, list) and all(map(_is_record, history))):
+        raise InputError(str(path), "must hold a number of steps and a record of each", "others", cure)
+    return list(arrays.values()), step, history
+
+
+def _is_record(value: Any) -> bool:
+    """Whether a value is the record of a step: its number, its loss, the terms and their names, as far as there are."""
+    if not isinstance(value, dict):
+        return False
+    terms, names = value.get("terms", []), value.get("names", [])
+    numbers = [value.get("step"), value.get("loss"), *(terms if isinstance(terms, list) else [None])]
+    texts = names if isinstance(names, list) else [None]
+    return all(type(n) in (int, float) for n in numbers) and all(isinstance(name, str) for name in texts)
 
 
 def write_history(run: Run, history: Sequence[Mapping[str, Any]]) -> None:

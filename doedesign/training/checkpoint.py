@@ -64,7 +64,11 @@ def read_checkpoint(path: Path, like: _State, owner: str) -> tuple[_State, int] 
     cure = f"Remove {path.name} to start this training again from the beginning."
     header, arrays = read_archive(path, "checkpoint", cure)
     expected = [[name, list(array.shape), array.dtype.name] for name, array in _leaves(like)]
-    if (header.get("format"), header.get("owner"), header.get("arrays")) != (FORMAT, owner, expected):
+    # What the header says of the arrays, and what they are.
+    wanted = [(array.shape, array.dtype) for array in (_plain(array) for _, array in _leaves(like))]
+    same = [(array.shape, array.dtype) for array in arrays.values()] == wanted
+    said = (header.get("format"), header.get("owner"), header.get("arrays"))
+    if said != (FORMAT, owner, expected) or not same or type(header.get("step")) is not int:
         raise InputError(str(path), "must belong to this training", "a checkpoint of another one", cure)
     return _rebuilt(like, list(arrays.values())), header["step"]
 

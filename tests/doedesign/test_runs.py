@@ -5,6 +5,7 @@ import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from doedesign.runs.folder import (
     write_history,
 )
 from doedesign.spec import Spec, load_spec
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import sha256_file
 
@@ -209,14 +211,13 @@ def test_input_digests_name_a_missing_file(tmp_path: Path):
 
 
 ARRAYS = [np.arange(12, dtype=np.float32).reshape(3, 4), np.array(7, np.int32), np.linspace(0, 1, 5, dtype=np.float32)]
-SHAPES = [(3, 4), (), (5,)]
 HISTORY = [{"step": 0, "loss": 0.1}, {"step": 1, "loss": 1e-300}]
 
 
 def test_checkpoint_round_trip(run: Run):
-    assert load_checkpoint(run, SHAPES) is None
+    assert load_checkpoint(run, ARRAYS) is None
     save_checkpoint(run, ARRAYS, 2, HISTORY)
-    stored = load_checkpoint(run, SHAPES)
+    stored = load_checkpoint(run, ARRAYS)
     assert stored is not None
     arrays, step, history = stored
     assert step == 2
@@ -235,12 +236,33 @@ def test_equal_checkpoints_have_equal_bytes(run: Run):
 
 def test_a_checkpoint_of_something_else(run: Run):
     save_checkpoint(run, ARRAYS, 2, HISTORY)
-    for shapes in ([(3, 4), (), (6,)], [(4, 3), (), (5,)], [*SHAPES, ()]):
+    first, second, third = ARRAYS
+    others = (
+        [first, second, third[:4]],
+        [first.T, second, third],
+        [*ARRAYS, second],
+        [first.astype(float), second, third],
+    )
+    for like in others:
         with pytest.raises(InputError, match=CHECKPOINT):
-            load_checkpoint(run, shapes)
+            load_checkpoint(run, like)
     other = Run(run.folder, load_spec(QUICK, ["optimize.seed=2"]), done=False)
     with pytest.raises(InputError, match="another spec"):
-        load_checkpoint(other, SHAPES)
+        load_checkpoint(other, ARRAYS)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [{"step": "2"}, {"step": True}, {"step": None}, {"history": 3}, {"history": [1]}, {"history": [{"step": 0}]},
+     {"history": [{"step": 0, "loss": "x"}]}, {"history": [{"step": 0, "loss": 1.0, "terms": "x"}]}],
+)  # fmt: skip
+def test_a_checkpoint_that_was_sealed_again_with_other_content_is_refused(run: Run, header: dict[str, Any]):
+    save_checkpoint(run, ARRAYS, 2, HISTORY)
+    path = run.path(CHECKPOINT)
+    before, arrays = read_archive(path, "checkpoint", "")
+    write_archive(path, {**before, **header}, arrays)
+    with pytest.raises(InputError, match="must hold a number of steps and a record of each"):
+        load_checkpoint(run, ARRAYS)
 
 
 def test_damage_is_found_or_harmless(run: Run):
@@ -256,7 +278,7 @@ def test_damage_is_found_or_harmless(run: Run):
     for data in damaged:
         run.path(CHECKPOINT).write_bytes(data)
         try:
-            stored = load_checkpoint(run, SHAPES)
+            stored = load_checkpoint(run, ARRAYS)
         except InputError as error:
             refused += error.cure.startswith(f"Remove {CHECKPOINT}")
             continue
@@ -279,8 +301,8 @@ def test_a_checkpoint_is_never_unpickled(run: Run, tmp_path: Path):
     bomb = Bomb(tmp_path / "exploded")
     run.path(CHECKPOINT).write_bytes(pickle.dumps(bomb))
     with pytest.raises(InputError, match="whole checkpoint"):
-        load_checkpoint(run, SHAPES)
+        load_checkpoint(run, ARRAYS)
     np.savez(run.path(CHECKPOINT), allow_pickle=True, array0=np.array([bomb], dtype=object))
     with pytest.raises(InputError, match="whole checkpoint"):
-        load_checkpoint(run, SHAPES)
+        load_checkpoint(run, ARRAYS)
     assert not (tmp_path / "exploded").exists()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from doedesign.training.checkpoint import read_checkpoint, settled, write_checkpoint
+from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 
 
@@ -88,6 +89,24 @@ def test_what_is_of_another_training(path: Path):
         with pytest.raises(InputError, match="another one") as caught:
             read_checkpoint(path, like, owner)
         assert caught.value.cure.startswith("Remove checkpoint.npz")
+
+
+@pytest.mark.parametrize("change", ["dtype", "shape", "fewer", "text", "step", "nan"])
+def test_a_checkpoint_that_was_sealed_again_with_other_content_is_refused(path: Path, change: str):
+    write_checkpoint(path, state(0), 12, "me")
+    header, arrays = read_archive(path, "checkpoint", "")
+    name = next(iter(arrays))
+    first = {"dtype": arrays[name].astype(np.complex64), "shape": np.zeros((9, 9)), "text": np.array("text")}
+    if change == "nan":  # JSON of its own that names a number which JSON does not have
+        path.write_bytes(path.read_bytes().replace(b'"step": 12', b'"step":NaN'))
+    elif change == "text":
+        np.savez(path, header=np.frombuffer(b'{"sha256": ""}', np.uint8), **{**arrays, name: first[change]})
+    else:
+        arrays = {**arrays, name: first.get(change, arrays[name])}
+        arrays = dict(list(arrays.items())[1:]) if change == "fewer" else arrays
+        write_archive(path, {**header, "step": "12"} if change == "step" else header, arrays)
+    with pytest.raises(InputError, match=r"checkpoint.*Remove checkpoint\.npz"):
+        read_checkpoint(path, state(1), "me")
 
 
 def test_damage_is_found_or_harmless(path: Path):

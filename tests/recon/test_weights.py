@@ -198,3 +198,13 @@ def test_a_change_without_a_new_digest_is_refused(path: Path):
     np.savez(path, **arrays)
     with pytest.raises(InputError, match="a file changed since"):
         read_network(path)
+
+
+@pytest.mark.parametrize(
+    "said", [{"width": 12.0}, {"width": "12"}, {"wiener": 1}, {"variant": "x"}, {"width": 3 << 20}]
+)
+def test_a_layout_that_was_sealed_again_is_refused_before_anything_is_made(path: Path, said: dict[str, object]):
+    header, arrays = read_archive(path, "network file", "")
+    write_archive(path, {**header, "layout": {**header["layout"], **said}}, arrays)
+    with pytest.raises(InputError, match=f"the layout must be one that this version knows.*{next(iter(said))}"):
+        read_network(path)
