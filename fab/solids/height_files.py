@@ -26,7 +26,7 @@ from fab.levels import Levels
 from fab.manifest.records import ModelEntry
 from fab.pictures import read_pixels, write_pixels
 from fab.solids.columns import PixelWindow, whole
-from fab.solids.model import DoeModel, ModelKind, model_entry, window_of
+from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.units import MM, format_length
 
 # OpticStudio's manual asks for this many points along either axis.
@@ -34,7 +34,6 @@ _FEWEST_ZEMAX = 5
 _SAG_CELLS = 500
 _ROWS = 256
 
-_Write = Callable[[Path, LevelMap], float]
 _Read = Callable[[Path], NDArray[Any]]
 
 
@@ -100,6 +99,17 @@ def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 
     return scale_m
 
 
+def _sag_lines(levels: Levels, side: Literal["exit", "entry"] = "exit") -> list[str]:
+    """Return the line of a point of every level."""
+    heights = levels.heights_m()
+    sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
+    lines = [f"{sag + 0.0:12.9f} 0 0 0 0\r\n" for sag in sag_mm]  # + 0.0: no minus before a zero
+    if len({len(line) for line in lines}) != 1:  # pragma: no cover - a relief deeper than a centimetre
+        deepest = format_length(heights.max())
+        raise InputError("grid sag", "the relief must be less than 10 mm deep", deepest, "Check it.")
+    return lines
+
+
 def write_zemax_sag(
     path: str | Path, level_map: LevelMap, window: PixelWindow | None = None, side: Literal["exit", "entry"] = "exit"
 ) -> None:
@@ -118,13 +128,8 @@ def write_zemax_sag(
     if min(window.rows, window.columns) < _FEWEST_ZEMAX:
         rule = f"OpticStudio needs at least {_FEWEST_ZEMAX} points along either axis"
         raise InputError("grid sag", rule, f"{window.rows} x {window.columns}", "Choose a larger window.")
-    heights = level_map.levels.heights_m()
-    sag_mm = (heights - heights.max()) / MM * (1 if side == "exit" else -1)
-    lines = [f"{sag + 0.0:12.9f} 0 0 0 0\r\n".encode() for sag in sag_mm]  # + 0.0: no minus before a zero
-    if len({len(line) for line in lines}) != 1:  # pragma: no cover - a relief deeper than a centimetre
-        deepest = format_length(heights.max())
-        raise InputError("grid sag", "the relief must be less than 10 mm deep", deepest, "Check it.")
-    table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(heights.size, -1)
+    lines = _sag_lines(level_map.levels, side)
+    table = np.frombuffer("".join(lines).encode(), dtype=np.uint8).reshape(len(lines), -1)
     x_mm, y_mm = (value / MM for value in window.centre_m(grid))
     pitch_mm = f"{grid.pitch_m / MM:.12g}"
     header = f"{window.columns} {window.rows} {pitch_mm} {pitch_mm} 0 {x_mm:.12g} {y_mm:.12g}\r\n"
@@ -155,25 +160,41 @@ def _write_sag(path: Path, model: DoeModel) -> None:
     write_zemax_sag(path, model.level_map, _window(model.level_map))
 
 
-def _problems(path: Path, entry: ModelEntry, model: DoeModel, read: Callable[[Path], NDArray[Any]]) -> list[str]:
-    level_map = model.level_map
-    window, per_count = window_of(entry) or whole(level_map.grid), entry.metres_per_count or 1.0
+def _problems(
+    path: Path, _: ModelEntry, model: DoeModel, read: _Read, counts: Callable[[Levels], tuple[NDArray[Any], float]]
+) -> list[str]:
+    """Compare every height with that of its level, exactly."""
+    wanted = counts(model.level_map.levels)[0][model.level_map.level]
     try:
-        found = read(path) * per_count
+        found = read(path)
     # Each library raises what it likes on a damaged file.
     except Exception as error:
         return [f"it cannot be read: {error}"]
-    wanted = level_map.levels.heights_m()[window.cut(level_map.level)]
-    problems = []
-    if path.suffix == ".DAT":
-        wanted = wanted - level_map.levels.total_m
-        problems = _header_problems(path, level_map, window)
     if found.shape != wanted.shape:
-        return [*problems, f"{found.shape} heights instead of {wanted.shape}"]
-    # Grey values are rounded to half a count; text and floating point to far less.
-    most = 0.5001 * per_count if path.suffix in (".png", ".tif") else 1e-12
-    wrong = int(np.count_nonzero(np.abs(found - wanted) > most))
-    return [*problems, f"{wrong} heights differ from the level map"] if wrong else problems
+        return [f"{found.shape} heights instead of {wanted.shape}"]
+    wrong = int(np.count_nonzero(found != wanted))
+    return [f"{wrong} heights differ from the level map"] if wrong else []
+
+
+def _sag_problems(path: Path, _: ModelEntry, model: DoeModel) -> list[str]:
+    """Compare the header and every point with all its derivatives."""
+    level_map, window = model.level_map, _window(model.level_map)
+    if window is None:
+        return ["the map has too few pixels for it"]
+    try:
+        problems = _header_problems(path, level_map, window)
+        found = _read_sag(path)
+    except (ValueError, IndexError) as error:
+        return [f"it cannot be read: {error}"]
+    wanted = np.array([float(line.split()[0]) for line in _sag_lines(level_map.levels)])[window.cut(level_map.level)]
+    if found.shape[:2] != wanted.shape:
+        return [*problems, f"{found.shape[:2]} points instead of {wanted.shape}"]
+    for what, wrong in (
+        ("heights differ from the level map", found[..., 0] != wanted),
+        ("points have slopes or no data", found[..., 1:].any(axis=2)),
+    ):
+        problems += [f"{int(np.count_nonzero(wrong))} {what}"] if wrong.any() else []
+    return problems
 
 
 def _header_problems(path: Path, level_map: LevelMap, window: PixelWindow) -> list[str]:
@@ -189,30 +210,35 @@ def _header_problems(path: Path, level_map: LevelMap, window: PixelWindow) -> li
 
 
 def _read_sag(path: Path) -> NDArray[np.float64]:
+    """Read the points ``[y, x, 5]``, row 0 at the lowest y: sag, three derivatives, and whether there are no data."""
     with open(path) as lines:
         columns, rows = (int(word) for word in lines.readline().split()[:2])
-        sag = np.loadtxt(lines, usecols=0)
+        points = np.loadtxt(lines, ndmin=2)
     # The first point is at the lowest x and the highest y.
-    return sag.reshape(rows, columns)[::-1]
+    return points.reshape(rows, columns, 5)[::-1]
 
 
-def _kind(ending: str, content: str, per_count: Callable[[Levels], float], write: _Write, read: _Read) -> ModelKind:
-    """Return the kind of a file that holds every height of the map, in counts of some metres."""
+def _kind(
+    ending: str,
+    content: str,
+    counts: Callable[[Levels], tuple[NDArray[Any], float]],
+    write: Callable[[Path, LevelMap], object],
+    read: _Read,
+) -> ModelKind:
+    """Return the kind of a file that holds every height of the map; `counts` are those of the levels, and their unit."""
     return ModelKind(
         ending,
-        lambda path, model: model_entry(path, content, metres_per_count=per_count(model.level_map.levels)),
+        lambda path, model: model_entry(path, content, metres_per_count=counts(model.level_map.levels)[1]),
         lambda path, model: write(path, model.level_map),
-        partial(_problems, read=read),
+        partial(_problems, read=read, counts=counts),
     )
 
 
 _FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
 _TOP_ROW = "first row at the highest y"
 KINDS = (
-    _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", lambda levels: _exact_scale(levels)[1], write_tiff, read_pixels),
-    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda _: 1.0, write_npy, read_npy),
-    _kind(
-        "_GREY.png", f"{_BLANK}, {_TOP_ROW}", lambda levels: _full_scale(levels, 65535)[1], write_greymap, read_pixels
-    ),
-    ModelKind("_SAG.DAT", _sag_entry, _write_sag, partial(_problems, read=_read_sag)),
+    _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", _exact_scale, write_tiff, read_pixels),
+    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda one: (one.heights_m(), 1.0), write_npy, read_npy),
+    _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", partial(_full_scale, top=65535), write_greymap, read_pixels),
+    ModelKind("_SAG.DAT", _sag_entry, _write_sag, _sag_problems),
 )

@@ -239,3 +239,27 @@ def closed_volume_m3(mesh: Mesh) -> float:
     if solid.status() != manifold3d.Error.NoError or not volume > 0:
         raise CheckFailed([f"mesh: not the skin of a solid ({solid.status().name}, volume {volume:g} um3)"])
     return volume * UM**3
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Whether every edge is run through as often one way as the other, vertices at one place being one.
+
+    Every edge gets a random number that depends on its two ends, and their sum, with the sign of the way, is taken: it
+    is 0 for a closed surface, and for any other but once in 2^64.
+    """
+    bits = (mesh.vertices_m + 0.0).view(np.uint64)  # + 0.0: no minus before a zero
+    ends = _mixed(bits[:, 0] + _mixed(bits[:, 1] + _mixed(bits[:, 2])))
+    total = 0
+    for start in range(0, len(mesh.triangles), _TOGETHER):
+        corners = ends[mesh.triangles[start : start + _TOGETHER]]
+        ahead = np.roll(corners, -1, axis=1)
+        edges = _mixed(np.minimum(corners, ahead) + _mixed(np.maximum(corners, ahead)))
+        total += int(np.sum(np.where(corners < ahead, edges, ~edges + np.uint64(1)), dtype=np.uint64))
+    return total % 2**64 == 0
+
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Scatter numbers over all of 64 bits (the finaliser of SplitMix64)."""
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))

@@ -12,7 +12,7 @@ import numpy as np
 
 from fab.manifest.records import ModelEntry
 from fab.solids.columns import BASE_M, Columns, reduced_cells, window_cells
-from fab.solids.mesh import Mesh
+from fab.solids.mesh import Mesh, is_closed
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
 from fab.solids.model import MESH_CELLS, DoeModel, MeshedRelief, ModelKind, model_entry, window_of
 from fab.solids.step_files import volume_problems
@@ -52,7 +52,34 @@ def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
     cells = reduced_cells(model.level_map, MESH_CELLS) if window is None else window_cells(model.level_map, window)
     most = _MOST_PER_CELL * cells.height_m.size + 1000
     mesh = read_mesh(path, "mm" if path.suffix == ".stl" else None, most)
-    return volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3}) + _top_problems(mesh, cells)
+    problems = volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3})
+    if not is_closed(mesh):
+        problems.append("its surface is not closed: an edge has not one triangle on either side")
+    return problems + _vertex_problems(mesh, cells) + _top_problems(mesh, cells)
+
+
+def _rounding_m(cells: Columns) -> float:
+    """Return how far numbers in the files may lie aside, metres: they are rounded to single precision or a picometre."""
+    far = max(np.abs(cells.x_edges_m).max(), np.abs(cells.y_edges_m).max())
+    return 1e-12 + _SINGLE * float(far)
+
+
+def _vertex_problems(mesh: Mesh, cells: Columns) -> list[str]:
+    """Check that every vertex lies on an edge of the columns along x and y, and at one of their heights or the base."""
+    high = 2e-12 + _SINGLE * (cells.blank_m + BASE_M)
+    tops = np.unique(cells.height_m) - cells.blank_m
+    places = (cells.x_edges_m, cells.y_edges_m, np.concatenate([[-cells.blank_m - BASE_M], tops]))
+    wrong = np.zeros(len(mesh.vertices_m), dtype=np.bool_)
+    for found, known, most in zip(
+        mesh.vertices_m.T, places, (_rounding_m(cells), _rounding_m(cells), high), strict=True
+    ):
+        after = np.clip(np.searchsorted(known, found), 1, len(known) - 1)
+        wrong |= np.minimum(np.abs(found - known[after - 1]), np.abs(found - known[after])) > most
+    count = int(np.count_nonzero(wrong))
+    if not count:
+        return []
+    place = ", ".join(f"{value / MM:.9g}" for value in mesh.vertices_m[int(np.argmax(wrong))])
+    return [f"{count} vertices lie on no edge or no height of the relief, the first at {place} mm"]
 
 
 def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
@@ -68,11 +95,10 @@ def _top_problems(mesh: Mesh, cells: Columns) -> list[str]:
     inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
     place = np.where(inside, row * shape[1] + column, 0)
     tops = np.stack([a[up, 2], b[up, 2], c[up, 2]], axis=1) - (cells.height_m - cells.blank_m).ravel()[place][:, None]
-    far = float(max(np.abs(cells.x_edges_m).max(), np.abs(cells.y_edges_m).max()))
     # Numbers in the files are rounded to single precision or to a picometre.
     level = np.abs(tops).max(axis=1) <= _SINGLE * max(1e-6, cells.blank_m) + 2e-12
     sound = np.bincount(place, weights=areas[up] * (inside & level), minlength=cells.height_m.size).reshape(shape)
-    rounding = 4 * (1e-12 + _SINGLE * far) / min(widths.min(), depths.min())
+    rounding = 4 * _rounding_m(cells) / min(widths.min(), depths.min())
     wrong = np.abs(sound / (depths[:, None] * widths) - 1) > rounding
     problems = []
     if wrong.any():
