@@ -2,25 +2,30 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from fab.figure import png_bytes
-from fab.files import canonical_json
+from fab.files import canonical_json, sha256_bytes
 from fab.layout.marks import alignment_site
 from fab.order.drawing import DrawnOrder
 from fab.order.form import form_csv, form_page, form_record
 from fab.order.recheck import drc_deck, layer_properties
+from fab.order.request import request_of
 from fab.runsheet.tables import Die, PhotomaskFile, RunSheet
 from fab.runsheet.write import record, run_sheet_page
 
 Paper = Callable[[], bytes]
 
 
-def papers(drawing: DrawnOrder, plates: Mapping[str, str], psfs: bytes | None = None) -> dict[str, Paper]:
+def papers(
+    drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[str, Any], psfs: bytes | None = None
+) -> dict[str, Paper]:
     """Return what makes the content of every paper of an order, by file name.
 
     Args:
         drawing: the order.
         plates: SHA-256 of the file of every photomask, by its name.
+        made_by: versions of the tools that made the order.
         psfs: PNG of the PSFs for the run sheet, if there is one.
     """
     order = drawing.order
@@ -39,7 +44,7 @@ def papers(drawing: DrawnOrder, plates: Mapping[str, str], psfs: bytes | None = 
         if not order.rules.clean:
             title = f"{stem}: where the masks break the rules of {order.process.name}"
             pictures["RULES.png"] = lambda: png_bytes(order.rules.plot(title=title))
-        content = record(run_sheet(drawing, plates))
+        content = record(run_sheet(drawing, plates, made_by))
         sheets["RUNSHEET.json"] = lambda: canonical_json(content)
         sheets["RUNSHEET.html"] = lambda: run_sheet_page(content, f"{stem}_RUNSHEET.json", shown())
     kept = {name: partial(drawing.kept, name, draw) for name, draw in pictures.items()}
@@ -66,8 +71,8 @@ def _marks(drawing: DrawnOrder) -> bytes:
     return png_bytes(plot_part(alignment_site(masks, drawing.order.dbu_m), masks, title))
 
 
-def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str]) -> RunSheet:
-    """Return the run sheet of an order; `plates` is the SHA-256 of the file of every photomask, by its name."""
+def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[str, Any]) -> RunSheet:
+    """Return the run sheet of an order (see `papers`)."""
     order, frame = drawing.order, drawing.frame
     moves = order.edge_moves()
     stems = {photomask.name: order.photomask_stem(photomask) for photomask in order.photomasks}
@@ -94,4 +99,5 @@ def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str]) -> RunSheet:
             for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
         ),
         predictions=None if order.light is None else order.light.predictions,
+        request_sha256=sha256_bytes(canonical_json([request_of(order), dict(made_by)])),
     )

@@ -82,8 +82,8 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
             map_check,
         ]
         level_map = asked.level_map
-        expected = Expected(wanted, drawing.model, level_map.planes(), pixel_edges(level_map.grid))
-        checks += check_files(folder, expected, intact)
+        expected = Expected(wanted, level_map.planes(), pixel_edges(level_map.grid))
+        checks += check_files(folder, expected, drawing.model, intact)
         checks += _paper_checks(folder, drawing, wanted)
     return VerificationReport(tuple(checks))
 
@@ -141,7 +141,7 @@ def _paper_checks(folder: Path, drawing: DrawnOrder, wanted: Manifest) -> list[C
     if order.light is not None:
         psfs = picture_of_digest(folder / f"{order.stem}_RUNSHEET.html", order.light.picture_sha256)
     checks = []
-    for name, make in papers(drawing, plates, psfs).items():
+    for name, make in papers(drawing, plates, wanted.tools, psfs).items():
         if (folder / name).is_file():
             question = "drawn again" if name.endswith(".png") else "written again"
             checks.append(Check(name, question, tuple(paper_problems(folder / name, make()))))

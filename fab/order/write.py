@@ -84,13 +84,14 @@ def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:
     plates = {
         f"{stem}.gds": sha256_file(folder / f"{stem}.gds") for stem in map(order.photomask_stem, order.photomasks)
     }
-    for name, content in papers(drawing, plates, seen and seen.picture).items():
+    made_by = tools()
+    for name, content in papers(drawing, plates, made_by, seen and seen.picture).items():
         write_atomic(folder / name, content())
     files = [
         replace(entry, bytes=(folder / entry.file).stat().st_size, sha256=sha256_file(folder / entry.file))
         for entry in file_entries(drawing, models)
     ]
-    return manifest_of(drawing, models, files, tools())
+    return manifest_of(drawing, models, files, made_by)
 
 
 def _require_own(folder: Path) -> None:

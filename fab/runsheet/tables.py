@@ -116,6 +116,7 @@ class RunSheet:
         chrome_m: thickness of the chrome, metres.
         deposition: how the chrome is laid down.
         predictions: what the lab should see; None if nothing is known about the light.
+        request_sha256: digest of what was asked for and of the tools that made it, which ties the sheet to its order.
 
     Raises:
         InputError: a photomask without a file, or etches that are not those of the process, in its order.
@@ -134,6 +135,7 @@ class RunSheet:
     chrome_m: float = 100 * NM
     deposition: Literal["evaporated", "sputtered"] = "evaporated"
     predictions: Predictions | None = None
+    request_sha256: str = ""
 
     def __post_init__(self) -> None:
         if missing := [photomask.name for photomask in self.photomasks if photomask.name not in self.files]:

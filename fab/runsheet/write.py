@@ -254,6 +254,7 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "format": FORMAT,
         "job": sheet.stem,
         "level_map_sha256": sheet.level_map.digest,
+        "request_sha256": sheet.request_sha256,
         "levels": sheet.level_map.levels.count,
         "aperture_mm": round(sheet.level_map.aperture_m / MM, 9),
         "opening_um": _um(sheet.opening_m),

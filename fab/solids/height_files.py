@@ -225,7 +225,7 @@ def _kind(
     write: Callable[[Path, LevelMap], object],
     read: _Read,
 ) -> ModelKind:
-    """Return the kind of a file that holds every height of the map; `counts` are those of the levels, and their unit."""
+    """Return the kind of a file that holds every height; `counts` gives those of the levels, and metres per count."""
     return ModelKind(
         ending,
         lambda path, model: model_entry(path, content, metres_per_count=counts(model.level_map.levels)[1]),

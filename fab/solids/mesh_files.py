@@ -59,7 +59,7 @@ def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
 
 
 def _rounding_m(cells: Columns) -> float:
-    """Return how far numbers in the files may lie aside, metres: they are rounded to single precision or a picometre."""
+    """Return how far places in the files may lie aside, metres: as single precision or a picometre rounds them."""
     far = max(np.abs(cells.x_edges_m).max(), np.abs(cells.y_edges_m).max())
     return 1e-12 + _SINGLE * float(far)
 

@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fab.errors import CheckFailed, InputError
-from fab.files import os_errors_explained, write_atomic
+from fab.files import os_errors_explained, read_bytes, write_atomic
 from fab.units import MM
 
 _HEADER_TIME = "2000-01-01T00:00:00"
+_NUMBER = re.compile(rb"(?<![#A-Z0-9'])-?\d+\.\d*(?:E[+-]?\d+)?")
 _COUNTED = re.compile(rb"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\()'\d+',([^;]*);")
 
 
@@ -239,6 +240,34 @@ def step_bodies(path: str | Path) -> dict[str, Body]:
         if solids:
             bodies[name.split("/")[-1]] = _body(solids)
     return bodies
+
+
+def step_differences(path: str | Path, wanted: str | Path) -> list[str]:
+    """Compare two STEP files entity by entity, whatever their headers say; return a sentence on the first difference.
+
+    Numbers may differ by a femtometre, since another version of the kernel may round them otherwise.
+    """
+    here, there = (_entities(Path(each)) for each in (path, wanted))
+    if len(here) != len(there):
+        return [f"{len(here)} entities instead of {len(there)}"]
+    for one, other in zip(here, there, strict=True):
+        if one != other and not _alike(one, other):
+            return [f"it says {one[:90].decode('ascii', 'replace')!r} instead of {other[:90].decode('ascii')!r}"]
+    return []
+
+
+def _entities(path: Path) -> list[bytes]:
+    """Return the entities of a STEP file, in its order, without line breaks."""
+    data = read_bytes(path).partition(b"DATA;")[2]
+    return re.sub(rb"\s+", b"", data).split(b";")
+
+
+def _alike(one: bytes, other: bytes) -> bool:
+    """Whether two entities are the same but for the last digits of their numbers, millimetres."""
+    if _NUMBER.split(one) != _NUMBER.split(other):
+        return False
+    pairs = zip(_NUMBER.findall(one), _NUMBER.findall(other), strict=True)
+    return all(a == b or abs(float(a) - float(b)) <= 1e-12 * max(1.0, abs(float(b))) for a, b in pairs)
 
 
 def _body(solids: list[Any]) -> Body:

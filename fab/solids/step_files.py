@@ -1,9 +1,12 @@
 """The STEP files of an order: one die, the wafer, and on request a window at full resolution.
 
-A STEP file must hold the stated parts, each with its volume and its centre of mass.
+A STEP file must hold the stated parts, each with its volume and its centre of mass, and every point, plane and circle
+where a fresh drawing has it.
 """
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from fab.manifest.records import ModelEntry
 from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.solids.patch import patch_body, patch_step
 from fab.solids.rings import pixel_share, ring_levels, rings_from_levels
-from fab.solids.step import step_bodies
+from fab.solids.step import step_bodies, step_differences
 from fab.solids.substrate import (
     ChromeRing,
     Rings,
@@ -95,7 +98,7 @@ def _write_patch(path: Path, model: DoeModel) -> None:
         patch_step(path, model.level_map, model.patch.window(model.level_map.grid))
 
 
-def _problems(path: Path, entry: ModelEntry, _: DoeModel) -> list[str]:
+def _problems(path: Path, entry: ModelEntry, model: DoeModel, write: Callable[[Path, DoeModel], object]) -> list[str]:
     found = step_bodies(path)
     problems = volume_problems(entry, {name: body.volume_m3 / MM**3 for name, body in found.items()})
     for name in sorted(entry.centres_mm.keys() & found.keys()):
@@ -104,7 +107,10 @@ def _problems(path: Path, entry: ModelEntry, _: DoeModel) -> list[str]:
         # Of a whole plate the kernel loses as many digits as its size has over a tenth of a nanometre.
         if not off <= 0.1e-9:
             problems.append(f"{name}: its centre of mass lies {format_length(off)} aside")
-    return problems
+    with tempfile.TemporaryDirectory(prefix="doedesign-verify-") as folder:
+        again = Path(folder) / path.name
+        write(again, model)
+        return problems + step_differences(path, again)
 
 
 def volume_problems(entry: ModelEntry, found_mm3: Mapping[str, float]) -> list[str]:
@@ -117,6 +123,6 @@ def volume_problems(entry: ModelEntry, found_mm3: Mapping[str, float]) -> list[s
     return problems
 
 
-DIE = ModelKind("_PLATE.step", _die_entry, _write_die, _problems)
-WAFER = ModelKind("_WAFER.step", _wafer_entry, _write_wafer, _problems)
-PATCH = ModelKind("_PATCH.step", _patch_entry, _write_patch, _problems)
+DIE = ModelKind("_PLATE.step", _die_entry, _write_die, partial(_problems, write=_write_die))
+WAFER = ModelKind("_WAFER.step", _wafer_entry, _write_wafer, partial(_problems, write=_write_wafer))
+PATCH = ModelKind("_PATCH.step", _patch_entry, _write_patch, partial(_problems, write=_write_patch))

@@ -17,7 +17,6 @@ from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
 from fab.layout.polygons import doubled_area, paint
 from fab.manifest.cells import cell_entry, shapes_digest
 from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
-from fab.solids.model import DoeModel
 from fab.units import MM, NM, UM
 
 Drawn = MaskEntry | DrawnEntry
@@ -27,12 +26,11 @@ Drawn = MaskEntry | DrawnEntry
 class Expected:
     """Content that the files of an order should have.
 
-    What the manifest should say, the DOE as its models show it, the pixels that each etch mask should open
-    ``[bit, y, x]``, and its pixel edges in the drawing.
+    What the manifest should say, the pixels that each etch mask should open ``[bit, y, x]``, and its pixel edges in the
+    drawing.
     """
 
     manifest: Manifest
-    model: DoeModel
     planes: NDArray[np.uint8]
     edges: PixelEdges
 

@@ -36,6 +36,7 @@ from fab.layout.polygons import paint
 from fab.level_map import level_digest
 from fab.levels import Levels
 from fab.manifest.records import FileEntry, Manifest
+from fab.solids.model import DoeModel
 from fab.solids.write import model_problems
 from fab.units import MM
 from fab.verification.child import Child, ChildFailed, TooMuch, child_process, limited
@@ -219,10 +220,10 @@ def _check_mask_file(folder: Path, entry: FileEntry, expected: Expected) -> list
     return [own, _library_check(path, entry, expected)] if fit else [own]
 
 
-def check_files(folder: Path, expected: Expected, intact: Mapping[str, bool]) -> list[Check]:
+def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping[str, bool]) -> list[Check]:
     """Read every mask file and every model of an order, and compare it with what it should hold.
 
-    `intact` says of every file whether its bytes are those of the manifest.
+    `doe` is what the models show; `intact` says of every file whether its bytes are those of the manifest.
     """
     checks = []
     files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
@@ -240,6 +241,6 @@ def check_files(folder: Path, expected: Expected, intact: Mapping[str, bool]) ->
     for model in expected.manifest.models:
         # Libraries of solids and pictures are given whole files only.
         if intact[model.file]:
-            problems = model_problems(folder, model, expected.model)
+            problems = model_problems(folder, model, doe)
             checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
     return checks
