@@ -130,8 +130,10 @@ def verify(order: Path, *, json_: AsJson = False) -> None:
     report = work(order)
     if json_:
         checks = [{"file": c.file, "question": c.question, "problems": list(c.problems)} for c in report.checks]
-        print_text(json.dumps({"passed": report.passed, "checks": checks}))
+        print_text(json.dumps({"passed": report.passed, "checks": checks, "notes": list(report.notes)}))
     report.require()
+    for note in report.notes:
+        say(note)
     say(f"{len(report.checks)} checks passed")
 
 

@@ -22,9 +22,10 @@ class Check:
 
 @dataclass(frozen=True)
 class VerificationReport:
-    """All checks of a mask order, in the order they were made."""
+    """All checks of a mask order, in the order they were made, and a sentence on everything that was not compared."""
 
     checks: tuple[Check, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
