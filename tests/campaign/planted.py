@@ -45,6 +45,7 @@ from fab.levels import Levels
 from fab.manifest import records
 from fab.manifest.cells import cell_entry
 from fab.order.order import plan_order
+from fab.order.terms import OrderTerms
 from fab.order.verify import verify
 from fab.order.write import write_planned
 from fab.pictures import read_pixels, write_pixels
@@ -88,6 +89,7 @@ def write_base(folder: Path) -> None:
     wafer = Wafer(dies=(3, 3), zero_layer=True, line_splits_m=(1e-7,), order_control=True)
     order = plan_order(
         level_map, process="contact_aligner", wafer=wafer, patch=Patch(0.0, 0.0, 14.8e-6), papers=True,
+        direct_write=True, terms=OrderTerms(revision="B", contact="A. Tester", quantity=2, cd_tolerance_m=1e-7),
         source={"kind": "run", "name": "planted", "level_map_sha256": level_map.digest},
     )  # fmt: skip
     near = PredictedMetrics("red", 0.05, 0.81, 0.0123, 0.86, ring_to_disc=3.21)
@@ -118,10 +120,10 @@ def _restate(folder: Path, change: Callable[[Json], object]) -> None:
 
 
 def _state(folder: Path, *files: str) -> None:
-    """Put the entries of changed files right, and the digests of masks on the run sheet."""
+    """Put the entries of changed files right, and the digests of masks on the order form and the run sheet."""
     manifest, digests = _manifest(folder), {}
     does = {manifest["doe_cell"], *(split["cell"] for split in manifest["splits"])}
-    papers = [entry["file"] for entry in manifest["files"] if "_RUNSHEET." in entry["file"]]
+    papers = [entry["file"] for entry in manifest["files"] if re.search(r"_(RUNSHEET|ORDER)\.", entry["file"])]
     for file in [*files, *papers]:
         path = folder / file
         if file in papers:
@@ -187,7 +189,7 @@ def _other(value: Any) -> Any:
     if isinstance(value, int):
         return value + 1
     if isinstance(value, float):
-        return round(value * 1.001, 9) if value else 0.001
+        return float(f"{value * 1.001:.12g}") if value else 0.001
     if isinstance(value, str):
         swaps = {"clear": "dark", "dark": "clear", "right": "wrong", "chrome": "glass", "mask 1": "mask 2"}
         for one, other in swaps.items():
@@ -328,7 +330,7 @@ def _manifest_defects() -> Iterator[Defect]:
 
         yield Defect(f"manifest: {word} unlisted", unlist)
         yield Defect(f"order: {word} unlisted and removed", leave_out)
-    for ending in ("_ALL.gds", "_ALL.oas", "_CHROME.gds", "_M1_B0_150NM.gds", "_ZERO.gds", ".step", ".png"):
+    for ending in ("_ALL.gds", "_ALL.oas", "_CHROME.gds", "_M1_150NM.gds", "_ZERO.gds", ".step", ".png"):
         for kind in ("GDSII", "OASIS", "PDF"):
             if kind != {".gds": "GDSII", ".oas": "OASIS"}.get(ending[-4:]):
                 yield Defect(f"manifest: {ending} called {kind}", partial(_format, ending=ending, kind=kind))
@@ -524,7 +526,7 @@ def _redraw_oasis(folder: Path, change: Callable[[kdb.Layout], object]) -> None:
 
 
 def _oasis_cell(layout: kdb.Layout, ending: str) -> kdb.Cell:
-    return next(cell for cell in layout.each_cell() if cell.name.endswith(ending))
+    return next(cell for cell in layout.each_cell() if cell.name.endswith(ending)) if ending else layout.top_cell()
 
 
 def _oasis_shift(layout: kdb.Layout, ending: str) -> None:
@@ -566,7 +568,7 @@ def _layout_defects() -> Iterator[Defect]:
         "a pixel missing": partial(_oasis_delete, ending="_DOE"),
         "a mark moved": partial(_oasis_shift, ending="_SITE"),
         "a mark missing": partial(_oasis_delete, ending="_SITE"),
-        "a letter missing": partial(_oasis_delete, ending="PLANTED"),
+        "a letter missing": partial(_oasis_delete, ending=""),
         "a test structure moved": partial(_oasis_shift, ending="_TEST"),
         "a die moved": _oasis_dies,
         "layers exchanged": _oasis_layers,
@@ -612,18 +614,18 @@ def _page_number(folder: Path, share: float) -> None:
     _state(folder, file)
 
 
-def _page_text(folder: Path, old: str, new: str) -> None:
-    file = _file(folder, "_RUNSHEET.html")
-    text = (folder / file).read_text()
-    assert old in text, old
-    (folder / file).write_text(text.replace(old, new, 1))
+def _alter(folder: Path, ending: str, old: str, new: str) -> None:
+    file = _file(folder, ending)
+    text = (folder / file).read_bytes()
+    assert old.encode() in text, old
+    (folder / file).write_bytes(text.replace(old.encode(), new.encode(), 1))
     _state(folder, file)
 
 
-def _page_picture(folder: Path, black: bool) -> None:
+def _page_picture(folder: Path, number: int, black: bool) -> None:
     file = _file(folder, "_RUNSHEET.html")
     text = (folder / file).read_text()
-    found = next(re.finditer(r"data:image/png;base64,[A-Za-z0-9+/=]*", text))
+    found = list(re.finditer(r"data:image/png;base64,[A-Za-z0-9+/=]*", text))[number]
     with Image.open(io.BytesIO(base64.b64decode(found[0].partition(",")[2]))) as image:
         dots = np.asarray(image.convert("RGB"))
     other = np.zeros_like(dots) if black else dots[::-1]
@@ -640,9 +642,22 @@ def _sheet_defects() -> Iterator[Defect]:
         share = (step + 0.5) / 40
         yield Defect(f"page: number at {100 * share:.0f} %", partial(_page_number, share=share))
     for old, new in (("</table>", "</table><p>Skip this step.</p>"), ("mask 2", "mask 3"), ("dark", "clear")):
-        yield Defect(f"page: {old} as {new}", partial(_page_text, old=old, new=new))
-    yield Defect("page: black picture", partial(_page_picture, black=True))
-    yield Defect("page: picture upside down", partial(_page_picture, black=False))
+        yield Defect(f"page: {old} as {new}", partial(_alter, ending="_RUNSHEET.html", old=old, new=new))
+    for number in range(3):
+        yield Defect(f"page: picture {number} black", partial(_page_picture, number=number, black=True))
+        yield Defect(f"page: picture {number} upside down", partial(_page_picture, number=number, black=False))
+    for ending, old, new in (
+        ("_ORDER.csv", "dark field", "clear field"),
+        ("_ORDER.csv", "A. Tester", "B. Tester"),
+        ("_ORDER.csv", ",2,", ",3,"),
+        ("_ORDER.html", "dark field", "clear field"),
+        ("_ORDER.html", "A. Tester", "B. Tester"),
+        ("_LAYERS.lyp", "1/0", "2/0"),
+        ("_CHECK.drc", "1.0", "0.9"),
+        ("_DOSE.csv", "1050", "1051"),
+        ("_DIRECT.dxf", "LEVEL_1_", "LEVEL_2_"),
+    ):
+        yield Defect(f"{ending}: {old} as {new}", partial(_alter, ending=ending, old=old, new=new))
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -826,7 +841,7 @@ def _rounder(text: str) -> str:
 
 
 def _add(folder: Path, name: str, content: str) -> None:
-    path = folder / name
+    path = folder / name.replace("JOB", _plates(folder)[0].removesuffix("_ZERO.gds"))
     path.parent.mkdir(parents=True, exist_ok=True)
     mask = (folder / _plates(folder)[1]).read_bytes()
     path.write_bytes({"mask": mask, "packed": gzip.compress(mask)}.get(content, content.encode()))
@@ -842,22 +857,22 @@ def _link(folder: Path, ending: str) -> None:
 
 def _folder_defects() -> Iterator[Defect]:
     for name, content in (
-        ("DOE_PLANTED_M5.gds", "mask"),
-        ("DOE_PLANTED_M5.gds.gz", "packed"),
-        ("DOE_PLANTED_M5.GDS", "mask"),
-        ("DOE_PLANTED_M5.oasis", "mask"),
-        ("DOE_PLANTED_M5.OAS", "mask"),
-        ("DOE_PLANTED_M5.dxf", "0\nSECTION\n"),
-        ("DOE_PLANTED_M5.cif", "DS 1;"),
-        ("sub/DOE_PLANTED_M5.gds", "mask"),
+        ("JOB_M5.gds", "mask"),
+        ("JOB_M5.gds.gz", "packed"),
+        ("JOB_M5.GDS", "mask"),
+        ("JOB_M5.oasis", "mask"),
+        ("JOB_M5.OAS", "mask"),
+        ("JOB_M5.dxf", "0\nSECTION\n"),
+        ("JOB_M5.cif", "DS 1;"),
+        ("sub/JOB_M5.gds", "mask"),
         ("sub/deeper/mask5.gds.gz", "packed"),
         ("sub/m5.dxf", "0\nSECTION\n"),
         ("mask5", "mask"),
         ("mask5.bin", "mask"),
         ("plates.zip", "packed"),
         ("plates.tar.gz", "packed"),
-        ("DOE_PLANTED_RUNSHEET_2.html", "<html></html>"),
-        ("DOE_PLANTED_PATCH2.step", "ISO-10303-21;"),
+        ("JOB_RUNSHEET_2.html", "<html></html>"),
+        ("JOB_PATCH2.step", "ISO-10303-21;"),
     ):
         yield Defect(f"folder: {name} beside the order", partial(_add, name=name, content=content))
     for ending in (
