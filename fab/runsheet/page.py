@@ -1,5 +1,6 @@
 """Pages of HTML that need nothing else, for A4 and for the screen."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,11 @@ from fab.units import format_length
 
 def html_page(template: str, **values: Any) -> bytes:
     """Fill a template of this package; what it asks for and does not get is an error, no blank."""
+    return _templates().get_template(template).render(**values).encode()
+
+
+@cache
+def _templates() -> Any:
     import jinja2
 
     environment = jinja2.Environment(
@@ -20,4 +26,4 @@ def html_page(template: str, **values: Any) -> bytes:
     )
     environment.filters["clock"] = lambda seconds: "{}:{:02d}".format(*divmod(round(seconds), 60))
     environment.filters["distance"] = format_length
-    return environment.get_template(template).render(**values).encode()
+    return environment
