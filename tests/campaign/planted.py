@@ -305,7 +305,7 @@ def _manifest_defects() -> Iterator[Defect]:
 
             yield Defect(f"manifest: {key}, value at {100 * share:.0f} %", change)
     for key in ("masks", "plates", "models", "files", "splits"):
-        for name, change in (
+        for name, alter in (
             ("first left out", lambda m, key: m[key].pop(0)),
             ("last left out", lambda m, key: m[key].pop()),
             ("first twice", partial(_twice, at=0)),
@@ -313,8 +313,8 @@ def _manifest_defects() -> Iterator[Defect]:
             ("first two exchanged", _exchanged),
         ):
 
-            def plant(folder: Path, key: str = key, change: Any = change) -> None:
-                _restate(folder, lambda manifest: change(manifest, key=key))
+            def plant(folder: Path, key: str = key, alter: Any = alter) -> None:
+                _restate(folder, lambda manifest: alter(manifest, key=key))
 
             yield Defect(f"manifest: {key}: {name}", plant)
     for word in ("RUNSHEET", "_RELIEF", "_PATCH", ".step", "HEIGHT", "SAG", "GREY", "WAFER.png", "MARKS", "RULES"):
@@ -726,7 +726,7 @@ def _counts(folder: Path, ending: str) -> None:
     _state(folder, file)
 
 
-def _sag(folder: Path, change: Callable[[list[str]], None]) -> None:
+def _sag(folder: Path, change: Callable[[list[str]], object]) -> None:
     file = _file(folder, "_SAG.DAT")
     lines = (folder / file).read_text().splitlines()
     change(lines)
@@ -797,7 +797,7 @@ def _model_defects() -> Iterator[Defect]:
         yield Defect(f"NPY: a height off by {picometres} pm", partial(_npy, metres=picometres * 1e-12))
     for ending in ("_HEIGHT.tif", "_GREY.png"):
         yield Defect(f"{ending}: a height off by a count", partial(_counts, ending=ending))
-    sags: dict[str, Callable[[list[str]], None]] = {
+    sags: dict[str, Callable[[list[str]], object]] = {
         "a slope": partial(_sag_word, line=5, word=1, value="0.001"),
         "a slope along y": partial(_sag_word, line=9, word=2, value="1e-9"),
         "a twist": partial(_sag_word, line=3, word=3, value="1"),
@@ -1026,7 +1026,7 @@ def outcome(defect: Defect, base: Path, folder: Path) -> Outcome:
 
 def main() -> int:
     """Plant the chosen defects and print what was not caught, or all."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Plant defects in a mask order, and list what verify does not catch.")
     parser.add_argument("--seed", type=int, default=0, help="of the sample that --count takes")
     parser.add_argument("--count", type=int, help="how many are planted; all by default")
     parser.add_argument("--only", default="", help="a word in their names")
