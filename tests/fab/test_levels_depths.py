@@ -201,9 +201,9 @@ def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
     manifest = read_manifest(folder)
     assert [mask.depth_nm for mask in manifest.masks] == [520.3, 160.1, 330.0]
     assert [mask.file.partition("_M")[2] for mask in manifest.masks] == [
-        "1_B0_520P3NM.gds",
-        "2_B1_160P1NM.gds",
-        "3_B2_330NM.gds",
+        "1_520P3NM.gds",
+        "2_160P1NM.gds",
+        "3_330NM.gds",
     ]
     assert manifest.staircase() == levels
     assert [plate.bit for plate in manifest.plates if plate.bit is not None] == [1, 2, 0]
