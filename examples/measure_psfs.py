@@ -1,6 +1,6 @@
 """Photographs of a point source through a plate with hidden errors, for a first `doedesign calibrate`.
 
-    python examples/measure_psfs.py RUN [--out RUN/measurement] [--seed 0]
+    python examples/measure_psfs.py RUN [--out RUN/measurement] [--seed 1]
 
 The plate is simulated: its depth, line width and overlay are drawn from the run's process, its other errors are the
 process's means. Its light at the two depths of examples/measurement/measurement.toml falls on a sensor of 12 bits with
@@ -9,7 +9,9 @@ that describes them, and the truth as hidden.toml. Then
 
     doedesign calibrate RUN RUN/measurement/measurement.toml
 
-should find the hidden errors to within a few of the standard deviations that it states.
+should explain the images and find overlay to about 20 nm and the common depth to about 0.1 %, as it does for the quick
+example. Seed 0 hides a mask a micrometre off, half a cell: there the search ends beside the truth, and says that the images
+are not explained.
 """
 
 import argparse
@@ -65,7 +67,7 @@ def exposed(electrons: np.ndarray, spec: MeasurementSpec, rng: np.random.Generat
     return np.clip(np.rint(seen / spec.gain) + BLACK, 0, TOP).astype(np.uint16)[::-1]
 
 
-def measure(run: Path, out: Path, seed: int = 0) -> Path:
+def measure(run: Path, out: Path, seed: int = 1) -> Path:
     """Write frames, description and truth into a folder; return the description.
 
     Args:
@@ -94,7 +96,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--out", type=Path, help="folder for the frames; RUN/measurement by default")
-    parser.add_argument("--seed", type=int, default=0, help="of errors and noise")
+    parser.add_argument("--seed", type=int, default=1, help="of errors and noise")
     given = parser.parse_args()
     return exit_code(lambda: print(measure(given.run, given.out or given.run / "measurement", given.seed)))
 

@@ -244,7 +244,8 @@ def open_run(folder: Path) -> Run:
             made.
     """
     if not folder.is_dir():
-        raise InputError(str(folder), "must be a run folder", "no folder", "Make one with: doedesign optimize SPEC")
+        got = "a file" if folder.exists() else "no folder"
+        raise InputError(str(folder), "must be a run folder", got, "Make one with: doedesign optimize SPEC")
     if not (folder / MANIFEST_NAME).is_file():
         raise InputError(str(folder), f"a run folder has a {MANIFEST_NAME}", "none", "Give the folder optimize wrote.")
     manifest = _read_manifest(folder, (FORMAT, TRAINING, RELEASED))

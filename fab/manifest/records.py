@@ -283,10 +283,12 @@ def _manifest_from(data: bytes, where: str) -> Manifest:
 def read_manifest(folder: str | Path) -> Manifest:
     """Read the manifest of a mask order and check it; every file name in it is a plain name in the folder."""
     path = Path(folder) / MANIFEST_NAME
+    if path.parent.is_file():
+        raise InputError(str(folder), "must be the folder of a mask order", "a file", "Give the folder that it is in.")
     data = read_json(path)
     if data.get("format") != FORMAT:
         got = repr(data.get("format"))
-        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give the folder of a mask order.")
+        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give the folder of a mask order, drawn by this version.")
     digest = data.pop("sha256", None)
     content = canonical_json(data)
     if digest != sha256_bytes(content):

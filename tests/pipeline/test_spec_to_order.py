@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from doedesign.runs.level_maps import drawn_in_masks
+from fab.errors import InputError
 from fab.files import sha256_file
 from fab.level_map import read_level_map
 from fab.levels import Levels, height_of
@@ -201,6 +203,12 @@ def test_fewer_levels_come_from_the_continuous_design(finished, cli, tmp_path):
     assert f"designed with 16 levels and drawn with 4: {100 * (1 - kept):.2g} % of its light" in done.err
     assert "as rounded to 4 levels, not as designed with 16" in done.err
     assert "as designed" in finished.said["masks"].err
+
+
+def test_masks_of_an_earlier_run_are_not_taken_for_those_of_this_one(finished):
+    own = read_level_map(finished.run / "level_map.npz")
+    with pytest.raises(InputError, match="must be those of this run, but got those of another"):
+        drawn_in_masks(finished.order, own.with_level(np.roll(own.level, 1, axis=0)))
 
 
 @pytest.mark.slow
