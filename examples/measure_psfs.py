@@ -10,8 +10,8 @@ that describes them, and the truth as hidden.toml. Then
     doedesign calibrate RUN RUN/measurement/measurement.toml
 
 should explain the images and find overlay to about 20 nm and the common depth to about 0.1 %, as it does for the quick
-example. Seed 0 hides a mask a micrometre off, half a cell: there the search ends beside the truth, and says that the images
-are not explained.
+example. Seed 0 hides a mask a micrometre off, half a cell: there the search ends beside the truth, and says that the
+images are not explained.
 """
 
 import argparse
