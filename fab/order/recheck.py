@@ -61,6 +61,7 @@ def drc_deck(order: Order, review: str) -> bytes:
         "LINE_UM": round(process.minimum_line_m / UM, 9),
         "SPACE_UM": round(process.minimum_space_m / UM, 9),
         "MASKS": masks,
+        "DOES": [f"{order.stem}_{split.code}" for split in order.splits],
     }
     # JSON of text, numbers, lists and booleans is Ruby.
     head = "".join(f"{name} = {json.dumps(value)}\n" for name, value in constants.items())

@@ -59,3 +59,17 @@ def test_the_deck_passes_an_order_and_finds_planted_defects(order_folder, tmp_pa
     assert f"shapes of cell {name}_SITE" in found
     assert f"places in cell {name}_DIE" in found
     assert plate.name in found
+
+
+@pytest.mark.skipif(shutil.which("klayout") is None, reason="the program KLayout is not installed, only its library")
+def test_the_deck_finds_lines_and_spaces_that_are_too_narrow_and_no_corners(order_folder, tmp_path):
+    """Pixels of 1.85 um touch at corners all over: that is no space of zero."""
+    deck, found = named(order_folder, "CHECK.drc"), []
+    words = deck.read_text()
+    for least in ("1.8", "1.9"):
+        deck.write_text(
+            words.replace("LINE_UM = 0.0", f"LINE_UM = {least}").replace("SPACE_UM = 0.0", f"SPACE_UM = {least}")
+        )
+        found.append([line for line in run_deck(order_folder, tmp_path) if "FOUND" in line])
+    assert found[0] == []
+    assert len(found[1]) == 9  # lines and spaces of four masks, and the sum
