@@ -102,7 +102,7 @@ def generate(level_map: LevelMap, path: Path) -> Layout:
 
 def read_back(path: Path, expected: LevelMap) -> None:
     """Read the file with the own reader and compare every pixel."""
-    if not np.array_equal(read_drawn_levels(path, LEVELS, pixel_edges(expected.grid), "BENCH"), expected.level):
+    if not np.array_equal(read_drawn_levels([path], LEVELS, pixel_edges(expected.grid), "BENCH"), expected.level):
         raise AssertionError("the file does not hold the map")
 
 

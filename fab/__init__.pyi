@@ -9,6 +9,7 @@ from .level_map import LevelMap as LevelMap
 from .level_map import read_level_map as read_level_map
 from .level_map import write_level_map as write_level_map
 from .levels import Levels as Levels
+from .order.formats import Formats as Formats
 from .order.terms import OrderTerms as OrderTerms
 from .order.verify import verify as verify
 from .order.write import WrittenOrder as WrittenOrder

@@ -57,6 +57,9 @@ def masks(
     wafer: Path | None = None,
     terms: Path | None = None,
     direct_write: Flag = False,
+    plates: Literal["gds.gz", "gds"] = "gds.gz",
+    combined_gds: Flag = False,
+    mesh_cells: int = 200,
     json_: AsJson = False,
 ) -> None:
     """Write the mask order of a run or of any height map, and prove it by reading it back.
@@ -82,6 +85,9 @@ def masks(
         wafer: A TOML file with another [wafer] table.
         terms: A TOML file with another [order] table, what a mask shop is asked for.
         direct_write: Also write one layer per level, merged, as OASIS and DXF, and a table of doses.
+        plates: Files of the photomasks: GDSII packed by gzip, or plain.
+        combined_gds: Write the layout of all layers as GDSII, too, and not only as OASIS.
+        mesh_cells: Most columns of the mesh of the whole relief along x and y, up to 1000.
     """
     if as_built is not None:
         for option, given in (("--wafer", wafer), ("--terms", terms)):
@@ -97,6 +103,7 @@ def masks(
     if order is not None:
         raise InputError("--order", "goes with --as-built only", order, "Leave it out.")
     from doedesign.lab.order import PROBE_M, drawn_as, write_masks
+    from fab.order.formats import Formats
 
     done = write_masks(
         source,
@@ -105,6 +112,7 @@ def masks(
         on_violation=on_violation,
         probe_m=length_of("--probe", probe) or PROBE_M,
         patch=_patch(patch, mesh_patch),
+        formats=Formats(plates, combined_gds, mesh_cells),
         process=process,
         wafer=wafer,
         terms=terms,

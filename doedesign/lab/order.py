@@ -24,6 +24,7 @@ from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
+from fab.order.formats import Formats
 from fab.order.order import Order, plan_order
 from fab.order.terms import OrderTerms
 from fab.order.write import WrittenOrder, write_planned
@@ -46,6 +47,7 @@ def write_masks(
     wafer: Wafer | str | Path | None = None,
     terms: OrderTerms | str | Path | None = None,
     direct_write: bool = False,
+    formats: Formats | None = None,
     **geometry: Any,
 ) -> WrittenOrder:
     """Write and prove the mask order of a design or of any height map, with its run sheet.
@@ -62,6 +64,7 @@ def write_masks(
         terms: what is asked of the mask shop besides the drawing, or a TOML file with it; that of the run, or else
             revision A and blanks, by default.
         direct_write: whether to write files for direct-write and greyscale exposure, too.
+        formats: in which formats it is written; packed and coarse enough to mail by default.
         geometry: of a bare height map: `step_m`, `etch_depths_m`, `pitch_m`, `scale_m`, `aperture_m`
             (`doedesign.runs.level_maps.drawing_from`).
 
@@ -91,6 +94,7 @@ def write_masks(
         on_violation=on_violation,
         waves_per_metre=spec and camera_from_spec(spec).waves_per_metre(spec.optics.design_wavelength_m),
         papers=True,
+        formats=formats,
     )
     if order.repair is not None and design is not None:
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}

@@ -229,7 +229,7 @@ def _is_wrapped(height: HeightMap, levels: Levels) -> bool:
 
 
 def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
-    """Return the level numbers ``[y, x]`` that the combined GDS file of the order of a level map draws.
+    """Return the level numbers ``[y, x]`` that the masks of the order of a level map draw.
 
     Raises:
         InputError: no order that can be read, or the order of another level map.
@@ -250,5 +250,5 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
         got = f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}"
         rule = f"the masks must be those of this run, {level_map}"
         raise InputError(str(folder), rule, got, "Give the masks of this run.")
-    combined, moves = folder / manifest.combined_gds, manifest.edge_moves()
-    return read_drawn_levels(combined, levels, pixel_edges(grid), manifest.doe_cell, moves)
+    files, moves = manifest.drawn_files(folder), manifest.edge_moves()
+    return read_drawn_levels(files, levels, pixel_edges(grid), manifest.doe_cell, moves)

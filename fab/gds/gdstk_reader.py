@@ -111,21 +111,21 @@ def _unfold_to(folded: Iterable[Any]) -> int:
 
 
 @contextmanager
-def _unpacked(path: str | Path) -> Iterator[Path]:
+def _unpacked(path: str | Path, scratch: Path | None) -> Iterator[Path]:
     """Provide a file that may be packed by gzip, unpacked."""
     if Path(path).suffix != ".gz":
         yield Path(path)
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         plain = Path(folder) / "unpacked.gds"
         with gzip.open(path) as packed, plain.open("wb") as stream:
             shutil.copyfileobj(packed, stream, 1 << 20)
         yield plain
 
 
-def _cells(library: Any) -> list[PlainCell]:
+def _cells(library: Any, scratch: Path | None) -> list[PlainCell]:
     """Return what a library holds, unfolded."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         path = Path(folder) / "unfolded.gds"
         library.write_gds(str(path), max_points=0)
         try:
@@ -141,10 +141,11 @@ class GdstkReader:
 
     The stream must be sound: the library is not safe against broken ones, so this package's own reader goes first.
     `problems` has a sentence per thing that should not be in the file (labels, paths, other layers of the DOE).
+    Files are unpacked and unfolded in `scratch`, a folder; by default in that of the system.
     """
 
-    def __init__(self, does: Collection[str], edges: PixelEdges) -> None:
-        self.does, self.edges = does, edges
+    def __init__(self, does: Collection[str], edges: PixelEdges, scratch: Path | None = None) -> None:
+        self.does, self.edges, self.scratch = does, edges, scratch
         self.problems: list[str] = []
         self._around: dict[str, dict[Layer, _Taken]] = defaultdict(lambda: defaultdict(lambda: ([], [])))
         self._references: dict[str, tuple[Reference, ...]] = {}
@@ -165,7 +166,7 @@ class GdstkReader:
         """
         waiting = list(layers)
         rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
-        with _unpacked(path) as plain:
+        with _unpacked(path, self.scratch) as plain:
             while waiting or rest:
                 group = [waiting.pop(0)] if waiting else []
                 while waiting and sum(layers[layer] for layer in group) + layers[waiting[0]] <= _MOST_AT_ONCE:
@@ -199,7 +200,7 @@ class GdstkReader:
         library.precision = self.edges.dbu_m
         odd = {cell.name for cell in library.cells if cell.labels or cell.paths}
         found: dict[tuple[str, Layer], _Taken] = {(name, layer): ([], []) for layer in group for name in self.does}
-        for cell in _cells(library):
+        for cell in _cells(library, self.scratch):
             if cell.name in odd or cell.others:
                 self.problems.append(f"cell {cell.name} holds labels or paths")
             around = cell.name not in self.does

@@ -6,7 +6,10 @@ The file is read a few megabytes at a time; a compiled kernel takes whole elemen
 is left moves to the front of the next.
 """
 
+import gzip
+import os
 import struct
+import zlib
 from collections import defaultdict
 from pathlib import Path
 from typing import BinaryIO, NoReturn
@@ -27,6 +30,8 @@ _BLOCK = 1 << 20
 _LONGEST = 1 << 17
 # The shortest element: a closed triangle.
 _SHORTEST = 4 + 6 + 6 + 4 + 4 * 8 + 4
+# A packed file holds at most this many bytes for each of its own; rectangles of one size on a raster come to thirty.
+_MOST_UNPACKED = 100
 _SPOILED = "Write the order again, or fetch the file again."
 # The words that mark an element: length of the record, then its type.
 _BOUNDARY, _LAYER = 4 << 16 | gds.BOUNDARY, 6 << 16 | gds.LAYER
@@ -154,6 +159,10 @@ class _Stream:
 
     def __init__(self, path: str | Path, file: BinaryIO) -> None:
         self.path, self._file, self.tally = path, file, Tally(str(path))
+        self._most = os.fstat(file.fileno()).st_size
+        if Path(path).suffix == ".gz":
+            self._file = gzip.GzipFile(fileobj=file, mode="rb")
+            self._most = _BLOCK + _MOST_UNPACKED * self._most
         self._buffer = np.empty(_BLOCK + _LONGEST, dtype=np.uint8)
         self._start = self._end = self.offset = 0
 
@@ -169,6 +178,9 @@ class _Stream:
         room = min(_BLOCK, self._buffer.size - kept)
         got = self._file.readinto(self._buffer.data[kept : kept + room])  # type: ignore[attr-defined]
         self._start, self._end = 0, kept + got
+        if self.offset + self._end > self._most:
+            rule = f"a packed file must hold at most {_MOST_UNPACKED} bytes for each of its own"
+            raise InputError(str(self.path), rule, "more", _SPOILED)
         return bool(got)
 
     def drop(self, count: int) -> None:
@@ -262,7 +274,7 @@ def _read_cell(stream: _Stream, found: _Found) -> Cell:
 
 
 def read_gds(path: str | Path) -> Layout:
-    """Read a GDSII file of boundaries and upright references, and check every record of it.
+    """Read a GDSII file of boundaries and upright references, packed if it ends in .gz, and check every record of it.
 
     Axis-parallel boundaries of four points become rectangles, in the order of the file, all others (degenerate ones
     too) polygons; layers are sorted and have no names.
@@ -272,19 +284,29 @@ def read_gds(path: str | Path) -> Layout:
             more than `fab.layout.limits` allows.
     """
     with opened(path) as file:
-        stream, found, cells = _Stream(path, file), _Found(), []
-        dbu_m = _read_unit(stream)
-        while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
-            stream.tally.add("cells")
-            cells.append(_read_cell(stream, found))
-        # Zeros may follow, since some programs fill the last block of a tape.
-        while stream.front.size or stream.fill():
-            if stream.front.any():
-                _fail(path, "the file must end with its end record", stream.offset)
-            stream.drop(stream.front.size)
+        stream = _Stream(path, file)
+        try:
+            dbu_m, cells = _read_cells(stream)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise InputError(str(path), "a packed file must be whole", str(error), _SPOILED) from error
     try:
         ordered = in_order(cells)
     except ValueError as error:
         raise InputError(str(path), "the cells must make one drawing", str(error), _SPOILED) from error
     stream.tally.add_places(ordered)
     return Layout(dbu_m, ordered)
+
+
+def _read_cells(stream: _Stream) -> tuple[float, list[Cell]]:
+    """Read a whole file; return its database unit in metres, and its cells."""
+    found, cells = _Found(), []
+    dbu_m = _read_unit(stream)
+    while stream.record(_WHOLE, gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+        stream.tally.add("cells")
+        cells.append(_read_cell(stream, found))
+    # Zeros may follow, since some programs fill the last block of a tape.
+    while stream.front.size or stream.fill():
+        if stream.front.any():
+            _fail(stream.path, "the file must end with its end record", stream.offset)
+        stream.drop(stream.front.size)
+    return dbu_m, cells

@@ -209,7 +209,7 @@ class Manifest:
     pixel_edges: str
     level_map_file: str
     level_map_sha256: str
-    combined_gds: str
+    combined_gds: str | None
     combined_oasis: str
     preview: str
     doe_cell: str
@@ -226,6 +226,10 @@ class Manifest:
     def edge_moves(self) -> tuple[int, ...]:
         """Return how far the edges of every mask were moved outward, in database units."""
         return tuple(round(mask.edge_move_nm / self.dbu_nm) for mask in self.masks)
+
+    def drawn_files(self, folder: Path) -> list[Path]:
+        """Return the files of an order's folder that draw the DOE between them, a mask each."""
+        return [folder / mask.file for mask in self.masks]
 
     def drawn(self) -> dict[str, Sequence[MaskEntry | DrawnEntry]]:
         """Return every cell of the DOE with what its etch layers draw."""
@@ -297,7 +301,8 @@ def read_manifest(folder: str | Path) -> Manifest:
     manifest = _manifest_from(content, str(path))
     entries = [*manifest.files, *manifest.masks, manifest.chrome, *manifest.plates, *manifest.models]
     names = [entry.file for entry in entries]
-    names += [manifest.level_map_file, manifest.combined_gds, manifest.combined_oasis, manifest.preview]
+    names += [manifest.level_map_file, manifest.combined_oasis, manifest.preview]
+    names += [name for name in [manifest.combined_gds] if name is not None]
     for name in names:
         if Path(name).name != name or name not in {entry.file for entry in manifest.files}:
             raise InputError(

@@ -1,5 +1,6 @@
 """A mask order: from numbers to the folder that goes to the lab, and its proof.
 
+formats       Formats: in which formats it is written
 order         Order: what is drawn, for whom, and what everything is called
 terms         what is asked of the mask shop besides the drawing
 form          the order form, as CSV and as a page

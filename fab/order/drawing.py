@@ -47,9 +47,8 @@ class DrawnOrder:
     def model(self) -> DoeModel:
         """The DOE as solids and height maps show it."""
         order, frame = self.order, self.frame
-        return DoeModel(
-            order.level_map, order.chrome, order.wafer, frame.die_m, frame.dies, order.patch, order.direct_write
-        )
+        at, cells = (frame.die_m, frame.dies), order.formats.mesh_cells
+        return DoeModel(order.level_map, order.chrome, order.wafer, *at, order.patch, order.direct_write, cells)
 
     def kept(self, what: str, make: Callable[[], T]) -> T:
         """Return what was made from this very order before, or make it."""
@@ -119,8 +118,8 @@ def file_entries(drawing: DrawnOrder, models: Sequence[ModelEntry]) -> list[File
     others = [model.file for model in models]
     others += [f"{order.stem}_{ending}" for ending in (*_paper_names(order), "LEVELS.npy")]
     return [
-        _mask_file(f"{order.stem}_ALL.gds", "GDSII", layout, drawn, does),
-        *(_mask_file(f"{plate.top.name}.gds", "GDSII", plate, layers, does) for plate, layers in plates),
+        *(_mask_file(name, "GDSII", layout, drawn, does) for name in [order.combined_gds] if name),
+        *(_mask_file(order.plate_file(plate.top.name), "GDSII", plate, layers, does) for plate, layers in plates),
         _mask_file(f"{order.stem}_ALL.oas", "OASIS", layout, drawn, does),
         *(FileEntry(name, name.rpartition(".")[2].upper(), 0, "", None, [], []) for name in others),
     ]
@@ -155,7 +154,7 @@ def manifest_of(
         pixel_edges=describe_edges(pixel_edges(grid)),
         level_map_file=f"{stem}_LEVELS.npy",
         level_map_sha256=level_map.digest,
-        combined_gds=f"{stem}_ALL.gds",
+        combined_gds=order.combined_gds,
         combined_oasis=f"{stem}_ALL.oas",
         preview=f"{stem}_PREVIEW.png",
         doe_cell=layout.cells[0].name,

@@ -82,7 +82,8 @@ def _shared(order: Order) -> Values:
 
 def _mask(drawing: DrawnOrder, photomask: Photomask, plates: Mapping[str, str], boxes: Mapping[Layer, Box]) -> Values:
     order, stem = drawing.order, drawing.order.photomask_stem(photomask)
-    file, written = f"{stem}.gds", box_around(box for layer, box in boxes.items() if layer.number == photomask.layer)
+    file = order.plate_file(stem)
+    written = box_around(box for layer, box in boxes.items() if layer.number == photomask.layer)
     field, opposite = ("dark field", "chrome") if photomask.tone == "clear" else ("clear field", "clear")
     x0, y0, x1, y1 = (round(edge * order.dbu_m / MM, 6) for edge in written or (0, 0, 0, 0))
     return {
@@ -90,7 +91,7 @@ def _mask(drawing: DrawnOrder, photomask: Photomask, plates: Mapping[str, str], 
         "makes": f"etch {photomask.depth}" if photomask.bit is not None else photomask.makes,
         "polarity": f"{field}: polygons {photomask.tone}, {opposite} elsewhere",
         "file": file,
-        "format": "GDSII",
+        "format": "GDSII, packed by gzip" if file.endswith(".gz") else "GDSII",
         "sha256": plates[file],
         "top_cell": stem,
         "layer": f"{photomask.layer}/0",

@@ -18,6 +18,7 @@ from fab.layout.part import Photomask, photomasks_of
 from fab.layout.split import DieSplit, splits_of
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
+from fab.order.formats import Formats
 from fab.order.terms import OrderTerms
 from fab.process import Process
 from fab.rules.check import RulesReport, check
@@ -66,6 +67,7 @@ class Order:
         direct_write: whether files for direct-write and greyscale exposure come with the masks.
         papers: whether a run sheet and pictures of the wafer, its marks and broken rules come with the masks.
         light: what the run sheet says of the light, if anything.
+        formats: in which formats it is written.
     """
 
     rules: RulesReport
@@ -79,6 +81,7 @@ class Order:
     direct_write: bool = False
     papers: bool = False
     light: Light | None = None
+    formats: Formats = field(default_factory=Formats)
 
     @property
     def level_map(self) -> LevelMap:
@@ -121,6 +124,15 @@ class Order:
         if photomask.bit is not None:
             return self.mask_stem(photomask.bit)
         return f"{self.stem}_{'ZERO' if photomask.makes == 'zero layer' else 'CHROME'}"
+
+    def plate_file(self, stem: str) -> str:
+        """Return the name of the file of a photomask from that of its top cell."""
+        return f"{stem}.{self.formats.plates}"
+
+    @property
+    def combined_gds(self) -> str | None:
+        """Name of the combined layout as GDSII, if it is wanted."""
+        return f"{self.stem}_ALL.gds" if self.formats.combined_gds else None
 
     @property
     def job(self) -> Job:
@@ -175,6 +187,7 @@ def plan_order(
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
     papers: bool = False,
+    formats: Formats | None = None,
 ) -> Order:
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`."""
     made_by = process_from(process, level_map.levels)
@@ -188,7 +201,8 @@ def plan_order(
         cure = "Design with a coarser pitch or fewer levels, choose another process, or have the level map repaired."
         raise InputError("masks", "the process must be able to print them", report.headlines()[0], cure)
     wafer, terms = wafer or Wafer(), terms or OrderTerms()
-    asked = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
+    asked: dict[str, Any] = {"patch": patch, "terms": terms, "papers": papers, "direct_write": direct_write}
+    asked["formats"] = formats or Formats()
     order = Order(report, made_by, wafer, chrome or Chrome(), source or {}, **asked)
     if warning := faint_marks(order.photomasks):
         log.warning(warning)

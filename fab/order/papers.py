@@ -78,8 +78,8 @@ def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[s
     stems = {photomask.name: order.photomask_stem(photomask) for photomask in order.photomasks}
     files = {
         photomask.name: PhotomaskFile(
-            file=f"{stems[photomask.name]}.gds",
-            sha256=plates[f"{stems[photomask.name]}.gds"],
+            file=order.plate_file(stems[photomask.name]),
+            sha256=plates[order.plate_file(stems[photomask.name])],
             cell=stems[photomask.name],
             edge_move_m=0.0 if photomask.bit is None else moves[photomask.bit] * order.dbu_m,
         )

@@ -51,7 +51,7 @@ def drc_deck(order: Order, review: str) -> bytes:
     """Return the deck of checks (Ruby) for KLayout, which reads the review file of that name beside it."""
     process, grid_m = order.process, order.terms.address_grid_m or order.dbu_m
     masks = [
-        [photomask.name, f"{order.photomask_stem(photomask)}.gds", photomask.layer, photomask.bit is not None]
+        [photomask.name, order.plate_file(order.photomask_stem(photomask)), photomask.layer, photomask.bit is not None]
         for photomask in order.photomasks
     ]
     constants: dict[str, Any] = {

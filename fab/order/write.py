@@ -1,9 +1,9 @@
 """The folder that goes to the lab: every mask as a file, the whole as a review file, and the proof.
 
-    <JOB>_ALL.gds, .oas           all layers, for review
-    <JOB>_M<n>_<depth>.gds        one file per etch mask n, on its own layer n
-    <JOB>_CHROME.gds              the chrome around the clear aperture
-    <JOB>_ZERO.gds                the chrome marks that are made first, if the wafer has any
+    <JOB>_ALL.oas                 all layers, for review; on request also .gds
+    <JOB>_M<n>_<depth>.gds.gz     one file per etch mask n, on its own layer n; on request plain .gds, as all of them
+    <JOB>_CHROME.gds.gz           the chrome around the clear aperture
+    <JOB>_ZERO.gds.gz             the chrome marks that are made first, if the wafer has any
     <JOB>_LEVELS.npy              the level map (uint8, row 0 at the lowest y)
     manifest.json                 what each file is, its digest, its geometry
     ...                           solids and height maps (`fab.solids.write`), papers (`fab.order.papers`)
@@ -33,6 +33,7 @@ from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.manifest.records import Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
+from fab.order.formats import Formats
 from fab.order.order import Light, OnViolation, Order, plan_order
 from fab.order.papers import papers
 from fab.order.terms import OrderTerms
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
 log = logging.getLogger("doedesign")
+_WRITERS = 2
 
 
 Predict = Callable[[Order], SheetPrediction | None]
@@ -56,13 +58,17 @@ Predict = Callable[[Order], SheetPrediction | None]
 def _write_masks(folder: Path, drawing: DrawnOrder) -> None:
     """Write the review files and one file per mask."""
     order, layout = drawing.order, drawing.layout
-    gds, oasis = (folder / f"{order.stem}_ALL.{ending}" for ending in ("gds", "oas"))
-    log.info("writing GDSII")
-    write_gds(gds, layout)
-    for photomask in order.photomasks:
-        write_gds(folder / f"{order.photomask_stem(photomask)}.gds", drawing.plate(photomask))
-    log.info("writing OASIS")
-    write_oasis(oasis, layout)
+    log.info("writing the mask files")
+    # What packs lets go of the interpreter lock; more threads would only hold more at once.
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        begun = [pool.submit(write_oasis, folder / f"{order.stem}_ALL.oas", layout)]
+        if order.combined_gds is not None:
+            begun.append(pool.submit(write_gds, folder / order.combined_gds, layout))
+        for photomask in order.photomasks:
+            name = order.plate_file(order.photomask_stem(photomask))
+            begun.append(pool.submit(write_gds, folder / name, drawing.plate(photomask)))
+        for one in begun:
+            one.result()
 
 
 def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:
@@ -81,9 +87,8 @@ def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:
         light = Light(seen.predictions, sha256_bytes(seen.picture))
         drawing = replace(drawing, order=replace(order, light=light))
     log.info("drawing the pictures")
-    plates = {
-        f"{stem}.gds": sha256_file(folder / f"{stem}.gds") for stem in map(order.photomask_stem, order.photomasks)
-    }
+    names = [order.plate_file(order.photomask_stem(photomask)) for photomask in order.photomasks]
+    plates = {name: sha256_file(folder / name) for name in names}
     made_by = tools()
     for name, content in papers(drawing, plates, made_by, seen and seen.picture).items():
         write_atomic(folder / name, content())
@@ -136,6 +141,7 @@ def write_order(
     source: Mapping[str, Any] | None = None,
     on_violation: OnViolation = "warn",
     waves_per_metre: float | None = None,
+    formats: Formats | None = None,
 ) -> WrittenOrder:
     """Write a mask order and prove it; the folder appears only if the proof holds.
 
@@ -152,6 +158,7 @@ def write_order(
         source: where the level map came from, for the manifest; JSON values only.
         on_violation: what to do where the process cannot print a mask: warn, fail, or fix the level map.
         waves_per_metre: waves of light per metre of height, for a repair (`fab.rules.repair.repair`).
+        formats: in which formats it is written; packed and coarse enough to mail by default.
 
     Raises:
         InputError: an argument is out of range; the folder holds anything else than an earlier order.
@@ -168,6 +175,7 @@ def write_order(
         source=source,
         on_violation=on_violation,
         waves_per_metre=waves_per_metre,
+        formats=formats,
     )
     return write_planned(folder, order)
 

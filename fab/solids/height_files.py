@@ -80,9 +80,9 @@ def write_tiff(path: str | Path, level_map: LevelMap) -> float:
 
 
 def write_npy(path: str | Path, level_map: LevelMap) -> float:
-    """Write the heights as a bare array: float64 metres (hence 1.0), ``[y, x]``, row 0 at the lowest y."""
+    """Write the heights as a bare array: float32 metres (hence 1.0), ``[y, x]``, row 0 at the lowest y."""
     stream = io.BytesIO()
-    np.save(stream, level_map.levels.heights_m()[level_map.level], allow_pickle=False)
+    np.save(stream, level_map.levels.heights_m().astype(np.float32)[level_map.level], allow_pickle=False)
     write_atomic(path, stream.getvalue())
     return 1.0
 
@@ -238,7 +238,13 @@ _FLOOR, _BLANK = "height above the deepest floor", "white is the blank surface"
 _TOP_ROW = "first row at the highest y"
 KINDS = (
     _kind("_HEIGHT.tif", f"{_FLOOR}, {_TOP_ROW}", _exact_scale, write_tiff, read_pixels),
-    _kind("_HEIGHT.npy", f"{_FLOOR}, row 0 at the lowest y", lambda one: (one.heights_m(), 1.0), write_npy, read_npy),
+    _kind(
+        "_HEIGHT.npy",
+        f"{_FLOOR}, row 0 at the lowest y",
+        lambda one: (one.heights_m().astype(np.float32), 1.0),
+        write_npy,
+        read_npy,
+    ),
     _kind("_GREY.png", f"{_BLANK}, {_TOP_ROW}", partial(_full_scale, top=65535), write_greymap, read_pixels),
     ModelKind("_SAG.DAT", _sag_entry, _write_sag, _sag_problems),
 )

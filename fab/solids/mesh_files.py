@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fab.manifest.records import ModelEntry
-from fab.solids.columns import BASE_M, Columns, reduced_cells, window_cells
+from fab.solids.columns import BASE_M, Columns, window_cells
 from fab.solids.mesh import Mesh, is_closed
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
-from fab.solids.model import MESH_CELLS, DoeModel, MeshedRelief, ModelKind, model_entry, window_of
+from fab.solids.model import DoeModel, MeshedRelief, ModelKind, model_entry, window_of
 from fab.solids.step_files import volume_problems
 from fab.units import MM
 
@@ -49,7 +49,7 @@ def _write(path: Path, model: DoeModel, shown: _Shown, write: Callable[[Path, Me
 
 def _problems(path: Path, entry: ModelEntry, model: DoeModel) -> list[str]:
     window = window_of(entry)
-    cells = reduced_cells(model.level_map, MESH_CELLS) if window is None else window_cells(model.level_map, window)
+    cells = model.relief.cells if window is None else window_cells(model.level_map, window)
     most = _MOST_PER_CELL * cells.height_m.size + 1000
     mesh = read_mesh(path, "mm" if path.suffix == ".stl" else None, most)
     problems = volume_problems(entry, {"RELIEF": mesh.volume_m3 / MM**3})

@@ -16,8 +16,6 @@ from fab.solids.patch import Patch
 from fab.solids.step import Body
 from fab.units import MM, format_length
 
-MESH_CELLS = 400
-
 
 @dataclass(frozen=True, eq=False)
 class MeshedRelief:
@@ -40,7 +38,7 @@ class DoeModel:
     """A DOE on its glass, as all models show it: chrome, edge of its die and middles of the dies on the wafer, metres.
 
     A `patch` is the window that is wanted at full resolution, if any; `direct_write` whether files for direct-write and
-    greyscale exposure are wanted.
+    greyscale exposure are wanted; the mesh of the whole relief has at most `mesh_cells` columns either way.
     """
 
     level_map: LevelMap
@@ -50,11 +48,12 @@ class DoeModel:
     dies: Sequence[tuple[float, float]]
     patch: Patch | None = None
     direct_write: bool = False
+    mesh_cells: int = 200
 
     @cached_property
     def relief(self) -> MeshedRelief:
         """The whole relief, block-reduced where it is large."""
-        cells = reduced_cells(self.level_map, MESH_CELLS)
+        cells = reduced_cells(self.level_map, self.mesh_cells)
         blocks = f"mean height of {cells.block} x {cells.block} pixels"
         return MeshedRelief(cells, f"relief on {format_length(BASE_M)} of glass, {blocks}")
 

@@ -1,9 +1,12 @@
 """Work in a child process with limits, for libraries that a damaged file makes crash or grow without bounds."""
 
 import contextlib
+import ctypes
 import faulthandler
 import importlib
+import math
 import os
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, TimeoutError
 from typing import Any
@@ -12,7 +15,9 @@ from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool, TerminatedWorkerError
 
 # A sound file takes far less of either: gdstk about 350 bytes for a polygon, and seconds for a million of them.
+# Seconds are those of the processor, so that a busy machine does not fail a sound file; to the clock they may be more.
 _SECONDS, _SECONDS_PER_SHAPE = 4.0, 5e-6
+_PATIENCE = 15.0
 _BYTES, _BYTES_PER_SHAPE = 1 << 30, 400
 _IDLE_S = 60  # after which a child without work ends
 
@@ -52,7 +57,7 @@ class Child:
         """
         try:
             self._ready.exception()  # what is imported for the first time does not count
-            return begun.result(_SECONDS + _SECONDS_PER_SHAPE * shapes)
+            return begun.result(_PATIENCE * _seconds(shapes))
         except TimeoutError as error:
             self.end()
             raise TooMuch("it takes too long") from error
@@ -60,6 +65,8 @@ class Child:
             raise TooMuch("it takes too much memory") from error
         except (BrokenProcessPool, TerminatedWorkerError) as error:
             self.end()
+            if "SIGXCPU" in str(error):
+                raise TooMuch("it takes too long") from error
             raise ChildFailed("the library that reads it crashes") from error
         except Exception as error:  # whatever a library makes of a broken file
             raise ChildFailed(str(error) or type(error).__name__) from error
@@ -89,8 +96,12 @@ def _import(modules: list[str]) -> None:
         importlib.import_module(module)
 
 
+def _seconds(shapes: int) -> float:
+    return _SECONDS + _SECONDS_PER_SHAPE * shapes
+
+
 def limited(shapes: int, work: Callable[..., Any], *arguments: Any) -> Any:
-    """Do work with no more memory than reading so many shapes takes, beyond what is in use already.
+    """Do work with no more time and memory than reading so many shapes takes, beyond what is in use already.
 
     For the child: neither it nor a library says anything on its own; who waits for the result is told.
     """
@@ -103,14 +114,30 @@ def limited(shapes: int, work: Callable[..., Any], *arguments: Any) -> Any:
         import resource
     except ImportError:  # Windows
         return work(*arguments)
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = _in_use() + _BYTES + _BYTES_PER_SHAPE * shapes
-    with contextlib.suppress(ValueError, OSError):  # a lower limit is there already
-        resource.setrlimit(resource.RLIMIT_DATA, (most, before[1]))
+    most = {
+        resource.RLIMIT_DATA: _in_use() + _BYTES + _BYTES_PER_SHAPE * shapes,
+        resource.RLIMIT_CPU: math.ceil(time.process_time() + _seconds(shapes)),
+        resource.RLIMIT_CORE: 0,
+    }
+    before = {kind: resource.getrlimit(kind) for kind in most}
+    for kind, limit in most.items():
+        with contextlib.suppress(ValueError, OSError):  # a lower limit is there already
+            resource.setrlimit(kind, (limit, before[kind][1]))
     try:
         return work(*arguments)
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
+        for kind, limits in before.items():
+            resource.setrlimit(kind, limits)
+        _give_back()
+
+
+def _give_back() -> None:
+    """Give memory that libraries have freed back to the system, where it can be asked for it.
+
+    The executor would take what is kept for a leak, and start the process again.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _in_use() -> int:

@@ -9,15 +9,16 @@ only that a file changed but also what in the drawing is different:
    it on the blank (`fab.verification.shop_checks`)?
 3. Does a library that had no part in the writing (gdstk) see the same?
 
-gdstk is not safe against broken streams. It is therefore given only GDSII files that the own reader
-accepts, and OASIS files whose bytes are those of the manifest, and those in a process of its own with limits
-of time and memory (`fab.verification.child`). An altered OASIS file, or one that gdstk cannot take, goes
-through KLayout, which refuses what is broken, and then through the own reader, in such a process, too.
+OASIS files have no reader of this package: KLayout reads them and hands them over as GDSII, then gdstk reads them, too.
+Libraries are not safe against broken files. They work in a process of their own, with limits of time and memory
+(`fab.verification.child`), and gdstk is given only what the own reader or KLayout accepts. That process reads beside
+this one, so that an order takes two cores.
 """
 
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,7 +40,7 @@ from fab.manifest.records import FileEntry, Manifest
 from fab.solids.model import DoeModel
 from fab.solids.write import model_problems
 from fab.units import MM
-from fab.verification.child import Child, ChildFailed, TooMuch, child_process, limited
+from fab.verification.child import Child, ChildFailed, child_process, limited
 from fab.verification.compare import Expected, cell_problems, layout_problems, reading_problems
 from fab.verification.report import Check
 from fab.verification.shop_checks import drawing_problems
@@ -72,20 +73,29 @@ def _stored_levels(folder: Path, manifest: Manifest) -> NDArray[np.uint8] | None
 
 
 def read_drawn_levels(
-    path: str | Path, levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
+    paths: Sequence[str | Path], levels: Levels, edges: PixelEdges, cell: str, moves: Sequence[int] = ()
 ) -> NDArray[np.uint8]:
-    """Rebuild the level numbers ``[y, x]`` that a cell of a combined GDSII file draws, bit k on layer k + 1.
+    """Rebuild the level numbers ``[y, x]`` that a cell draws in some GDSII files together, bit k on layer k + 1.
 
     Edges of the masks were moved outward by `moves`, database units (`Manifest.edge_moves`).
 
     Raises:
-        InputError: the file is missing or corrupt, or draws something else than a plane of pixels.
+        InputError: a file is missing or corrupt, or draws something else than planes of pixels.
     """
     etched = np.zeros((edges.y.size - 1, edges.x.size - 1), dtype=np.uint8)
+    for path in paths:
+        _paint_cell(path, cell, edges, moves or (0,) * levels.bits, etched)
+    return np.uint8(levels.count - 1) - etched
+
+
+def _paint_cell(
+    path: str | Path, cell: str, edges: PixelEdges, moves: Sequence[int], etched: NDArray[np.uint8]
+) -> None:
+    """Set the bits ``[y, x]`` of the etch layers that a cell of a file holds."""
     drawn = read_gds(path).cell(cell)
     if drawn is None:
         raise InputError(str(path), f"must hold the cell {cell}", "none of that name", "Write the order again.")
-    for bit, move in zip(range(levels.bits), moves or (0,) * levels.bits, strict=True):
+    for bit, move in enumerate(moves):
         shapes = drawn.shapes.get(Layer(bit + 1))
         if shapes is None:
             continue
@@ -97,13 +107,12 @@ def read_drawn_levels(
             rule = f"layer {bit + 1}/0 must hold separate rectangles on the pixel raster"
             got = f"{len(shapes.polygons) + painted.strays} other shapes and {painted.overlaps} pixels covered twice"
             raise InputError(str(path), rule, got, "Write the order again.")
-    return np.uint8(levels.count - 1) - etched
 
 
 def reference_level(folder: Path, manifest: Manifest) -> tuple[NDArray[np.uint8], Check]:
     """Return the level numbers ``[y, x]`` to compare with, and whether the stored ones are those of the manifest.
 
-    A damaged copy must not put the blame on the masks: the map drawn in the combined file may be the right one.
+    A damaged copy must not put the blame on the masks: the map drawn in the masks may be the right one.
 
     Raises:
         CheckFailed: neither holds the map of the manifest.
@@ -116,7 +125,7 @@ def reference_level(folder: Path, manifest: Manifest) -> tuple[NDArray[np.uint8]
     levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
     try:
         moves = manifest.edge_moves()
-        drawn = read_drawn_levels(folder / manifest.combined_gds, levels, edges, manifest.doe_cell, moves)
+        drawn = read_drawn_levels(manifest.drawn_files(folder), levels, edges, manifest.doe_cell, moves)
     except InputError:
         drawn = None
     if drawn is not None and level_digest(drawn) == manifest.level_map_sha256:
@@ -152,72 +161,64 @@ def _most_shapes(entry: FileEntry, expected: Expected) -> int:
     return 2 * min(stated, len(does) * expected.planes.size + MOST_AROUND)
 
 
-def _altered_oasis(path: Path, entry: FileEntry, expected: Expected, scratch: Path) -> Check:
-    gds = scratch / f"{entry.file}.gds"
+def _klayout_check(path: Path, entry: FileEntry, expected: Expected, scratch: Path) -> tuple[Check, bool]:
+    """Return what is found in an OASIS file through KLayout, and whether the file is whole."""
+    question, gds = "KLayout and own reader, every pixel", scratch / f"{entry.file}.gds"
     try:
         oasis_to_gds(path, gds, _most_shapes(entry, expected))
     except InputError as error:
-        return Check(entry.file, "KLayout and own reader", (f"it cannot be read: {error.rule}, but got {error.got}",))
-    return _own_check(gds, entry, expected)[0]
+        problem = f"it cannot be read: {error.rule}, but got {error.got}"
+        return Check(entry.file, question, (problem,)), False
+    found, _ = _own_check(gds, entry, expected)
+    gds.unlink()
+    return replace(found, question=question), True
 
 
-def _library_check(path: Path, entry: FileEntry, expected: Expected) -> Check:
+def _library_check(path: Path, entry: FileEntry, expected: Expected, scratch: Path) -> tuple[Check, bool]:
+    """Return what gdstk finds, and whether it could read the file."""
     layers: Counter[Layer] = Counter()
     for drawn in expected.etch_layers(entry).values():
         layers.update({layer: mask.polygons for layer, mask in drawn.items()})
     chrome = expected.chrome_layer(entry)
     if chrome is not None:
         layers[chrome] = expected.manifest.chrome.polygons
-    again = GdstkReader(expected.etch_layers(entry), expected.edges)
+    again = GdstkReader(expected.etch_layers(entry), expected.edges, scratch)
     numbers = [tuple(map(int, one.layer.split("/"))) for cell in entry.cells for one in cell.layers]
     others = dict.fromkeys(Layer(number, datatype) for number, datatype in numbers)
     if entry.format == _OASIS:
         readings = again.oasis(path, layers, _most_shapes(entry, expected))
     else:
         readings = again.gds(path, layers, others)
+    question = "gdstk, every pixel"
     try:
         problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]
     except InputError as error:
-        problems = [f"it cannot be read: {error.rule}, but got {error.got}"]
-    else:
-        problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
-    return Check(entry.file, "gdstk, every pixel", tuple(problems))
+        problem = f"it cannot be read: {error.rule}, but got {error.got}"
+        return Check(entry.file, question, (problem,)), False
+    problems += again.problems + cell_problems(again.around, entry, expected.edges.dbu_m)
+    return Check(entry.file, question, tuple(problems)), True
 
 
-def _check_oasis(
-    child: Child, path: Path, entry: FileEntry, intact: bool, expected: Expected, scratch: Path
-) -> Callable[[], Check]:
-    """Begin to check an OASIS file in a child process; return what waits for the result."""
-    shapes = _most_shapes(entry, expected)
-    path = path.absolute()  # the child may work in another folder
-    works = [(_library_check, path, entry, expected), (_altered_oasis, path, entry, expected, scratch)]
-    first, *others = works if intact else works[1:]
-    begun = child.begin(limited, shapes, *first)
+_Work = Callable[[Path, FileEntry, Expected, Path], tuple[Check, bool]]
 
-    def wait() -> Check:
+
+def _found_by(
+    works: Sequence[_Work], child: Child, path: Path, entry: FileEntry, of: Expected, scratch: Path
+) -> list[Check]:
+    """Return what libraries find in a file, one after the other in a child process, until one cannot read it."""
+    shapes, checks = _most_shapes(entry, of), []
+    # The child may work in another folder.
+    begun = ((work, child.begin(limited, shapes, work, path.absolute(), entry, of, scratch)) for work in works)
+    for work, one in begun:
         try:
-            return child.result(begun, shapes)
-        except TooMuch as error:
-            return Check(entry.file, "OASIS", (f"it cannot be read: {error}",))
+            found, fit = child.result(one, shapes)
         except ChildFailed as error:
-            problems = [f"it cannot be read: {error}"]
-        for other in others:
-            try:
-                found = child.result(child.begin(limited, shapes, *other), shapes)
-                return replace(found, problems=(*problems, *found.problems))
-            except ChildFailed as error:
-                problems.append(f"nor by KLayout: {error}")
-        return Check(entry.file, "OASIS", tuple(problems))
-
-    return wait
-
-
-def _check_mask_file(folder: Path, entry: FileEntry, expected: Expected) -> list[Check]:
-    path = folder / entry.file
-    if not path.is_file():
-        return []
-    own, fit = _own_check(path, entry, expected)
-    return [own, _library_check(path, entry, expected)] if fit else [own]
+            name = "KLayout" if work is _klayout_check else "gdstk"
+            found, fit = Check(entry.file, f"{name}, every pixel", (f"it cannot be read: {error}",)), False
+        checks.append(found)
+        if not fit:
+            break
+    return checks
 
 
 def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping[str, bool]) -> list[Check]:
@@ -225,22 +226,29 @@ def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping
 
     `doe` is what the models show; `intact` says of every file whether its bytes are those of the manifest.
     """
-    checks = []
     files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
-    with tempfile.TemporaryDirectory(prefix="doedesign-verify-") as scratch, child_process() as child:
-        begun = {
-            entry.file: _check_oasis(child, folder / entry.file, entry, intact[entry.file], expected, Path(scratch))
-            for entry in files
-            if entry.format == _OASIS
+    scratch_folder = tempfile.TemporaryDirectory(prefix="doedesign-verify-")
+    with scratch_folder as scratch, child_process() as child, ThreadPoolExecutor(1) as beside:
+
+        def begin(entry: FileEntry, *works: _Work) -> Future[list[Check]]:
+            return beside.submit(_found_by, works, child, folder / entry.file, entry, expected, Path(scratch))
+
+        # Libraries read in a process of their own, beside this one.
+        found = {
+            entry.file: [begin(entry, _klayout_check, _library_check)] for entry in files if entry.format == _OASIS
         }
+        own: dict[str, Check] = {}
         for entry in files:
             if entry.format == _GDS:
-                checks += _check_mask_file(folder, entry, expected)
-            elif entry.file in begun:
-                checks.append(begun[entry.file]())
-    for model in expected.manifest.models:
-        # Libraries of solids and pictures are given whole files only.
-        if intact[model.file]:
-            problems = model_problems(folder, model, doe)
-            checks.append(Check(model.file, "read back, volume or every height", tuple(problems)))
-    return checks
+                own[entry.file], fit = _own_check(folder / entry.file, entry, expected)
+                found[entry.file] = [begin(entry, _library_check)] if fit else []
+        models = [
+            Check(model.file, "read back, volume or every height", tuple(model_problems(folder, model, doe)))
+            for model in expected.manifest.models
+            if intact[model.file]  # libraries of solids and pictures are given whole files only
+        ]
+        checks: list[Check] = []
+        for entry in files:
+            checks += [own[entry.file]] if entry.file in own else []
+            checks += [check for one in found.get(entry.file, []) for check in one.result()]
+    return checks + models

@@ -8,6 +8,10 @@ from numpy.typing import ArrayLike
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
+from fab.order.formats import Formats
+
+# Every mask file as it can be read and changed without unpacking.
+PLAIN = Formats("gds", combined_gds=True)
 
 # What the names of the order of `tests/fab/conftest.py` begin with; its last part is the digest of its geometry.
 SMALL = "SMALL_A_1P85_2887"

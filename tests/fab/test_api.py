@@ -116,7 +116,7 @@ def test_an_order_is_written_proved_and_shown(tmp_path):
         report.require()
         assert report.checks == order.report.checks
     assert _Sound(order.report._repr_html_()).open == 0
-    assert named(order.folder, "ALL.gds").name in order._repr_html_()
-    named(order.folder, "CHROME.gds").unlink()
+    assert named(order.folder, "ALL.oas").name in order._repr_html_()
+    named(order.folder, "CHROME.gds.gz").unlink()
     with pytest.raises(fab.CheckFailed, match="the file is missing"):
         fab.verify(order).require()

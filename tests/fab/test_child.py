@@ -6,7 +6,7 @@ import time
 import pytest
 
 from fab.verification import child as module
-from fab.verification.child import ChildFailed, child_process, limited
+from fab.verification.child import ChildFailed, TooMuch, child_process, limited
 
 
 def test_results_come_back_one_after_another():
@@ -17,6 +17,7 @@ def test_results_come_back_one_after_another():
 
 def test_what_goes_wrong_is_told_and_the_next_work_is_done(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "_SECONDS", 1.0)
+    monkeypatch.setattr(module, "_PATIENCE", 1.0)
     with child_process() as child:
         with pytest.raises(ChildFailed, match="crashes"):
             child.result(child.begin(limited, 0, os._exit, 3), 0)
@@ -27,3 +28,13 @@ def test_what_goes_wrong_is_told_and_the_next_work_is_done(monkeypatch: pytest.M
         with pytest.raises(ChildFailed, match="invalid literal"):
             child.result(child.begin(limited, 0, int, "x"), 0)
         assert child.result(child.begin(limited, 0, pow, 3, 2), 0) == 9
+
+
+@pytest.mark.slow
+def test_work_that_keeps_the_processor_busy_is_ended_by_its_own_time():
+    with child_process() as child:
+        begun, start = child.begin(limited, 0, sum, range(10**12)), time.monotonic()
+        with pytest.raises(TooMuch, match="too long"):
+            child.result(begun, 0)
+        # Not by the clock, which allows a minute.
+        assert time.monotonic() - start < module._PATIENCE * module._SECONDS

@@ -18,7 +18,7 @@ from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
 from fab.verification.files import read_drawn_levels
-from tests.fab.maps import wide_map
+from tests.fab.maps import PLAIN, wide_map
 from tests.orders import named
 
 
@@ -31,7 +31,7 @@ def compensated(tmp_path_factory):
     process = Process(levels, spreads=bias)
     folders = [tmp_path_factory.mktemp("moved") / name for name in ("moved", "plain")]
     for folder, wafer in zip(folders, (Wafer(compensate=True), Wafer()), strict=True):
-        write_order(folder, wide_map(level_map, levels, grid, "small"), process=process, wafer=wafer)
+        write_order(folder, wide_map(level_map, levels, grid, "small"), process=process, wafer=wafer, formats=PLAIN)
     return folders
 
 
@@ -40,7 +40,7 @@ def test_edges_are_drawn_against_the_bias_and_the_map_comes_back(compensated):
     manifest = read_manifest(moved)
     assert [mask.edge_move_nm for mask in manifest.masks] == [-100, -100, 200, -100]
     levels, edges = manifest.staircase(), pixel_edges(manifest.grid())
-    drawn = read_drawn_levels(moved / manifest.combined_gds, levels, edges, manifest.doe_cell, manifest.edge_moves())
+    drawn = read_drawn_levels([moved / manifest.combined_gds], levels, edges, manifest.doe_cell, manifest.edge_moves())
     assert np.array_equal(drawn, np.load(named(plain, "LEVELS.npy")))
     # The process moves every edge by its bias: printed like that, by KLayout, the drawing is the plane again.
     for mask in manifest.masks:

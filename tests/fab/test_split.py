@@ -19,7 +19,7 @@ from fab.manifest.records import read_manifest
 from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
-from tests.fab.maps import wide_map
+from tests.fab.maps import PLAIN, wide_map
 
 LEVELS, GRID = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
 
@@ -31,7 +31,7 @@ def split(tmp_path_factory):
     process = Process(LEVELS, spreads={"common_cd_bias_m": Normal(0.1e-6, 0.0)})
     wafer = Wafer(compensate=True, line_splits_m=(-0.25e-6, 0.25e-6), order_control=True)
     folder = tmp_path_factory.mktemp("split") / "order"
-    written = write_order(folder, wide_map(level_map, LEVELS, GRID, "s"), process=process, wafer=wafer)
+    written = write_order(folder, wide_map(level_map, LEVELS, GRID, "s"), process=process, wafer=wafer, formats=PLAIN)
     assert written.report.passed
     return folder
 

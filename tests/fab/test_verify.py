@@ -265,7 +265,7 @@ def test_a_damaged_level_map_does_not_put_the_blame_on_the_masks(order_folder):
 
 def test_without_any_level_map_there_is_nothing_to_compare_with(order_folder):
     (order_folder / f"{SMALL}_LEVELS.npy").write_bytes(b"ruin")
-    (order_folder / MASKS[0]).write_bytes(b"ruin")
+    (order_folder / MASKS[3]).write_bytes(b"ruin")
     with pytest.raises(CheckFailed, match=r"LEVELS\.npy"):
         verify(order_folder)
 
@@ -296,7 +296,7 @@ def test_a_level_map_is_rebuilt_only_from_separate_pixels(tmp_path):
     write_gds(
         tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects[:1]), Layer(2): Shapes(rects[1:])}),))
     )
-    assert read_drawn_levels(tmp_path / "a.gds", levels, edges, "TOP").tolist() == [[0, 1], [3, 3]]
+    assert read_drawn_levels([tmp_path / "a.gds"], levels, edges, "TOP").tolist() == [[0, 1], [3, 3]]
     write_gds(tmp_path / "a.gds", Layout(1e-9, (Cell("TOP", {Layer(1): Shapes(rects)}),)))
     with pytest.raises(InputError, match=r"a\.gds: layer 1/0 .*1 pixels covered twice"):
-        read_drawn_levels(tmp_path / "a.gds", levels, edges, "TOP")
+        read_drawn_levels([tmp_path / "a.gds"], levels, edges, "TOP")

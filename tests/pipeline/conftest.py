@@ -130,7 +130,7 @@ def finish(tiny: Path, folder: Path) -> None:
     run, order = folder / "run", folder / "order"
     said = {
         "optimize": run_here("optimize", tiny, "--out", run),
-        "masks": run_here("masks", run, "--levels", 16, "--out", order),
+        "masks": run_here("masks", run, "--levels", 16, "--out", order, "--plates", "gds", "--combined-gds"),
         "verify": run_here("verify", order),
         "psf": run_here("psf", run, "--masks", order, "--json"),
     }

@@ -55,7 +55,7 @@ def test_the_order_is_made_of_the_depths_that_the_run_chose(chosen):
     assert tuple(mask.depth_nm for mask in manifest.masks) == pytest.approx([d * 1e9 for d in levels.depths_m], 1e-9)
     # From the file alone: the planes and the depths of the manifest are the heights of the run, where light passes.
     rebuilt = read_drawn_levels(
-        order / manifest.combined_gds, levels, pixel_edges(manifest.grid()), manifest.doe_cell, manifest.edge_moves()
+        manifest.drawn_files(order), levels, pixel_edges(manifest.grid()), manifest.doe_cell, manifest.edge_moves()
     )
     stored = read_height(run / "height.exr")
     inside = manifest.grid().inside_circle(manifest.aperture_m)

@@ -150,7 +150,7 @@ def test_folders_are_called_after_the_design(tiny, cli, tmp_path, monkeypatch):
     name = "--set=name=plate_1.2-b"
     assert cli("optimize", tiny, "--set", "optimize.steps=0", name).out == "runs/plate_1.2-b\n"
     assert cli("masks", "runs/plate_1.2-b").out.splitlines()[0] == "masks/plate_1.2-b"
-    assert named(tmp_path / "masks/plate_1.2-b", "ALL.gds").name.startswith("PLATE_1_A_1P85_")
+    assert named(tmp_path / "masks/plate_1.2-b", "ALL.oas").name.startswith("PLATE_1_A_1P85_")
     done = cli("psf", "runs/plate_1.2-b")
     assert "runs/plate_1.2-b/psf/from_masks.exr" in done.out.splitlines()
 

@@ -64,7 +64,7 @@ def test_a_marked_place_stays_where_it_is(cli, tmp_path, kind, shape):
     path = tmp_path / f"corner.{kind[:3]}"
     done = cli("masks", path, *write_map(path, height, kind), "--out", tmp_path / "order")
     assert done.code == 0, done.err
-    cells: list[Any] = gdstk.read_gds(str(named(tmp_path / "order", "ALL.gds"))).cells
+    cells: list[Any] = gdstk.read_oas(str(named(tmp_path / "order", "ALL.oas"))).cells
     (cell,) = [cell for cell in cells if cell.name.startswith("CORNER_A_") and cell.name.endswith("_DOE")]
     # The centre of the cell, from the centre of the map, in micrometres: half a cell off where the count is even.
     x, y = (column - (shape[1] - 1) / 2) * PITCH_UM, (row - (shape[0] - 1) / 2) * PITCH_UM
@@ -129,7 +129,7 @@ def test_strange_names(cli, tmp_path, monkeypatch, stem, folder, order_id):
     done = cli("masks", f"{stem}.npy", "--levels", LEVELS, "--step", "75 nm", "--pitch", "9 um")
     assert done.code == 0, done.err
     assert done.out.splitlines()[0] == f"masks/{folder}"
-    assert named(tmp_path / "masks" / folder, "ALL.gds").name.startswith(f"{order_id}_A_9_")
+    assert named(tmp_path / "masks" / folder, "ALL.oas").name.startswith(f"{order_id}_A_9_")
 
 
 @pytest.mark.slow
