@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,6 +13,7 @@ import tifffile
 from PIL import Image
 
 from tests.campaign.process import End, Worker, content
+from tests.campaign.shim import Fault
 
 SPEC = Path(__file__).with_name("tiny.toml")
 BARE = ("--levels", 4, "--step", "300 nm", "--pitch", "1.85 um", "--out", "order")
@@ -94,16 +96,24 @@ class Ground:
     """The files, and what each command makes of them.
 
     Attributes:
-        folder: where they are kept; made by `make` if it is empty.
+        folder: where they are kept; what is missing there is made when it is needed.
         worker: process that commands run in.
     """
 
     def __init__(self, folder: Path, worker: Worker) -> None:
         self.folder, self.worker = folder, worker
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._makers = {
+            "run": self._optimized,
+            "order": self._ordered,
+            "measured.json": self._measured,
+            "model": self._trained,
+            "half": self._stopped,
+        }
         self._contents: dict[str, dict[str, bytes]] = {}
-        if not (folder / "made").exists():
-            self._make()
+        if not self.work.exists():
+            self.work.mkdir(parents=True)
+            _small_files(self.work)
 
     @property
     def work(self) -> Path:
@@ -116,41 +126,45 @@ class Ground:
             raise RuntimeError(f"{' '.join(map(str, arguments))}: {end}\n{end.err}")
         return end
 
-    def _make(self) -> None:
-        work = self.work
-        shutil.rmtree(work, ignore_errors=True)
-        (work / "pictures").mkdir(parents=True)
-        shutil.copy(SPEC, work / "spec.toml")
-        _small_files(work)
+    def _ready(self, needed: str) -> Path:
+        """Path of a file or folder that is there from now on."""
+        path = self.work / needed
+        with self._lock:
+            if not path.exists():
+                self._makers[needed]()
+        return path
+
+    def _optimized(self) -> None:
         self._run(self.folder, "optimize", "spec.toml", "--out", "run")
+
+    def _ordered(self) -> None:
+        self._ready("run")
         self._run(self.folder, "masks", "run", "--out", "order")
-        sheet = json.loads(next((work / "order").glob("*_RUNSHEET.json")).read_text())
-        sheet["measured"]["mask 1"]["depth_nm"] = 301.0
-        (work / "measured.json").write_text(json.dumps(sheet, indent=1))
+
+    def _trained(self) -> None:
+        self._ready("run")
         self._run(self.folder, "train", "run", "--images", "pictures", "--out", "model")
-        # A run that was ended after its first steps.
-        self._run(self.folder, "optimize", "spec.toml", "--out", "half", "--set", "optimize.steps=4")
-        self._half()
-        (self.folder / "made").touch()
 
-    def _half(self) -> None:
-        """Stop the second run where its last checkpoint is on the disk and nothing else."""
-        from tests.campaign.shim import Fault
+    def _measured(self) -> None:
+        sheet = json.loads(next(self._ready("order").glob("*_RUNSHEET.json")).read_text())
+        sheet["measured"]["mask 1"]["depth_nm"] = 301.0
+        (self.work / "measured.json").write_text(json.dumps(sheet, indent=1))
 
-        shutil.rmtree(self.work / "half")
-        arguments = COMMANDS["optimize-resumed"].arguments
-        calls = len(self.worker.run(arguments, self.folder).calls)
+    def _stopped(self) -> None:
+        """A run that was ended when its last checkpoint was on the disk."""
+        half, arguments = self.work / "half", COMMANDS["optimize-resumed"].arguments
+        calls = len(self._run(self.folder, *arguments).calls)
         for call in range(20, calls):
-            shutil.rmtree(self.work / "half")
-            self.worker.run(arguments, self.folder, Fault(call=call, number=2))
-            if (self.work / "half" / "checkpoint.npz").exists():
+            shutil.rmtree(half)
+            self.worker.run(arguments, self.folder, Fault(call=call, number=signal.SIGINT))
+            if (half / "checkpoint.npz").exists():
                 return
 
     def lay(self, name: str, place: Path) -> Path:
         """Copy what a command needs into `place`/work; returns that folder."""
         shutil.rmtree(place, ignore_errors=True)
         for needed in COMMANDS[name].needs:
-            source, target = self.work / needed, place / "work" / needed
+            source, target = self._ready(needed), place / "work" / needed
             target.parent.mkdir(parents=True, exist_ok=True)
             if source.is_dir():
                 shutil.copytree(source, target, symlinks=True)
@@ -198,6 +212,8 @@ def leftovers(names: Iterable[str]) -> list[str]:
 
 
 def _small_files(work: Path) -> None:
+    shutil.copy(SPEC, work / "spec.toml")
+    (work / "pictures").mkdir()
     rng = np.random.default_rng(0)
     for k, kind in enumerate(("png", "tif", "png", "png")):
         picture = Image.fromarray(rng.integers(30, 256, (5, 6, 3), np.uint8)).resize((48, 40))
