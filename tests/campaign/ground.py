@@ -1,10 +1,11 @@
 """What every case begins with: the smallest files of every kind, and each command on them undisturbed."""
 
+import itertools
 import json
 import shutil
 import signal
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,6 +91,15 @@ COMMANDS = {
         ("run", "order"),
     ),
 }
+
+
+WRITING = tuple(name for name, command in COMMANDS.items() if command.writes is not None)
+
+
+def in_turn(names: Sequence[str], seed: int, count: int) -> Iterator[str]:
+    """So many names, one after another in an order that the seed chooses."""
+    order = np.random.default_rng(seed).permutation(np.array(names, object))
+    yield from itertools.islice(itertools.cycle(order), count)
 
 
 class Ground:

@@ -9,18 +9,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from tests.campaign.field import Family, Field, disturbed
-from tests.campaign.ground import COMMANDS, Ground
+from tests.campaign.ground import WRITING, Ground, in_turn
 from tests.campaign.process import SIGNALS
 from tests.campaign.shim import Fault
-
-WRITING = tuple(name for name, command in COMMANDS.items() if command.writes is not None)
 
 
 def moments(ground: Ground, seed: int, count: int) -> Iterator[tuple[str, str]]:
     """Commands in turn, each with a call ("call=17") or a time in seconds ("after=0.25")."""
     rng = np.random.default_rng(seed)
-    for k in range(count):
-        name = WRITING[k % len(WRITING)]
+    for name in in_turn(WRITING, seed, count):
         end = ground.whole(name)[1]
         if rng.random() < 0.5:
             yield name, f"call={rng.integers(1, len(end.calls) + 1)}"

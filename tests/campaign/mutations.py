@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.campaign.field import Family, Field, said_badly
-from tests.campaign.ground import COMMANDS, Ground, leftovers
+from tests.campaign.ground import COMMANDS, Ground, in_turn, leftovers
 from tests.campaign.mutate import changed
 from tests.campaign.process import content
 
@@ -26,17 +26,16 @@ def inputs(ground: Ground, name: str) -> list[str]:
 
 
 def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
-    """Commands in turn; a file is chosen after its kind, so that a kind with many files does not hide the others."""
     rng = np.random.default_rng(seed)
-    names = list(COMMANDS)
-    for k in range(count):
-        yield f"{names[k % len(names)]}:{rng.integers(2**32)}"
+    for name in in_turn(tuple(COMMANDS), seed, count):
+        yield f"{name}:{rng.integers(2**32)}"
 
 
 def _problems(field: Field, case: str) -> list[str]:
     name, number = case.split(":")
     rng, command = np.random.default_rng(int(number)), COMMANDS[name]
     files = inputs(field.ground, name)
+    # By kind, so that a kind with many files does not hide the others.
     kinds = sorted({Path(file).suffix for file in files})
     kind = kinds[rng.integers(len(kinds))]
     alike = [file for file in files if Path(file).suffix == kind]

@@ -1,25 +1,22 @@
 """Two processes on one folder at once: the second waits for nobody, and nothing is mixed up."""
 
+import time
 from collections.abc import Iterator
 
 import numpy as np
 
 from tests.campaign.field import Family, Field, said_badly
-from tests.campaign.ground import COMMANDS, Ground, differences
-from tests.campaign.kills import WRITING
+from tests.campaign.ground import COMMANDS, WRITING, Ground, differences, in_turn
 from tests.campaign.process import content
 
 
 def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
     rng = np.random.default_rng(seed)
-    for k in range(count):
-        name = WRITING[k % len(WRITING)]
+    for name in in_turn(WRITING, seed, count):
         yield f"{name}:after={rng.uniform(0, ground.whole(name)[1].wall_s):.3f}"
 
 
 def _problems(field: Field, case: str) -> list[str]:
-    import time
-
     name, moment = case.split(":")
     command, whole = COMMANDS[name], field.ground.after(name)
     work = field.ground.lay(name, field.place)
