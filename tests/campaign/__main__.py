@@ -98,7 +98,8 @@ class Campaign:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the campaign; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("family", nargs="*", help=f"{', '.join(FAMILIES)}; all by default")
+    about = "; ".join(f"{name}: {family.about}" for name, family in FAMILIES.items())
+    parser.add_argument("family", nargs="*", help=f"{about}; all by default")
     parser.add_argument("--count", type=int, help="cases of each family; some minutes' worth by default")
     parser.add_argument("--seed", type=int, help="where the cases come from; a new one by default")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases at once")

@@ -90,7 +90,7 @@ def disturbed(
     before = content(work)
     end = field.worker.run(command.arguments, place, fault, kill_after_s=kill_after_s)
     found = content(work)
-    killed = end.code is not None and end.code == -9 and -9 in codes
+    killed = end.code == -9 and -9 in codes
     problems = [] if killed else said_badly(end)
     if end.code not in (0, *codes):
         problems.append(f"unexpected end: {end}")
