@@ -185,6 +185,8 @@ def test_target_pattern_is_zero_when_all_light_is_on_target() -> None:
     assert target.sum() == pytest.approx(1.0, abs=1e-5)
     images = PsfSet(jnp.zeros((1, 0, *target.shape)), jnp.asarray(target)[None, None], jnp.zeros((1, 0)), camera)
     assert float(term.value(images)) == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_array_equal(np.asarray(term.target), target)
+    assert terms_from_spec(load_spec(EXAMPLES / "quick.toml"), CAMERA, {})[0].target is None
 
 
 def test_a_picture_is_a_target_with_its_top_at_the_highest_y(tmp_path: Path) -> None:
