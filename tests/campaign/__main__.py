@@ -27,7 +27,7 @@ from tests.campaign.full_disk import FULL_DISK
 from tests.campaign.ground import Ground
 from tests.campaign.kills import KILLS, SIGNALLED
 from tests.campaign.mutations import MUTATIONS
-from tests.campaign.orders import BOMBS
+from tests.campaign.orders import BOMBS, PLANTED
 from tests.campaign.process import Worker
 from tests.campaign.two_processes import TWO_PROCESSES
 
@@ -38,6 +38,7 @@ FAMILIES = {
     "two_processes": TWO_PROCESSES,
     "mutations": MUTATIONS,
     "bombs": BOMBS,
+    "planted": PLANTED,
 }
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
+from tests.campaign.planted import write_base
 from tests.campaign.process import End, Worker, content
 from tests.campaign.shim import Fault
 
@@ -169,6 +170,14 @@ class Ground:
             self.worker.run(arguments, self.folder, Fault(call=call, number=signal.SIGINT))
             if (half / "checkpoint.npz").exists():
                 return
+
+    def base(self) -> Path:
+        """The order that defects are planted in."""
+        path = self.folder / "planted"
+        with self._lock:
+            if not path.exists():
+                write_base(path)
+        return path
 
     def lay(self, name: str, place: Path) -> Path:
         """Copy what a command needs into `place`/work; returns that folder."""

@@ -1,6 +1,7 @@
-"""Orders for `verify`: drawings that unfold without bounds, in the place of a plate or of the review file."""
+"""Orders for `verify`: with a planted defect, or with a drawing that unfolds without bounds in the place of a file."""
 
 import hashlib
+import shutil
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,6 +10,7 @@ from tests.campaign.bombs import gds_bombs, oasis_bombs
 from tests.campaign.field import Family, Field, said_badly
 from tests.campaign.ground import COMMANDS, Ground
 from tests.campaign.mutations import MOST_BYTES, REFUSED_S
+from tests.campaign.planted import defects
 
 
 def _bombs(ground: Ground, seed: int, count: int) -> Iterator[str]:
@@ -36,3 +38,27 @@ def _exploded(field: Field, case: str) -> list[str]:
 
 
 BOMBS = Family("drawings that unfold without bounds, for verify", 20, _bombs, _exploded)
+
+
+def _defects(ground: Ground, seed: int, count: int) -> Iterator[str]:
+    names = [defect.name for defect in defects()]
+    order = np.random.default_rng(seed).permutation(len(names))
+    yield from (names[k] for k in order[:count])
+
+
+def _planted(field: Field, case: str) -> list[str]:
+    defect = next(one for one in defects() if one.name == case)
+    work = field.place / "work"
+    shutil.rmtree(field.place, ignore_errors=True)
+    shutil.copytree(field.ground.base(), work / "order", symlinks=True)
+    defect.plant(work / "order")
+    end = field.worker.run(COMMANDS["verify"].arguments, field.place)
+    problems = said_badly(end)
+    if (end.code != 0) != defect.meaningful:
+        problems.append(
+            f"{'a defect passes' if defect.meaningful else 'a change that means nothing is refused'}: {end}"
+        )
+    return problems
+
+
+PLANTED = Family("defects planted in orders, for verify", 60, _defects, _planted)
