@@ -379,18 +379,21 @@ Redraw = Callable[[Layout], Layout]
 
 
 def _cells(layout: Layout, ending: str, change: Callable[[Cell], Cell]) -> Layout:
-    """Change the cells whose names end so ("" for the top cell)."""
+    """Change the cells whose names end so ("" for the top cell); the same layout if none of them has it."""
     chosen = [cell.name for cell in layout.cells if (cell is layout.top if not ending else cell.name.endswith(ending))]
     assert chosen
-    return replace(layout, cells=tuple(change(cell) if cell.name in chosen else cell for cell in layout.cells))
+    cells = tuple(change(cell) if cell.name in chosen else cell for cell in layout.cells)
+    alike = all(one is other for one, other in zip(cells, layout.cells, strict=True))
+    return layout if alike else replace(layout, cells=cells)
 
 
 def _shapes(cell: Cell, change: Callable[[Shapes], Shapes]) -> Cell:
     """Change the shapes on the lowest layer of a cell that has rectangles, or any."""
-    layers = sorted(
-        cell.shapes, key=lambda layer: (not len(cell.shapes[layer].rectangles), layer.number, layer.datatype)
-    )
-    return replace(cell, shapes={**cell.shapes, layers[0]: change(cell.shapes[layers[0]])})
+    drawn = {layer: shapes for layer, shapes in cell.shapes.items() if len(shapes)}
+    if not drawn:
+        return cell
+    lowest = min(drawn, key=lambda layer: (not len(drawn[layer].rectangles), layer.number, layer.datatype))
+    return replace(cell, shapes={**cell.shapes, lowest: change(drawn[lowest])})
 
 
 def _moved(shapes: Shapes, units: int, which: slice = slice(None)) -> Shapes:
@@ -417,7 +420,8 @@ def _place(word: str, units: int, which: slice = slice(None)) -> Callable[[Cell]
 
     def change(cell: Cell) -> Cell:
         chosen = [n for n, reference in enumerate(cell.references) if word in reference.cell][which]
-        assert chosen
+        if not chosen:
+            return cell
         moved = (replace(r, x=r.x + units) if n in chosen else r for n, r in enumerate(cell.references))
         return replace(cell, references=tuple(moved))
 
@@ -487,7 +491,7 @@ def _redraw(folder: Path, plate: int | None, change: Redraw) -> None:
     file = _file(folder, "_ALL.gds") if plate is None else _plates(folder)[plate]
     layout = read_gds(folder / file)
     changed = change(layout)
-    if changed is layout:  # a plate that holds no DOE
+    if changed is layout:  # not every plate holds everything
         changed = _REDRAWN["a mark moved"](layout)
     write_gds(folder / file, changed)
     _state(folder, file)
