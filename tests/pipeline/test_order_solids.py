@@ -11,7 +11,7 @@ from fab.solids.rings import ring_levels
 
 def models(order):
     listed = json.loads((order / "manifest.json").read_text())["models"]
-    return {entry["file"].split("_", 2)[2]: entry for entry in listed}
+    return {entry["file"].split("_", 4)[4]: entry for entry in listed}
 
 
 @pytest.mark.slow
