@@ -209,6 +209,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             os.close(handle)
 
 
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder among the system's temporary ones, removed in the end; an error of it names that place."""
+    with os_errors_explained(tempfile.gettempdir()):
+        folder = Path(tempfile.mkdtemp(prefix="doedesign-verify-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def sha256_bytes(data: bytes | memoryview) -> str:
     """Return the SHA-256 of a byte string, in lower-case hexadecimal."""
     return hashlib.sha256(data).hexdigest()

@@ -292,7 +292,7 @@ def read_manifest(folder: str | Path) -> Manifest:
     data = read_json(path)
     if data.get("format") != FORMAT:
         got = repr(data.get("format"))
-        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Give a mask order of this version.")
+        raise InputError(str(path), f'the format must be "{FORMAT}"', got, "Draw it again elsewhere.")
     digest = data.pop("sha256", None)
     content = canonical_json(data)
     if digest != sha256_bytes(content):

@@ -15,7 +15,6 @@ Libraries are not safe against broken files. They work in a process of their own
 this one, so that an order takes two cores.
 """
 
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
-from fab.files import read_npy, sha256_file
+from fab.files import read_npy, scratch_folder, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
@@ -227,11 +226,10 @@ def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping
     `doe` is what the models show; `intact` says of every file whether its bytes are those of the manifest.
     """
     files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
-    scratch_folder = tempfile.TemporaryDirectory(prefix="doedesign-verify-")
-    with scratch_folder as scratch, child_process() as child, ThreadPoolExecutor(1) as beside:
+    with scratch_folder() as scratch, child_process() as child, ThreadPoolExecutor(1) as beside:
 
         def begin(entry: FileEntry, *works: _Work) -> Future[list[Check]]:
-            return beside.submit(_found_by, works, child, folder / entry.file, entry, expected, Path(scratch))
+            return beside.submit(_found_by, works, child, folder / entry.file, entry, expected, scratch)
 
         # Libraries read in a process of their own, beside this one.
         found = {
