@@ -31,6 +31,8 @@ from fab.errors import InputError
 
 MANIFEST_NAME = "manifest.json"
 
+_NO_TEXT = re.compile("[\ud800-\udfff]")
+
 _CURES = {
     errno.EACCES: ("the place must be writable", "Choose another output folder or change its permissions."),
     errno.EPERM: ("the place must be writable", "Choose another output folder or change its permissions."),
@@ -142,7 +144,14 @@ def _umask() -> int:
     return mask
 
 
+def require_text(path: Path) -> None:
+    """Refuse a path with bytes that are no UTF-8, which libraries for layouts and solids cannot open."""
+    if _NO_TEXT.search(str(path)):
+        raise InputError(str(path), "the path must be UTF-8 text", "other bytes", "Rename it.")
+
+
 def _require_replaceable(path: Path) -> None:
+    require_text(path)
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not path.is_dir():
@@ -256,8 +265,12 @@ def sha256_file(path: str | Path) -> str:
 
 
 def canonical_json(value: object) -> bytes:
-    """Return a value as JSON whose bytes depend on it alone; NaN and infinities raise a ValueError."""
-    return (json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    """Return a value as JSON whose bytes depend on it alone; NaN and infinities raise a ValueError.
+
+    Bytes of a file name that are no UTF-8 are written as the text of their escapes.
+    """
+    text = json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return _NO_TEXT.sub(lambda found: f"\\\\u{ord(found[0]):04x}", text).encode()
 
 
 def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -198,7 +198,7 @@ def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
         return tomllib.loads(read_bytes(path, 1 << 24).decode())
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits
         raise InputError(str(path), f"{what} must be valid TOML", f'"{error}"', "Fix that line.") from error
     except RecursionError as error:
         raise InputError(str(path), f"{what} must be valid TOML", "brackets without end", cure) from error
@@ -213,7 +213,7 @@ def _override(raw: dict[str, Any], text: str) -> str:
     key, value = re.sub(r"\[(\d+)\]", r".\1", found[1]), found[2].strip()
     try:
         table = tomllib.loads(f"value = {value}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         table = {}
     # Anything that is no TOML value is text, so that `sensor.pitch=1.85 um` needs no quotes.
     _put(raw, key, table["value"] if len(table) == 1 else value)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes
+from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes, require_text
 from fab.layout.geometry import pixel_edges
 from fab.manifest.records import Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
@@ -59,6 +59,7 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
     """
     folder = Path(order) if isinstance(order, str | Path) else order.folder
+    require_text(folder)
     recorded, ours = read_manifest(folder), tools()
     with os_errors_explained(folder):
         level, map_check = reference_level(folder, recorded)

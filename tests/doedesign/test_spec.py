@@ -383,3 +383,13 @@ def test_impossible_openings_and_sensors(override: str, message: str):
 
 def test_a_bound_itself_is_inside():
     assert load_spec(AUTOMOTIVE, ["process.level_step=0.1 nm"]).process.level_step_m == pytest.approx(1e-10)
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000, "{a=" * 5000], ids=["digits", "brackets", "tables"])
+def test_a_value_that_python_refuses_is_a_mistake_in_the_file(tmp_path: Path, value: str):
+    path = tmp_path / "a.toml"
+    path.write_text(f"value = {value}", "utf-8")
+    with pytest.raises(InputError, match="must be valid TOML"):
+        load_spec(path)
+    with pytest.raises(InputError, match=r"process\.levels"):
+        load_spec(Path("examples/quick.toml"), [f"process.levels={value}"])

@@ -289,3 +289,16 @@ def test_read_npy_survives_any_flipped_header_byte(tmp_path):
         # Read or refused: any other exception would fail here.
         with suppress(InputError):
             read_npy(tmp_path / "d.npy")
+
+
+def test_bytes_of_a_name_that_are_no_text_are_written_as_text(tmp_path: Path):
+    data = canonical_json({"file": "caf\udce9.npy", "other": "µ\\"})
+    assert json.loads(data) == {"file": "caf\\udce9.npy", "other": "µ\\"}
+    assert canonical_json(json.loads(data)) == data
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path: Path):
+    # Libraries for layouts and solids cannot open files in it.
+    with pytest.raises(InputError, match="must be UTF-8 text"), atomic_folder(tmp_path / "caf\udce9"):
+        pass
+    assert not list(tmp_path.iterdir())
