@@ -6,16 +6,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from fab.errors import InputError
+
 
 class StopRequest:
     """Request to end the work; made by `stoppable`.
 
     Attributes:
         asked: whether a signal arrived.
+        cut: whether it interrupted whatever was going on.
     """
 
     def __init__(self) -> None:
-        self.asked, self._waits = False, False
+        self.asked, self.cut, self._waits = False, False, False
 
     def ask(self, *_: Any) -> None:
         """Handle a signal: at once, or after the step within `gently`; a second signal does not wait.
@@ -24,6 +27,7 @@ class StopRequest:
             KeyboardInterrupt: at once.
         """
         if self.asked or not self._waits:
+            self.cut = True
             raise KeyboardInterrupt
         self.asked = True
 
@@ -47,9 +51,19 @@ def stoppable() -> Iterator[StopRequest]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let all the signals raise KeyboardInterrupt, as SIGINT does by default, so that work cleans up behind itself."""
-    with _handled(StopRequest().ask):
-        yield
+    """Let all the signals raise KeyboardInterrupt, as SIGINT does by default, so that work cleans up behind itself.
+
+    Raises:
+        KeyboardInterrupt: a signal came, also where a library that was just being imported took it for a fault.
+    """
+    stop = StopRequest()
+    with _handled(stop.ask):
+        try:
+            yield
+        except Exception as error:
+            if stop.cut and not isinstance(error, InputError):
+                raise KeyboardInterrupt from error
+            raise
 
 
 @contextmanager

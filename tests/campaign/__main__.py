@@ -56,13 +56,13 @@ class Campaign:
 
     def __init__(self, folder: Path, jobs: int) -> None:
         self._folder, self._jobs = folder, jobs
-        self._local, self._fields = threading.local(), []
+        self._local, self._fields, self._numbers = threading.local(), [], itertools.count()
         self._worker = Worker(folder / "said")
         self.ground = Ground(folder, self._worker)
 
     def _field(self) -> Field:
         if not hasattr(self._local, "field"):
-            self._local.field = Field(self.ground, self._folder / f"field{len(self._fields)}")
+            self._local.field = Field(self.ground, self._folder / f"field{next(self._numbers)}")
             self._fields.append(self._local.field)
         return self._local.field
 

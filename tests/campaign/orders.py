@@ -1,5 +1,6 @@
 """Orders for `verify`: with a planted defect, or with a drawing that unfolds without bounds in the place of a file."""
 
+import gzip
 import hashlib
 import shutil
 from collections.abc import Iterator
@@ -23,7 +24,9 @@ def _exploded(field: Field, case: str) -> list[str]:
     data = {**gds_bombs(), **oasis_bombs()}[case]
     work = field.ground.lay("verify", field.place)
     order, ending = work / "order", case[case.rindex(".") :]
-    path = sorted(order.glob(f"*{ending}"))[-1]
+    path = sorted([*order.glob(f"*{ending}"), *order.glob(f"*{ending}.gz")])[-1]
+    if path.suffix == ".gz":
+        data = gzip.compress(data)
     old, new = (hashlib.sha256(content).hexdigest() for content in (path.read_bytes(), data))
     path.write_bytes(data)
     manifest = order / "manifest.json"

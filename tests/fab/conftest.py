@@ -10,7 +10,7 @@ from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.write import write_order
-from tests.fab.maps import PLAIN
+from tests.fab.maps import FEW, PLAIN
 
 # Odd and even sides, and a pitch whose half is a whole number of nanometres, as in the automotive design.
 SHAPE = (21, 16)
@@ -35,7 +35,7 @@ def level_map(levels, grid) -> LevelMap:
 @pytest.fixture(scope="session")
 def written_order(tmp_path_factory, level_map) -> Path:
     folder = tmp_path_factory.mktemp("orders") / "small"
-    write_order(folder, level_map, source={"height_map": "a test"}, formats=PLAIN)
+    write_order(folder, level_map, source={"height_map": "a test"}, wafer=FEW, formats=PLAIN)
     return folder
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fab.grid import Grid
+from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.order.formats import Formats
@@ -13,8 +14,11 @@ from fab.order.formats import Formats
 # Every mask file as it can be read and changed without unpacking.
 PLAIN = Formats("gds", combined_gds=True)
 
+# Nine dies instead of hundreds, whose chrome and places take most of the time that a small order takes.
+FEW = Wafer(dies=(3, 3))
+
 # What the names of the order of `tests/fab/conftest.py` begin with; its last part is the digest of its geometry.
-SMALL = "SMALL_A_1P85_2887"
+SMALL = "SMALL_A_1P85_4823"
 
 
 def level_map_from(

@@ -14,7 +14,7 @@ from fab.manifest.records import read_manifest
 from fab.order.write import write_order
 from fab.units import NM, UM
 from fab.verification.files import read_drawn_levels
-from tests.fab.maps import PLAIN, wide_map
+from tests.fab.maps import FEW, PLAIN, wide_map
 
 BLANK = 15
 
@@ -74,7 +74,7 @@ def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_p
     # A circle wide enough for every pixel is wider than the raster; the aperture may not be, so corners are blank.
     folder = tmp_path / "o"
     given = wide_map(level_map, levels, grid, "odd")
-    assert write_order(folder, given, chrome=Chrome(0.5 * UM), formats=PLAIN).report.passed
+    assert write_order(folder, given, chrome=Chrome(0.5 * UM), wafer=FEW, formats=PLAIN).report.passed
     manifest = read_manifest(folder)
     edges = pixel_edges(grid)
     combined = folder / manifest.combined_gds

@@ -13,7 +13,7 @@ from fab.layout.doe import mask_layout
 from fab.layout.geometry import Chrome
 from fab.levels import Levels, height_of, planes, quantise
 from fab.order.write import write_order
-from tests.fab.maps import wide_map
+from tests.fab.maps import FEW, wide_map
 from tests.orders import named
 
 LEVELS = Levels(16, 75e-9)
@@ -79,7 +79,9 @@ def test_the_depths_of_all_open_masks_make_the_height():
 
 
 def test_oasis_draws_the_same_way_up(tmp_path):
-    write_order(tmp_path / "o", wide_map(one_pixel(3, 1, 14), LEVELS, GRID, "up"), chrome=Chrome(overlap_m=1e-6))
+    write_order(
+        tmp_path / "o", wide_map(one_pixel(3, 1, 14), LEVELS, GRID, "up"), chrome=Chrome(overlap_m=1e-6), wafer=FEW
+    )
     layout = kdb.Layout()
     layout.read(str(named(tmp_path / "o", "ALL.oas")))
     box = layout.cell(f"{layout.top_cell().name}_DOE").bbox(layout.find_layer(1, 0))

@@ -11,7 +11,7 @@ from fab.levels import Levels
 from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.pictures import read_pixels
-from tests.fab.maps import level_map_from
+from tests.fab.maps import FEW, level_map_from
 from tests.fab.mended import mend, told
 from tests.orders import named
 
@@ -24,7 +24,7 @@ LEVEL = (np.hypot(X, Y).astype(int) // 3) % 4
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     level_map = level_map_from(LEVEL, LEVELS, 2e-6, 140e-6, "grey")
-    return write_order(tmp_path_factory.mktemp("direct") / "o", level_map, direct_write=True).folder
+    return write_order(tmp_path_factory.mktemp("direct") / "o", level_map, wafer=FEW, direct_write=True).folder
 
 
 @pytest.mark.parametrize("ending", ["DIRECT.oas", "DIRECT.dxf"])

@@ -17,7 +17,7 @@ from fab.order.formats import Formats
 from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.units import NM
-from tests.fab.maps import SMALL
+from tests.fab.maps import FEW, SMALL
 from tests.fab.mended import mend
 
 M1 = f"{SMALL}_M1_75NM.gds.gz"
@@ -26,7 +26,7 @@ M1 = f"{SMALL}_M1_75NM.gds.gz"
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory, level_map):
     folder = tmp_path_factory.mktemp("formats") / "small"
-    write_order(folder, level_map, source={"height_map": "a test"})
+    write_order(folder, level_map, source={"height_map": "a test"}, wafer=FEW)
     return folder
 
 

@@ -8,7 +8,7 @@ from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.solids import write
 from fab.solids.model import ModelKind, model_entry
-from tests.fab.maps import level_map_from
+from tests.fab.maps import FEW, level_map_from
 from tests.fab.mended import mend, told
 from tests.orders import named
 
@@ -38,7 +38,7 @@ def order(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(write, "KINDS", (*write.KINDS, *kinds))
     level = np.random.default_rng(0).integers(0, 16, (19, 18))
-    return write_order(tmp_path / "o", level_map_from(level, aperture_m=18e-6, name="toy"))
+    return write_order(tmp_path / "o", level_map_from(level, aperture_m=18e-6, name="toy"), wafer=FEW)
 
 
 def counts(order):

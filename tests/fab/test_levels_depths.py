@@ -20,7 +20,7 @@ from fab.process import Process
 from fab.rules.check import Rules
 from fab.rules.repair import repair
 from fab.runsheet.recipe import depths_m
-from tests.fab.maps import PLAIN, level_map_from, wide_map
+from tests.fab.maps import FEW, PLAIN, level_map_from, wide_map
 
 NM = 1e-9
 STEP_M = 300 * NM
@@ -191,7 +191,7 @@ def order(tmp_path_factory):
     folder = tmp_path_factory.mktemp("orders") / "uneven"
     grid = Grid((21, 16), 1.85e-6)
     drawn, source = wide_map(level_map, levels, grid, "uneven"), {"height_map": "a test"}
-    written = write_order(folder, drawn, source=source, formats=PLAIN)
+    written = write_order(folder, drawn, source=source, wafer=FEW, formats=PLAIN)
     return folder, levels, written.report
 
 

@@ -23,7 +23,7 @@ from fab.solids.patch import Patch
 from fab.solids.step import step_bodies
 from fab.solids.write import model_problems, write_models
 from fab.units import MM, NM, UM
-from tests.fab.maps import level_map_from
+from tests.fab.maps import FEW, level_map_from
 from tests.orders import named
 
 LEVELS, GRID = Levels(16, 75 * NM), Grid((30, 30), 2 * UM)
@@ -44,7 +44,7 @@ def entries(folder):
 
 def test_a_radial_order_has_its_rings_as_exact_circles(tmp_path):
     level_map, profile = radial_map()
-    write_order(tmp_path / "o", LevelMap(level_map, LEVELS, GRID, 59 * UM, "rings"))
+    write_order(tmp_path / "o", LevelMap(level_map, LEVELS, GRID, 59 * UM, "rings"), wafer=FEW)
     entry = entries(tmp_path / "o")["PLATE.step"]
     assert "relief of 15 rings as exact circles; the masks draw them in pixels" in entry.content
     manifest = read_manifest(tmp_path / "o")
@@ -66,7 +66,6 @@ def test_the_wafer_of_an_order(written_order):
     manifest, entry = read_manifest(written_order), entries(written_order)["WAFER.step"]
     assert "primary flat of 32.5 mm at -y" in entry.content
     dies = len(manifest.wafer.dies_mm)
-    assert dies > 100
     assert f"chrome of {dies} dies" in entry.content
     body = step_bodies(written_order / entry.file)
     # A disc of 100 mm without its segment of 32.5 mm.
@@ -100,7 +99,7 @@ def patched(tmp_path_factory):
     level_map = np.random.default_rng(3).integers(0, 16, (24, 31)).astype(np.uint8)
     folder = tmp_path_factory.mktemp("patched") / "o"
     level_map = level_map_from(level_map, LEVELS, 1.85 * UM, 44 * UM, "patch")
-    write_order(folder, level_map, patch=Patch(-9 * UM, 7.4 * UM, 14.8 * UM))
+    write_order(folder, level_map, patch=Patch(-9 * UM, 7.4 * UM, 14.8 * UM), wafer=FEW)
     return folder
 
 
@@ -146,6 +145,6 @@ def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_
     # Warnings may come first, work may not.
     assert [record.message for record in caplog.records if record.levelno < logging.WARNING] == []
     assert not (tmp_path / "o").exists()
-    write_order(tmp_path / "o", level_map, patch=Patch(0.0, 0.0, 50 * UM, step=False))
+    write_order(tmp_path / "o", level_map, patch=Patch(0.0, 0.0, 50 * UM, step=False), wafer=FEW)
     names = {name for name in entries(tmp_path / "o") if name.startswith("PATCH")}
     assert names == {"PATCH.3mf", "PATCH.glb", "PATCH_MM.stl"}

@@ -18,7 +18,7 @@ from fab.order.order import plain_name, plan_order
 from fab.order.terms import OrderTerms
 from fab.order.write import write_order
 from fab.verification.files import read_drawn_levels
-from tests.fab.maps import PLAIN, SMALL, level_map_from, wide_map
+from tests.fab.maps import FEW, PLAIN, SMALL, level_map_from, wide_map
 
 NAMES = [
     f"{SMALL}_ALL.gds",
@@ -98,7 +98,7 @@ def test_the_manifest_tells_what_each_mask_is(written_order, level_map):
 
 def test_the_same_inputs_give_the_same_bytes_in_every_file(written_order, tmp_path, level_map):
     again = tmp_path / "elsewhere" / "again"
-    write_order(again, level_map, source={"height_map": "a test"}, formats=PLAIN)
+    write_order(again, level_map, source={"height_map": "a test"}, wafer=FEW, formats=PLAIN)
     for name in NAMES:
         assert (again / name).read_bytes() == (written_order / name).read_bytes(), name
 
@@ -118,7 +118,7 @@ def test_orders_of_every_kind_verify(tmp_path, caplog, count, step_nm, shape, fi
     rng = np.random.default_rng(1)
     level_map = rng.integers(0, count, shape) if fill is None else np.full(shape, fill)
     given = wide_map(level_map, levels, grid, "kind")
-    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-6)).report.passed
+    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-6), wafer=FEW).report.passed
     warnings = caplog.messages[: caplog.messages.index("drawing the masks")]
     assert any("what flat glass does" in line for line in warnings) == (fill is not None)
     assert any("are hard to see" in line for line in warnings) == (step_nm < 150 and count > 1)
@@ -131,7 +131,7 @@ def test_edges_that_had_to_be_rounded_are_stated_and_verify(tmp_path, levels):
     grid = Grid((5, 7), 1e-6 / 3)
     rng = np.random.default_rng(1)
     given = LevelMap(rng.integers(0, 16, (5, 7), np.uint8), levels, grid, 1.6e-6, "thirds")
-    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-7)).report.passed
+    assert write_order(tmp_path / "o", given, chrome=Chrome(1e-7), wafer=FEW).report.passed
     assert read_manifest(tmp_path / "o").pixel_edges.startswith("each pixel edge is rounded to 1 nm")
 
 
@@ -143,20 +143,20 @@ def test_an_order_that_does_not_verify_never_appears(tmp_path, monkeypatch, leve
     from fab.layout.polygons import rectangles
 
     monkeypatch.setattr("fab.layout.compensation.rectangles", crooked)
-    with pytest.raises(CheckFailed, match=r"M1_B0_75NM\.gds\.gz: own reader, every pixel: layer 1/0: \d+ pixel"):
-        write_order(tmp_path / "o", level_map)
+    with pytest.raises(CheckFailed, match=r"M1_75NM\.gds\.gz: own reader, every pixel: layer 1/0: \d+ pixel"):
+        write_order(tmp_path / "o", level_map, wafer=FEW)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_earlier_order_is_replaced(order_folder, level_map):
-    write_order(order_folder, replace(level_map, name="other"))
+    write_order(order_folder, replace(level_map, name="other"), wafer=FEW)
     assert read_manifest(order_folder).name == "other"
     assert not (order_folder / f"{SMALL}_ALL.gds").exists()
 
 
 def test_nothing_but_an_earlier_order_is_replaced(order_folder, tmp_path, level_map):
     def write(folder):
-        write_order(folder, replace(level_map, name="other"))
+        write_order(folder, replace(level_map, name="other"), wafer=FEW)
 
     (order_folder / "notes.txt").write_text("from the lab")
     with pytest.raises(InputError, match=r"notes\.txt"):

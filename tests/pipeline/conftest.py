@@ -40,6 +40,9 @@ material = "fused_silica"
 levels = 16
 level_step = "75 nm"
 
+[wafer]
+dies = [3, 3]
+
 [scene]
 near = ["6 mm"]
 far = ["0.6 m"]

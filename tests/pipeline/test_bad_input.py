@@ -436,13 +436,13 @@ def test_files_missing_or_too_many_fail_verify(copied, cli):
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_drawing_cut_off(copied, cli, content, share):
-    gds = named(copied.order, "ALL.gds")
-    cut(gds, share)
+    drawing = named(copied.order, "M1_75NM.gds")
+    cut(drawing, share)
     before = content(copied.run)
-    refuse(cli("psf", copied.run, "--masks", copied.order), gds)
+    refuse(cli("psf", copied.run, "--masks", copied.order), drawing)
     done = cli("verify", copied.order)
     assert done.code == 1
-    assert gds.name in done.err
+    assert drawing.name in done.err
     assert content(copied.run) == before
 
 

@@ -1,0 +1,33 @@
+"""Signals that end a command, and what goes wrong because of them."""
+
+import signal
+
+import pytest
+
+from doedesign.runtime.stopping import interruptible
+from fab.errors import InputError
+
+
+def cut_off(error: Exception) -> None:
+    """Be interrupted, and fail while cleaning up."""
+    with interruptible():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            raise error
+
+
+def test_a_fault_that_follows_an_interruption_is_the_interruption():
+    """A library that is cut off while it is imported may be found half there by what cleans up."""
+    with pytest.raises(KeyboardInterrupt):
+        cut_off(NameError("half imported"))
+
+
+def test_a_fault_of_its_own_stays_one():
+    with pytest.raises(NameError), interruptible():
+        raise NameError("typed wrongly")
+
+
+def test_a_mistake_while_cleaning_up_is_told():
+    with pytest.raises(InputError, match="room"):
+        cut_off(InputError("out", "the disk must have room", "none", "Free some."))
