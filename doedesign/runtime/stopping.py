@@ -1,6 +1,8 @@
 """Signals that end work: SIGINT (Ctrl-C), SIGTERM (kill) and SIGHUP (the terminal is closed), all alike."""
 
+import _thread
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -66,6 +68,14 @@ def interruptible() -> Iterator[None]:
             raise
 
 
+def _interrupt_main() -> None:
+    """Send SIGINT to the main thread, which ends a wait there, too."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        _thread.interrupt_main()  # Windows
+
+
 @contextmanager
 def _handled(handler: Callable[..., None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
@@ -76,8 +86,19 @@ def _handled(handler: Callable[..., None]) -> Iterator[None]:
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, handler) for number in numbers}
+    show = sys.unraisablehook
+
+    def not_lost(unraisable: "sys.UnraisableHookArgs") -> None:
+        # Python swallows what is raised while an object is removed: interrupt once more, a moment later.
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            threading.Timer(0.01, _interrupt_main).start()
+        else:
+            show(unraisable)
+
+    sys.unraisablehook = not_lost
     try:
         yield
     finally:
+        sys.unraisablehook = show
         for number, earlier in before.items():
             signal.signal(number, earlier)

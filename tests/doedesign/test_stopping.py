@@ -1,6 +1,7 @@
 """Signals that end a command, and what goes wrong because of them."""
 
 import signal
+import time
 
 import pytest
 
@@ -31,3 +32,18 @@ def test_a_fault_of_its_own_stays_one():
 def test_a_mistake_while_cleaning_up_is_told():
     with pytest.raises(InputError, match="room"):
         cut_off(InputError("out", "the disk must have room", "none", "Free some."))
+
+
+def test_an_interruption_is_not_lost_where_python_swallows_it(capfd):
+    class Removed:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    def remove() -> None:
+        with interruptible():
+            Removed()
+            time.sleep(30)
+
+    with pytest.raises(KeyboardInterrupt):
+        remove()
+    assert "Traceback" not in capfd.readouterr().err
