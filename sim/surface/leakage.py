@@ -53,10 +53,10 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
     Energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms: that
     they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
-    chosen = [doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m]
-    whole = doe.transmission[np.array(chosen)]
+    chosen = np.array([doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m])
+    whole = doe.transmission[chosen]
     even = jnp.broadcast_to(jnp.asarray(mean_transmission(doe)[chosen], jnp.complex64)[:, None, None], whole.shape)
     one = replace(doe, camera=replace(doe.camera, colours=(colour,)))
-    other = replace(one, wavelengths_m=colour.wavelengths_m, height_m=None)
-    parts = (replace(other, transmission=part) for part in (even, whole - even))
+    other = {"means": doe.means[chosen], "wavelengths_m": colour.wavelengths_m, "height_m": None}
+    parts = (replace(one, transmission=part, **other) for part in (even, whole - even))
     return SplitPsf(*(psf(part, depths=depth_m).energy[0, 0] for part in (one, *parts)))
