@@ -105,13 +105,17 @@ def _locked(make: Callable[[], tuple[Path, int]]) -> tuple[Path, int]:
     while True:
         with contextlib.suppress(FileNotFoundError):  # cleared by another process before it was locked
             path, handle = make()
-            if _lock(handle) is not False and path.exists():
+            if lock(handle) is not False and path.exists():
                 return path, handle
             os.close(handle)
 
 
-def _lock(handle: int) -> bool | None:
-    """Whether a lock could be had; None where the file system has none."""
+def lock(handle: int) -> bool | None:
+    """Lock an open file or folder until its handle is closed, without waiting.
+
+    Returns:
+        whether it could be had; None where the file system has no locks.
+    """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -128,7 +132,7 @@ def _clear_killed(path: Path) -> None:
         with contextlib.suppress(OSError):  # another process clears it, or may not
             handle = os.open(entry, os.O_RDONLY | os.O_NOFOLLOW)
             try:
-                if not _lock(handle):
+                if not lock(handle):
                     continue
                 if not path.exists() and (entry / path.name).exists():
                     (entry / path.name).rename(path)
@@ -219,10 +223,11 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """Make a folder among the system's temporary ones, removed in the end; an error of it names that place."""
-    with os_errors_explained(tempfile.gettempdir()):
-        folder = Path(tempfile.mkdtemp(prefix="doedesign-verify-"))
+def scratch_folder(within: Path | None = None) -> Iterator[Path]:
+    """Make a folder, by default among the system's temporary ones, removed in the end; an error names that place."""
+    place = Path(tempfile.gettempdir()) if within is None else within
+    with os_errors_explained(place):
+        folder = Path(tempfile.mkdtemp(prefix="doedesign-", dir=place))
     try:
         yield folder
     finally:

@@ -9,6 +9,7 @@ import gc
 import os
 import resource
 import shutil
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -21,6 +22,12 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
 WITH_ARRAYS = [path for path in (ROOT / "doedesign").rglob("*.py") if "jaxtyping" in path.read_text("utf-8")]
+
+# Whoever starts the tests in the background lets them ignore these, and with them every process that a test starts and
+# ends by a signal.
+for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) == signal.SIG_IGN:
+        signal.signal(number, usual)
 
 # Programs are compiled once for all processes of a session: those of xdist, which find the name here, and those that
 # tests start. It must be said before anything imports jax.

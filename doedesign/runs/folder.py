@@ -20,7 +20,6 @@ process at a time works in a run folder.
 """
 
 import contextlib
-import fcntl
 import json
 import os
 import re
@@ -38,7 +37,7 @@ from doedesign.spec import Spec, load_spec, spec_digest, spec_from_json, spec_to
 from doedesign.spec.table import toml_key
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, read_json, sha256_file, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, explain_os_error, lock, read_json, sha256_file, write_atomic
 
 FORMAT = "doedesign run 1"
 TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of its own
@@ -139,12 +138,9 @@ def alone_in(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise explain_os_error(error, folder) from error
     try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                rule = "only one process may work in a run folder"
-                raise InputError(str(folder), rule, "a second one", "Wait for the first.") from error
+        if lock(handle) is False:
+            rule = "only one process may work in a run folder"
+            raise InputError(str(folder), rule, "a second one", "Wait for the first.")
         for path in folder.iterdir():
             if _UNFINISHED.fullmatch(path.name):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -14,7 +14,6 @@ end it after the step it is at, with a checkpoint.
 """
 
 import logging
-import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -43,7 +42,7 @@ from doedesign.training.perceptual import Lpips, Perceptual, read_lpips
 from doedesign.training.similarity import MsSsim
 from fab.errors import InputError
 from fab.figure import save
-from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, read_json, scratch_folder, sha256_bytes, sha256_file, write_atomic
 
 _log = logging.getLogger("doedesign")
 
@@ -102,7 +101,7 @@ def trained_model(job: TrainingJob, out: str | Path | None, *, tensorboard: bool
 
     A signal ends it after a step, with a checkpoint (KeyboardInterrupt).
     """
-    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else tempfile.TemporaryDirectory()
+    place: AbstractContextManager[str | Path] = nullcontext(out) if out is not None else scratch_folder()
     with stoppable() as stop, place as folder:
         _run(job, Path(folder), stop, tensorboard)
         model = Model.open(folder)

@@ -11,7 +11,6 @@ repetitions of OASIS unfolded (`fab.gds.plain`).
 import gzip
 import shutil
 import struct
-import tempfile
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.files import scratch_folder
 from fab.gds.plain import PlainCell, plain_cells
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.layout.limits import Tally
@@ -116,8 +116,8 @@ def _unpacked(path: str | Path, scratch: Path | None) -> Iterator[Path]:
     if Path(path).suffix != ".gz":
         yield Path(path)
         return
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
-        plain = Path(folder) / "unpacked.gds"
+    with scratch_folder(scratch) as folder:
+        plain = folder / "unpacked.gds"
         with gzip.open(path) as packed, plain.open("wb") as stream:
             shutil.copyfileobj(packed, stream, 1 << 20)
         yield plain
@@ -125,15 +125,15 @@ def _unpacked(path: str | Path, scratch: Path | None) -> Iterator[Path]:
 
 def _cells(library: Any, scratch: Path | None) -> list[PlainCell]:
     """Return what a library holds, unfolded."""
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
-        path = Path(folder) / "unfolded.gds"
+    with scratch_folder(scratch) as folder:
+        path = folder / "unfolded.gds"
         library.write_gds(str(path), max_points=0)
         try:
             return list(plain_cells(path))
         except (ValueError, struct.error) as error:
             # The library does not say so where a disk is full.
             rule = "must have room for the file unfolded"
-            raise InputError(folder, rule, str(error), "Free some space there.") from error
+            raise InputError(str(folder), rule, str(error), "Free some space there.") from error
 
 
 class GdstkReader:

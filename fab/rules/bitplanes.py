@@ -31,18 +31,28 @@ def _ones(word):  # pragma: no cover - compiled
     return np.int64((word * _EACH) >> np.uint64(56))
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _mirrored(word):  # pragma: no cover - compiled
+    for by, mask in ((7, 0x00AA00AA00AA00AA), (14, 0x0000CCCC0000CCCC), (28, 0x00000000F0F0F0F0)):
+        swapped = (word ^ (word >> np.uint64(by))) & np.uint64(mask)
+        word ^= swapped ^ (swapped << np.uint64(by))
+    return word
+
+
 @njit(cache=True, nogil=True)
 def _pack(levels, top, out):  # pragma: no cover - compiled
     # `levels` holds eight pixels per word; no byte borrows from the next, since none exceeds `top`.
-    bits, ny = out.shape[:2]
+    bits, ny, nw = out.shape
     for y in range(ny):
-        out[:, y] = NONE
-        for group in range(levels.shape[1]):
-            etched = top * _EACH - levels[y, group]
-            place = np.uint64(8 * (group & 7))
+        for w in range(nw):
+            first = 8 * w
             for bit in range(bits):
-                byte = (((etched >> np.uint64(bit)) & _EACH) * _GATHER) >> np.uint64(56)
-                out[bit, y, group >> 3] |= byte << place
+                # Bit g of byte i is pixel i of group g, until the square of 8 x 8 bits is mirrored.
+                word = NONE
+                for group in range(min(8, levels.shape[1] - first)):
+                    etched = top * _EACH - levels[y, first + group]
+                    word |= ((etched >> np.uint64(bit)) & _EACH) << np.uint64(group)
+                out[bit, y, w] = _mirrored(word)
 
 
 def pack(level_map: NDArray[np.uint8], bits: int) -> Words:
@@ -89,35 +99,45 @@ def count_starts(words: Words, axis: int, outside: np.uint64) -> Any:  # pragma:
 
 
 @njit(cache=True, nogil=True)
-def _and_shifted(words, axis, by, outside):  # pragma: no cover - compiled
+def _and_below(words, by, outside):  # pragma: no cover - compiled
     ny, nw = words.shape
+    for y in range(ny):
+        for w in range(nw):
+            words[y, w] &= words[y + by, w] if y + by < ny else outside
+
+
+@njit(cache=True, nogil=True)
+def _and_beside(row, by, outside):  # pragma: no cover - compiled
+    nw = row.size
     skip, low = by >> 6, np.uint64(by & 63)
     high = np.uint64(64) - low
-    for y in range(ny):
-        if axis == 0:
-            for w in range(nw):
-                words[y, w] &= words[y + by, w] if y + by < ny else outside
-            continue
-        whole = max(0, nw - skip - 1)
-        if low:
-            for w in range(whole):
-                words[y, w] &= (words[y, w + skip] >> low) | (words[y, w + skip + 1] << high)
-        else:
-            for w in range(whole):
-                words[y, w] &= words[y, w + skip]
-        for w in range(whole, nw):
-            near = words[y, w + skip] if w + skip < nw else outside
-            words[y, w] &= (near >> low) | (outside << high) if low else near
+    if by < 64:  # a loop that the compiler can run on several words at once
+        for w in range(nw - 1):
+            row[w] &= (row[w] >> low) | (row[w + 1] << high)
+        row[nw - 1] &= (row[nw - 1] >> low) | (outside << high)
+        return
+    for w in range(nw):
+        near = row[w + skip] if w + skip < nw else outside
+        far = row[w + skip + 1] if w + skip + 1 < nw else outside
+        row[w] &= (near >> low) | (far << high) if low else near
 
 
 @njit(cache=True, nogil=True)
 def erode(words: Words, axis: int, length: int, outside: np.uint64) -> None:  # pragma: no cover - compiled
     """Keep, in place, the pixels that begin `length` set ones along an axis: shorter runs vanish, others stay one."""
-    reach = 1
-    while reach < length:
-        by = min(reach, length - reach)
-        _and_shifted(words, axis, by, outside)
-        reach += by
+    if axis == 0:
+        reach = 1
+        while reach < length:
+            by = min(reach, length - reach)
+            _and_below(words, by, outside)
+            reach += by
+        return
+    for row in words:
+        reach = 1
+        while reach < length:
+            by = min(reach, length - reach)
+            _and_beside(row, by, outside)
+            reach += by
 
 
 @njit(cache=True, nogil=True)
@@ -167,6 +187,12 @@ def corners(words: Words, found: Words) -> Any:  # pragma: no cover - compiled
     return total
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _is_set(words, y, x):  # pragma: no cover - compiled
+    inside = y < words.shape[0] and x < 64 * words.shape[1]
+    return inside and (words[y, x >> 6] >> np.uint64(x & 63)) & _ONE != NONE
+
+
 @njit(cache=True, nogil=True)
 def longest_runs(
     starting: Words, words: Words, axis: int, most: int, looks: int
@@ -190,17 +216,19 @@ def longest_runs(
             while fresh:
                 first = 64 * w + _ones((fresh & (~fresh + _ONE)) - _ONE)
                 fresh &= fresh - _ONE
-                row, column = y, first
-                while row < ny and column < 64 * nw and (words[row, column >> 6] >> np.uint64(column & 63)) & _ONE:
-                    row, column = row + 1 - axis, column + axis
-                length = row - y + column - first
-                place = used
-                while place and out[place - 1, 2] < length:
-                    out[place] = out[place - 1]
-                    place -= 1
-                out[place, 0], out[place, 1], out[place, 2] = y, first, length
-                used = min(used + 1, most)
                 seen += 1
+                # Only a run that is longer than the last one listed is measured.
+                least = out[most - 1, 2] if used == most else 0
+                if _is_set(words, y + least * (1 - axis), first + least * axis):
+                    length = least + 1
+                    while _is_set(words, y + length * (1 - axis), first + length * axis):
+                        length += 1
+                    place = used
+                    while place and out[place - 1, 2] < length:
+                        out[place] = out[place - 1]
+                        place -= 1
+                    out[place, 0], out[place, 1], out[place, 2] = y, first, length
+                    used = min(used + 1, most)
                 if seen == looks:
                     return out[:used]
     return out[:used]
@@ -211,17 +239,17 @@ def windows(words: Words, nx: int, size: int) -> NDArray[np.int64]:  # pragma: n
     """Count the set pixels of all whole square windows that fit side by side into a plane of `nx` columns."""
     across = nx // size
     out = np.zeros((words.shape[0] // size, across), np.int64)
+    before = np.empty(words.shape[1], np.int64)  # pixels of the row left of a word
     for y in range(out.shape[0] * size):
+        total = 0
+        for w in range(words.shape[1]):
+            before[w] = total
+            total += _ones(words[y, w])
+        left = 0
         for i in range(across):
-            first, last = i * size, i * size + size - 1
-            low, high = ALL << np.uint64(first & 63), ALL >> np.uint64(63 - (last & 63))
-            total = 0
-            for w in range(first >> 6, (last >> 6) + 1):
-                word = words[y, w]
-                if w == first >> 6:
-                    word &= low
-                if w == last >> 6:
-                    word &= high
-                total += _ones(word)
-            out[y // size, i] += total
+            edge = (i + 1) * size
+            w, inside = edge >> 6, np.uint64(edge & 63)
+            right = before[w] + _ones(words[y, w] & ((_ONE << inside) - _ONE)) if w < words.shape[1] else total
+            out[y // size, i] += right - left
+            left = right
     return out

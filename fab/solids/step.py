@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -106,15 +106,17 @@ def boxes(corners_m: Iterable[tuple[float, float, float, float, float, float]]) 
     return _compound(occ.BRepPrimAPI_MakeBox(low, high).Shape() for low, high in ends)
 
 
-def copies(shape: Any, places_m: Iterable[tuple[float, float]]) -> Any:
-    """Return a compound of copies of a shape, each moved by x, y (metres)."""
+class Copies(NamedTuple):
+    """A part that is one shape at many places x, y, metres; the file holds the shape once."""
 
-    def moved(x_m: float, y_m: float) -> Any:
-        move = occ.gp_Trsf()
-        move.SetTranslation(occ.gp_Vec(x_m / MM, y_m / MM, 0))
-        return shape.Moved(occ.TopLoc_Location(move))
+    shape: Any
+    places_m: Sequence[tuple[float, float]]
 
-    return _compound(moved(*place) for place in places_m)
+
+def _moved(x_m: float, y_m: float) -> Any:
+    move = occ.gp_Trsf()
+    move.SetTranslation(occ.gp_Vec(x_m / MM, y_m / MM, 0))
+    return occ.TopLoc_Location(move)
 
 
 def slab(surface: Any, thickness_m: float) -> Any:
@@ -187,7 +189,14 @@ def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
     shapes = occ.XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
     root = named(shapes.NewShape(), name)
     for part, shape in parts.items():
-        label = named(shapes.AddShape(shape, False), part)
+        if isinstance(shape, Copies):
+            one, label = shapes.AddShape(shape.shape, False), shapes.NewShape()
+            for number, place in enumerate(shape.places_m, 1):
+                named(shapes.AddComponent(label, one, _moved(*place)), f"{part}_{number}")
+            named(one, f"{part}_ONE")
+        else:
+            label = shapes.AddShape(shape, False)
+        named(label, part)
         named(shapes.AddComponent(root, label, occ.TopLoc_Location()), part)
     shapes.UpdateAssemblies()
     writer = occ.STEPCAFControl_Writer()
@@ -232,14 +241,16 @@ def step_bodies(path: str | Path) -> dict[str, Body]:
     except Exception as error:
         cure = "Write the file again from its source."
         raise InputError(str(path), "the file must be STEP with parts in it", str(error), cure) from error
-    bodies = {}
-    for shape, name, _, _ in read:
-        solids = shape.Solids()
-        if not all(solid.isValid() for solid in solids):
-            raise CheckFailed([f"{path}: {name} is not a valid solid"])
-        if solids:
-            bodies[name.split("/")[-1]] = _body(solids)
-    return bodies
+    solids: dict[str, list[Body]] = {}
+    measured: dict[Any, list[Body]] = {}
+    for shape, name, place, _ in read:
+        part = name.split("/")[1]
+        # The copies of a shape have one geometry.
+        key = shape.wrapped.TShape()
+        if key not in measured:
+            measured[key] = [_body(solid) for solid in shape.Solids() if _require_valid(path, part, solid)]
+        solids.setdefault(part, []).extend(_placed(body, place) for body in measured[key])
+    return {part: _together(bodies) for part, bodies in solids.items() if bodies}
 
 
 def step_differences(path: str | Path, wanted: str | Path) -> list[str]:
@@ -270,12 +281,23 @@ def _alike(one: bytes, other: bytes) -> bool:
     return all(a == b or abs(float(a) - float(b)) <= 1e-12 * max(1.0, abs(float(b))) for a, b in pairs)
 
 
-def _body(solids: list[Any]) -> Body:
-    volumes = [solid.Volume() for solid in solids]
-    centres = [solid.Center().toTuple() for solid in solids]
-    volume = math.fsum(volumes)
-    x, y, z = (
-        math.fsum(v * c for v, c in zip(volumes, axis, strict=True)) / volume * MM
-        for axis in zip(*centres, strict=True)
-    )
-    return Body(volume * MM**3, (x, y, z))
+def _require_valid(path: Path, part: str, solid: Any) -> bool:
+    if not solid.isValid():
+        raise CheckFailed([f"{path}: {part} is not a valid solid"])
+    return True
+
+
+def _body(solid: Any) -> Body:
+    x, y, z = (v * MM for v in solid.Center().toTuple())
+    return Body(solid.Volume() * MM**3, (x, y, z))
+
+
+def _placed(body: Body, place: Any) -> Body:
+    point = _point(*body.centre_m).Transformed(place.wrapped.Transformation())
+    return body._replace(centre_m=(point.X() * MM, point.Y() * MM, point.Z() * MM))
+
+
+def _together(bodies: Sequence[Body]) -> Body:
+    volume = math.fsum(body.volume_m3 for body in bodies)
+    x, y, z = (math.fsum(body.volume_m3 * body.centre_m[axis] for body in bodies) / volume for axis in range(3))
+    return Body(volume, (x, y, z))

@@ -1,16 +1,16 @@
 """The STEP files of an order: one die, the wafer, and on request a window at full resolution.
 
-A STEP file must hold the stated parts, each with its volume and its centre of mass, and every point, plane and circle
-where a fresh drawing has it.
+A STEP file must hold every point, plane and circle where a fresh drawing has it, and the stated parts, each with its
+volume and its centre of mass.
 """
 
-import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from fab.files import scratch_folder
 from fab.manifest.records import ModelEntry
 from fab.solids.model import DoeModel, ModelKind, model_entry
 from fab.solids.patch import patch_body, patch_step
@@ -99,6 +99,12 @@ def _write_patch(path: Path, model: DoeModel) -> None:
 
 
 def _problems(path: Path, entry: ModelEntry, model: DoeModel, write: Callable[[Path, DoeModel], object]) -> list[str]:
+    with scratch_folder() as folder:
+        again = folder / path.name
+        write(again, model)
+        # What differs may be made to harm the kernel, which therefore does not read it.
+        if differences := step_differences(path, again):
+            return differences
     found = step_bodies(path)
     problems = volume_problems(entry, {name: body.volume_m3 / MM**3 for name, body in found.items()})
     for name in sorted(entry.centres_mm.keys() & found.keys()):
@@ -107,10 +113,7 @@ def _problems(path: Path, entry: ModelEntry, model: DoeModel, write: Callable[[P
         # Of a whole plate the kernel loses as many digits as its size has over a tenth of a nanometre.
         if not off <= 0.1e-9:
             problems.append(f"{name}: its centre of mass lies {format_length(off)} aside")
-    with tempfile.TemporaryDirectory(prefix="doedesign-verify-") as folder:
-        again = Path(folder) / path.name
-        write(again, model)
-        return problems + step_differences(path, again)
+    return problems
 
 
 def volume_problems(entry: ModelEntry, found_mm3: Mapping[str, float]) -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.solids.step import Body, copies, disc, outline, plate, revolved, slab, write_step
+from fab.solids.step import Body, Copies, disc, outline, plate, revolved, slab, write_step
 from fab.units import NM, format_length
 
 # The kernel takes points 1e-7 mm apart for one; edges must be clearly longer.
@@ -227,7 +227,7 @@ def wafer_step(
             raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
     parts = {
         "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),
-        "DATUM_RELIEF": copies(disc(aperture_m / 2), places_m),
-        "CHROME": copies(chrome.solid(), places_m),
+        "DATUM_RELIEF": Copies(disc(aperture_m / 2), places_m),
+        "CHROME": Copies(chrome.solid(), places_m),
     }
     write_step(path, "WAFER", parts)

@@ -36,7 +36,10 @@ def some_rings(count=60, aperture_m=APERTURE):
 
 
 def shapes_of(path):
-    return {name.split("/")[-1]: shape for shape, name, _, _ in cadquery.Assembly.importStep(str(path))}
+    parts = {}
+    for shape, name, place, _ in cadquery.Assembly.importStep(str(path)):
+        parts.setdefault(name.split("/")[1], []).append(shape.located(place))
+    return {name: cadquery.Compound.makeCompound(shapes) for name, shapes in parts.items()}
 
 
 def sizes(shape):
