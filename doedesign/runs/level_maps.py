@@ -237,9 +237,6 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
     from fab.verification.files import read_drawn_levels  # slow to import
 
     manifest = read_manifest(folder)
-    if manifest.source.get("level_map_sha256", level_map.digest) != level_map.digest:
-        rule, got = "the masks must be those of this run", "those of another, such as an earlier one"
-        raise InputError(str(folder), rule, got, "Draw the masks of this run again: doedesign masks RUN.")
     levels, grid = manifest.staircase(), manifest.grid()
     alike = grid.shape == level_map.shape and levels.count == level_map.levels.count
     # The manifest rounds lengths to its units' last digit.
@@ -250,5 +247,8 @@ def drawn_in_masks(folder: Path, level_map: LevelMap) -> np.ndarray:
         got = f"{ny} x {nx} pixels of {format_length(grid.pitch_m)} in {levels}"
         rule = f"the masks must be those of this run, {level_map}"
         raise InputError(str(folder), rule, got, "Give the masks of this run.")
+    if manifest.source.get("level_map_sha256", level_map.digest) != level_map.digest:
+        rule, got = "the masks must be those of this run", "those of another, such as an earlier one"
+        raise InputError(str(folder), rule, got, "Draw the masks of this run again: doedesign masks RUN.")
     files, moves = manifest.drawn_files(folder), manifest.edge_moves()
     return read_drawn_levels(files, levels, pixel_edges(grid), manifest.doe_cell, moves)
