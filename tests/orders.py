@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+# Options of `doedesign masks` for GDS that every program opens.
+GDS_TOO = ("--plates", "gds", "--combined-gds")
+
 
 def named(folder: Path, ending: str) -> Path:
     """The one file whose name ends so."""

@@ -20,6 +20,7 @@ import pytest
 import doedesign.optimization
 import doedesign.runs.psfs
 from doedesign.cli import main
+from tests.orders import GDS_TOO
 from tests.pictures import leave_out_pictures
 
 TINY = """
@@ -133,7 +134,7 @@ def finish(tiny: Path, folder: Path) -> None:
     run, order = folder / "run", folder / "order"
     said = {
         "optimize": run_here("optimize", tiny, "--out", run),
-        "masks": run_here("masks", run, "--levels", 16, "--out", order, "--plates", "gds", "--combined-gds"),
+        "masks": run_here("masks", run, "--levels", 16, "--out", order, *GDS_TOO),
         "verify": run_here("verify", order),
         "psf": run_here("psf", run, "--masks", order, "--json"),
     }
