@@ -44,6 +44,7 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.manifest import records
 from fab.manifest.cells import cell_entry
+from fab.order.formats import Formats
 from fab.order.order import plan_order
 from fab.order.terms import OrderTerms
 from fab.order.verify import verify
@@ -89,7 +90,8 @@ def write_base(folder: Path) -> None:
     wafer = Wafer(dies=(3, 3), zero_layer=True, line_splits_m=(1e-7,), order_control=True)
     order = plan_order(
         level_map, process="contact_aligner", wafer=wafer, patch=Patch(0.0, 0.0, 14.8e-6), papers=True,
-        direct_write=True, terms=OrderTerms(revision="B", contact="A. Tester", quantity=2, cd_tolerance_m=1e-7),
+        formats=Formats("gds", combined_gds=True), direct_write=True,
+        terms=OrderTerms(revision="B", contact="A. Tester", quantity=2, cd_tolerance_m=1e-7),
         source={"kind": "run", "name": "planted", "level_map_sha256": level_map.digest},
     )  # fmt: skip
     near = PredictedMetrics("red", 0.05, 0.81, 0.0123, 0.86, ring_to_disc=3.21)

@@ -34,9 +34,10 @@ def test_a_sample_of_the_defects(base, tmp_path, defect):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(8))
-def test_every_defect(base, tmp_path, part):
-    wrong = [d.name for d in DEFECTS[part::8] if not outcome(d, base, tmp_path / "order").right]
+def test_a_larger_sample_of_the_defects(base, tmp_path):
+    """The campaign plants all of them."""
+    chosen = [defect for defect in DEFECTS if not defect.meaningful] + random.Random(17).sample(DEFECTS, 60)
+    wrong = [d.name for d in chosen if not outcome(d, base, tmp_path / "order").right]
     assert wrong == []
 
 

@@ -463,7 +463,9 @@ def test_masks_of_another_run(copied, tiny, cli, content, tmp_path):
     assert cli("optimize", tiny, "--out", other, "--set", "optimize.seed=9", "--set", "optimize.steps=0").code == 0
     assert cli("masks", other, "--out", order).code == 0
     before = content(copied.run)
-    refuse(cli("psf", copied.run, "--masks", order), order, "those of this run", "those of another", "doedesign masks RUN")
+    refuse(
+        cli("psf", copied.run, "--masks", order), order, "those of this run", "those of another", "doedesign masks RUN"
+    )
     assert cli("masks", copied.run, "--levels", 8, "--out", order).code == 0
     refuse(cli("psf", copied.run, "--masks", order), order, "16 levels of 75 nm", "8 levels of 150 nm")
     np.save(tmp_path / "map.npy", np.zeros((15, 20)))
