@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import os_errors_explained
 from fab.layout.geometry import Layer, Layout, Reference, require_name
+from fab.layout.limits import Tally
 from fab.units import UM
 
 # Record types: the kind of record, then the kind of its data.
@@ -122,6 +123,7 @@ def oasis_to_gds(path: str | Path, gds: str | Path, most: int) -> None:
     quiet.warn_level = 0
     try:
         layout.read(str(path), quiet)
+        Tally(str(path)).add("cells", layout.cells())
         count = sum(cell.shapes(index).size() for cell in layout.each_cell() for index in layout.layer_indexes())
         if count > most:
             raise InputError(str(path), f"must hold at most {most} shapes", f"{count} shapes", cure)

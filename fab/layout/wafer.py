@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from fab.errors import InputError
+from fab.layout.limits import MOST
 from fab.units import MM, UM, format_length
 
 # Primary flats of SEMI M1 by diameter, both in millimetres; larger wafers have a notch.
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
+_MOST_SPLITS = 32
 _NOTCH_M, _NOTCHED_M = 1 * MM, 199 * MM
 
 
@@ -62,6 +64,12 @@ class Wafer:
             raise InputError("wafer: blank_m", rule, format_length(self.blank_m), "Choose a larger mask blank.")
         if self.dies is not None and min(self.dies) < 1:
             raise InputError("wafer: dies", "must be 1 or more rows and columns", self.dies, "For example (3, 3).")
+        if self.dies is not None and self.dies[0] * self.dies[1] > MOST["placed copies"]:
+            rule = f"must be at most {MOST['placed copies']} altogether"
+            raise InputError("wafer: dies", rule, self.dies, "Let the wafer be filled.")
+        if len(self.line_splits_m) > _MOST_SPLITS:
+            rule, got = f"must be at most {_MOST_SPLITS}", len(self.line_splits_m)
+            raise InputError("wafer: line splits", rule, got, "Take fewer, since each is a drawing of its own.")
         if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
             got = ", ".join(format_length(move) for move in self.line_splits_m)
             raise InputError("wafer: line splits", "must lie from 1 nm to 100 um, out or in", got, "Check their unit.")

@@ -57,9 +57,10 @@ def test_an_oasis_file_that_unfolds_without_bounds_is_refused_by_the_library_s_c
         list(GdstkReader([], EDGES).oasis(path, [], most))
 
 
-def test_an_altered_oasis_file_is_not_written_out(tmp_path: Path):
-    with pytest.raises(InputError, match="at most 1000 shapes"):
-        oasis_to_gds(planted(tmp_path, "repeated_shapes", ".oas"), tmp_path / "out.gds", 1000)
+@pytest.mark.parametrize("name", ["many_cells", "repeated_shapes"])
+def test_an_altered_oasis_file_is_not_written_out(tmp_path: Path, name: str):
+    with pytest.raises(InputError, match=SAYS[name]):
+        oasis_to_gds(planted(tmp_path, name, ".oas"), tmp_path / "out.gds", 1000)
     assert not (tmp_path / "out.gds").exists()
 
 

@@ -113,6 +113,10 @@ def test_splits_leave_a_die_as_ordered():
         Wafer(dies=(1, 2), line_splits_m=(1e-7,), order_control=True)
     with pytest.raises(InputError, match="out or in"):
         Wafer(line_splits_m=(0.0,))
+    with pytest.raises(InputError, match="at most 32, but got 33"):
+        Wafer(line_splits_m=(1e-7,) * 33)
+    with pytest.raises(InputError, match="at most 100000 altogether"):
+        Wafer(dies=(1000, 101))
     assert [one.code for one in splits_of(Wafer(), LEVELS, (0,) * 4, 1e-9)] == ["DOE"]
 
 
