@@ -5,9 +5,12 @@ Everything is counted, nothing is unfolded: an array of copies is the product of
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from fab.errors import InputError
-from fab.layout.geometry import Cell
+
+if TYPE_CHECKING:
+    from fab.layout.geometry import Cell
 
 # A drawing of this package has about ten cells, four deep, a die per millimetre of the wafer and a few hundred
 # polygons that are no rectangles. Rectangles have no limit: a file has at least ten bytes for each, or the manifest
@@ -40,7 +43,7 @@ class Tally:
             rule = f"a drawing may hold at most {most} {what}"
             raise InputError(self.file, rule, f"at least {self.counts[what]}", _CURE)
 
-    def add_places(self, cells: Iterable[Cell]) -> None:
+    def add_places(self, cells: "Iterable[Cell]") -> None:
         """Count depth and copies of all cells, each given after those that it places."""
         depth: dict[str, int] = {}
         copies: dict[str, int] = {}
