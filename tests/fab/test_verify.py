@@ -58,8 +58,10 @@ def test_a_whole_order_passes_every_question(written_order):
         assert file.endswith(".oas") or (file, "own reader, every pixel") in asked
 
 
-@pytest.mark.parametrize("file", [*MASKS, f"{SMALL}_LEVELS.npy", f"{SMALL}_PREVIEW.png"])
-@pytest.mark.parametrize("where", [0.0, 0.1, 0.37, 0.5, 0.63, 0.9, 0.9999])
+@pytest.mark.parametrize(
+    ("file", "where"),
+    [(file, 0.05 + 0.11 * i) for i, file in enumerate([*MASKS, f"{SMALL}_LEVELS.npy", f"{SMALL}_PREVIEW.png"])],
+)
 def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
     path = order_folder / file
     flip(path, int(where * path.stat().st_size), 0x10)
@@ -68,6 +70,14 @@ def test_one_flipped_byte_fails_and_names_the_file(order_folder, file, where):
     assert all(difference.startswith(file) for difference in report.differences)
     with pytest.raises(CheckFailed, match=file):
         report.require()
+
+
+@pytest.mark.parametrize("where", [0.0, 0.1, 0.37, 0.5, 0.63, 0.9, 0.9999])
+def test_one_flipped_byte_in_every_file_names_them_all(order_folder, where):
+    files = [*MASKS, f"{SMALL}_PREVIEW.png"]
+    for file in files:
+        flip(order_folder / file, int(where * (order_folder / file).stat().st_size), 0x10)
+    assert {difference.partition(":")[0] for difference in verify(order_folder).differences} == set(files)
 
 
 @pytest.mark.slow
