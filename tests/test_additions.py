@@ -37,7 +37,7 @@ PLACES = {
 # Names that the tables list beside what the blocks say.
 LISTED = [
     ("sim/obstruction/__init__.py", "MaskFolder)\n", "MaskFolder, Sticker)\n"),
-    ("fab/solids/write.py", "import height_files, ", "import height_files, profile_file, "),
+    ("fab/solids/write.py", "mesh_files, step_files\n", "mesh_files, profile_file, step_files\n"),
 ]
 
 HEAD = "import numpy as np, pytest\nfrom pathlib import Path\nQUICK = {quick!r}\n"

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes, require_text
+from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes, read_json, require_text
 from fab.layout.geometry import pixel_edges
 from fab.manifest.records import Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
-from fab.order.papers import papers
+from fab.order.papers import papers, tie_of
 from fab.order.request import order_from
 from fab.solids.write import model_entries
 from fab.verification.compare import Expected
@@ -86,7 +86,9 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         ]
         expected = Expected(wanted, level_map.planes(), pixel_edges(level_map.grid))
         checks += check_files(folder, expected, drawing.model, intact)
-        if not notes:
+        if notes:
+            checks += _tie_checks(folder, recorded)
+        else:
             alike = recorded.tools.get("matplotlib") == ours["matplotlib"]
             checks += _paper_checks(folder, drawing, wanted, alike)
     return VerificationReport(tuple(checks), tuple(notes))
@@ -154,6 +156,15 @@ def _taken_for(path: Path, stem: str) -> str:
 def _first_bytes(path: Path) -> bytes:
     with opened(path) as stream:
         return stream.read(16)
+
+
+def _tie_checks(folder: Path, recorded: Manifest) -> Iterator[Check]:
+    """Compare the digest by which a run sheet belongs to what was asked for, and to the version that wrote it."""
+    for entry in recorded.files:
+        if entry.file.endswith("_RUNSHEET.json") and (folder / entry.file).is_file():
+            told = read_json(folder / entry.file).get("request_sha256")
+            alike = told == tie_of(recorded.request, recorded.tools)
+            yield Check(entry.file, "of this order", () if alike else ("it belongs to another request or version",))
 
 
 def _paper_checks(folder: Path, drawing: DrawnOrder, wanted: Manifest, alike: bool) -> list[Check]:
