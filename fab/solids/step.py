@@ -46,11 +46,16 @@ def _point(x_m: float, y_m: float, z_m: float) -> Any:
     return occ.gp_Pnt(x_m / MM, y_m / MM, z_m / MM)
 
 
-def _faces(shape: Any) -> Iterator[Any]:
-    explorer = occ.TopExp_Explorer(shape, occ.TopAbs_FACE)
+def _inside(shape: Any, kind: Any) -> Iterator[Any]:
+    """Yield the shapes of a kind, such as edges, within another."""
+    explorer = occ.TopExp_Explorer(shape, kind)
     while explorer.More():
-        yield occ.TopoDS.Face_s(explorer.Current())
+        yield explorer.Current()
         explorer.Next()
+
+
+def _faces(shape: Any) -> Iterator[Any]:
+    return map(occ.TopoDS.Face_s, _inside(shape, occ.TopAbs_FACE))
 
 
 def _polygon(points: list[Any], closed: bool) -> Any:
@@ -127,15 +132,12 @@ def slab(surface: Any, thickness_m: float) -> Any:
 def _rim(shell: Any, radius_m: float) -> Any:
     """Return the circular edge in which a revolved relief ends at z = 0."""
     # The faces come in the order of the profile, so the last one holds it.
-    explorer = occ.TopExp_Explorer(list(_faces(shell))[-1], occ.TopAbs_EDGE)
-    while explorer.More():
-        edge = occ.TopoDS.Edge_s(explorer.Current())
+    for edge in map(occ.TopoDS.Edge_s, _inside(list(_faces(shell))[-1], occ.TopAbs_EDGE)):
         curve = occ.BRepAdaptor_Curve(edge)
         if curve.GetType() == occ.GeomAbs_Circle:
             circle = curve.Circle()
             if circle.Location().Z() == 0 and abs(circle.Radius() * MM / radius_m - 1) < 1e-12:
                 return edge
-        explorer.Next()
     raise AssertionError("a relief must end in a circle at z = 0")
 
 
@@ -230,27 +232,41 @@ def step_bodies(path: str | Path) -> dict[str, Body]:
         InputError: the file is missing or holds no STEP parts.
         CheckFailed: a solid is not valid.
     """
-    import cadquery
-
     path = Path(path)
+    bodies: dict[str, Body] = {}
+    measured: dict[Any, Body] = {}
+    for name, shape in _read_parts(path).items():
+        solids = list(_inside(shape, occ.TopAbs_SOLID))
+        for solid in solids:
+            if solid.TShape() not in measured:  # the copies of a solid share their geometry
+                measured[solid.TShape()] = _body(solid, f"{path}: {name}")
+        if solids:
+            bodies[name] = _together([_moved_body(measured[solid.TShape()], solid.Location()) for solid in solids])
+    return bodies
+
+
+def _read_parts(path: Path) -> dict[str, Any]:
+    """Return the shapes of an assembly by the names of its parts."""
     with os_errors_explained(path):
         path.open("rb").close()
-    try:
-        with _silence():
-            read = cadquery.Assembly.importStep(str(path))
-    except Exception as error:
+    reader, found = occ.STEPCAFControl_Reader(), occ.TDF_LabelSequence()
+    reader.SetNameMode(True)
+    document = occ.TDocStd_Document(occ.TCollection_ExtendedString("doedesign"))
+    with _silence():
+        read = reader.ReadFile(str(path)) == occ.IFSelect_RetDone and reader.Transfer(document)
+    shapes = occ.XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
+    shapes.GetFreeShapes(found)
+    if not read or found.Length() != 1 or not occ.XCAFDoc_ShapeTool.IsAssembly_s(found.First()):
         cure = "Write the file again from its source."
-        raise InputError(str(path), "the file must be STEP with parts in it", str(error), cure) from error
-    solids: dict[str, list[Body]] = {}
-    measured: dict[Any, list[Body]] = {}
-    for shape, name, place, _ in read:
-        part = name.split("/")[1]
-        # The copies of a shape have one geometry.
-        key = shape.wrapped.TShape()
-        if key not in measured:
-            measured[key] = [_body(solid) for solid in shape.Solids() if _require_valid(path, part, solid)]
-        solids.setdefault(part, []).extend(_placed(body, place) for body in measured[key])
-    return {part: _together(bodies) for part, bodies in solids.items() if bodies}
+        raise InputError(str(path), "the file must be STEP with parts in it", "another file, or a damaged one", cure)
+    parts = occ.TDF_LabelSequence()
+    occ.XCAFDoc_ShapeTool.GetComponents_s(found.First(), parts)
+    return {_name(label): occ.XCAFDoc_ShapeTool.GetShape_s(label) for label in parts}
+
+
+def _name(label: Any) -> str:
+    name = occ.TDataStd_Name()
+    return name.Get().ToExtString() if label.FindAttribute(occ.TDataStd_Name.GetID_s(), name) else ""
 
 
 def step_differences(path: str | Path, wanted: str | Path) -> list[str]:
@@ -281,20 +297,22 @@ def _alike(one: bytes, other: bytes) -> bool:
     return all(a == b or abs(float(a) - float(b)) <= 1e-12 * max(1.0, abs(float(b))) for a, b in pairs)
 
 
-def _require_valid(path: Path, part: str, solid: Any) -> bool:
-    if not solid.isValid():
-        raise CheckFailed([f"{path}: {part} is not a valid solid"])
-    return True
+def _body(solid: Any, where: str) -> Body:
+    """Measure a solid where its geometry was drawn."""
+    solid = solid.Located(occ.TopLoc_Location())
+    if not occ.BRepCheck_Analyzer(solid).IsValid():
+        raise CheckFailed([f"{where} is not a valid solid"])
+    properties = occ.GProp_GProps()
+    occ.BRepGProp.VolumeProperties_s(solid, properties)
+    return Body(properties.Mass() * MM**3, _metres(properties.CentreOfMass()))
 
 
-def _body(solid: Any) -> Body:
-    x, y, z = (v * MM for v in solid.Center().toTuple())
-    return Body(solid.Volume() * MM**3, (x, y, z))
+def _moved_body(body: Body, place: Any) -> Body:
+    return body._replace(centre_m=_metres(_point(*body.centre_m).Transformed(place.Transformation())))
 
 
-def _placed(body: Body, place: Any) -> Body:
-    point = _point(*body.centre_m).Transformed(place.wrapped.Transformation())
-    return body._replace(centre_m=(point.X() * MM, point.Y() * MM, point.Z() * MM))
+def _metres(point: Any) -> tuple[float, float, float]:
+    return point.X() * MM, point.Y() * MM, point.Z() * MM
 
 
 def _together(bodies: Sequence[Body]) -> Body:
