@@ -101,7 +101,6 @@ IMPORTERS = {
     "gdstk": {"fab/gds/gdstk_reader.py"},
     # The picture of marks unites shapes and opens no file; files for direct write are not those of masks.
     "klayout": {"fab/gds/writer.py", "fab/plots/marks.py", "fab/solids/direct_write.py"},
-    "cadquery": {"fab/solids/step.py"},
     "imageio": {"fab/pictures.py"},
     "jinja2": {"fab/runsheet/page.py"},
     "tomllib": {"doedesign/spec/__init__.py"},
@@ -112,6 +111,11 @@ IMPORTERS = {
 def test_one_room_for_a_file_format(library: str):
     users = {name for name, tree in TREES.items() if any(m.split(".")[0] == library for m in imported_modules(tree))}
     assert users == IMPORTERS[library]
+
+
+def test_one_room_for_the_kernel_of_solids():
+    """Its modules are loaded by name, each when it is used first."""
+    assert [name for name in TREES if "OCP" in (ROOT / name).read_text("utf-8")] == ["fab/solids/step.py"]
 
 
 # TOML tables and command-line options are named where the user's words are read, and nowhere below.

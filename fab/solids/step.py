@@ -29,7 +29,9 @@ class _Kernel:
     """Classes of the kernel by name, each loaded on its first use from the module that its name begins with."""
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(import_module(f"OCP.{name.partition('_')[0]}"), name)
+        found = getattr(import_module(f"OCP.{name.partition('_')[0]}"), name)
+        setattr(self, name, found)
+        return found
 
 
 occ = _Kernel()
