@@ -217,10 +217,10 @@ def longest_runs(
                 first = 64 * w + _ones((fresh & (~fresh + _ONE)) - _ONE)
                 fresh &= fresh - _ONE
                 seen += 1
-                # Only a run that is longer than the last one listed is measured.
+                # A run that ends before it is as long as the last one listed is not measured.
                 least = out[most - 1, 2] if used == most else 0
                 if _is_set(words, y + least * (1 - axis), first + least * axis):
-                    length = least + 1
+                    length = 1
                     while _is_set(words, y + length * (1 - axis), first + length * axis):
                         length += 1
                     place = used
