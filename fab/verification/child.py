@@ -19,7 +19,7 @@ from loky.process_executor import BrokenProcessPool, TerminatedWorkerError
 _SECONDS, _SECONDS_PER_SHAPE = 4.0, 5e-6
 _PATIENCE = 15.0
 _BYTES, _BYTES_PER_SHAPE = 1 << 30, 400
-_IDLE_S = 60  # after which a child without work ends
+_START_S = 120.0  # for a child to begin, and to import what it needs
 
 
 class ChildFailed(Exception):
@@ -39,10 +39,19 @@ class Child:
 
     def begin(self, work: Callable[..., Any], *arguments: Any) -> "Future[Any]":
         """Begin a piece of work; `result` waits for it."""
+        modules = [each.__module__ for each in (work, *arguments) if callable(each)]
+        try:
+            self._ready = self._running().submit(_import, modules)
+        except (BrokenProcessPool, TerminatedWorkerError):  # something ended it while it had nothing to do
+            self.end()
+            self._ready = self._running().submit(_import, modules)
+        return self._running().submit(work, *arguments)
+
+    def _running(self) -> ProcessPoolExecutor:
         if self._executor is None:
-            self._executor = ProcessPoolExecutor(max_workers=1, timeout=_IDLE_S)
-        self._ready = self._executor.submit(_import, [each.__module__ for each in (work, *arguments) if callable(each)])
-        return self._executor.submit(work, *arguments)
+            # Without a timeout: a process that ends by itself may do so just when work is given to it.
+            self._executor = ProcessPoolExecutor(max_workers=1)
+        return self._executor
 
     def result(self, begun: "Future[Any]", shapes: int) -> Any:
         """Wait for a piece of work.
@@ -56,7 +65,7 @@ class Child:
             ChildFailed: the work failed, or its process died.
         """
         try:
-            self._ready.exception()  # what is imported for the first time does not count
+            self._ready.exception(_START_S)  # what is imported for the first time does not count
             return begun.result(_PATIENCE * _seconds(shapes))
         except TimeoutError as error:
             self.end()
@@ -83,7 +92,7 @@ _CHILD = Child()
 
 @contextlib.contextmanager
 def child_process() -> Iterator[Child]:
-    """Provide the child process. It is kept for the next block for a while, unless this one is left by an error."""
+    """Provide the child process. It is kept for the next block, unless this one is left by an error."""
     try:
         yield _CHILD
     except BaseException:

@@ -66,7 +66,7 @@ class Worker:
     """A warm process; what a command says is in files in `said`, even if the process dies."""
 
     def __init__(self, said: Path) -> None:
-        self._said, self._process, self._pipe = said, None, None
+        self._said, self._process, self._pipe, self._fault = said, None, None, Fault()
         said.mkdir(parents=True, exist_ok=True)
 
     def _start(self) -> Connection:
@@ -85,7 +85,7 @@ class Worker:
         """Begin a command in the folder `place`/work, with `place`/tmp for temporary files."""
         (place / "tmp").mkdir(exist_ok=True)
         self._start().send(_Job(tuple(map(str, arguments)), place, fault))
-        self._begun = time.monotonic()
+        self._fault, self._begun = fault, time.monotonic()
 
     def end(self, limit_s: float = 120.0, kill_after_s: float | None = None) -> End:
         """Wait for the command; kill it after a limit, or when it is meant to be killed."""
@@ -99,7 +99,8 @@ class Worker:
             with contextlib.suppress(EOFError, ConnectionResetError):
                 found = pipe.recv()
         if found is not None:
-            if found.peak_bytes > _GROWN_BYTES or _resident() > _GROWN_BYTES:
+            # A signal may have left modules imported by half, which a command in a process of its own never meets.
+            if self._fault.number or found.peak_bytes > _GROWN_BYTES or _resident() > _GROWN_BYTES:
                 self.stop()
             return found
         late = not ready and kill_after_s is None

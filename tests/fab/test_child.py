@@ -1,6 +1,7 @@
 """Work in a child process: its result, and what becomes of work that never ends, grows without bounds or crashes."""
 
 import os
+import signal
 import time
 
 import pytest
@@ -27,6 +28,14 @@ def test_what_goes_wrong_is_told_and_the_next_work_is_done(monkeypatch: pytest.M
             child.result(child.begin(limited, 0, bytearray, 3 << 30), 0)
         with pytest.raises(ChildFailed, match="invalid literal"):
             child.result(child.begin(limited, 0, int, "x"), 0)
+        assert child.result(child.begin(limited, 0, pow, 3, 2), 0) == 9
+
+
+def test_a_child_that_was_ended_while_it_had_nothing_to_do_is_replaced():
+    with child_process() as child:
+        process = child.result(child.begin(os.getpid), 0)
+        os.kill(process, signal.SIGKILL)
+        time.sleep(0.5)  # until it is noticed
         assert child.result(child.begin(limited, 0, pow, 3, 2), 0) == 9
 
 
