@@ -86,12 +86,13 @@ def _handled(handler: Callable[..., None]) -> Iterator[None]:
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, handler) for number in numbers}
-    show = sys.unraisablehook
+    show, again = sys.unraisablehook, list[threading.Timer]()
 
     def not_lost(unraisable: "sys.UnraisableHookArgs") -> None:
         # Python swallows what is raised while an object is removed: interrupt once more, a moment later.
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            threading.Timer(0.01, _interrupt_main).start()
+            again.append(threading.Timer(0.01, _interrupt_main))
+            again[-1].start()
         else:
             show(unraisable)
 
@@ -99,6 +100,11 @@ def _handled(handler: Callable[..., None]) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.unraisablehook = show
-        for number, earlier in before.items():
-            signal.signal(number, earlier)
+        try:
+            for timer in again:  # none may come when this handler is gone
+                timer.cancel()
+                timer.join()
+        finally:
+            sys.unraisablehook = show
+            for number, earlier in before.items():
+                signal.signal(number, earlier)

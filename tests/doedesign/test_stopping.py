@@ -47,3 +47,19 @@ def test_an_interruption_is_not_lost_where_python_swallows_it(capfd):
     with pytest.raises(KeyboardInterrupt):
         remove()
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_an_interruption_does_not_come_when_the_work_is_over():
+    class Removed:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        with interruptible():
+            Removed()
+        time.sleep(0.1)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert came == []
