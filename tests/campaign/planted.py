@@ -726,8 +726,8 @@ def _npy(folder: Path, metres: float) -> None:
 
 def _counts(folder: Path, ending: str) -> None:
     file = _file(folder, ending)
-    pixels = read_pixels(folder / file)
-    pixels[2, 3] += 1 if pixels[2, 3] == 0 else -1
+    pixels = read_pixels(folder / file).copy()
+    pixels[2, 3] = abs(int(pixels[2, 3]) - 1)
     write_pixels(folder / file, pixels, about="heights")
     _state(folder, file)
 
