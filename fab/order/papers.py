@@ -99,10 +99,10 @@ def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[s
             for number, ((x, y), split) in enumerate(zip(frame.dies, frame.splits, strict=True), 1)
         ),
         predictions=None if order.light is None else order.light.predictions,
-        request_sha256=tie_of(request_of(order), made_by),
+        request_sha256=request_digest(request_of(order), made_by),
     )
 
 
-def tie_of(request: Mapping[str, Any], made_by: Mapping[str, Any]) -> str:
+def request_digest(request: Mapping[str, Any], made_by: Mapping[str, Any]) -> str:
     """Return the digest of what was asked for and of the tools that made it, which ties a run sheet to its order."""
     return sha256_bytes(canonical_json([dict(request), dict(made_by)]))

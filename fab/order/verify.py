@@ -11,7 +11,7 @@ Two things are done, and nothing of the first is used for the second:
 
 Whatever says nothing may differ: dates, the order of shapes and where each begins, how a program packs an OASIS file.
 Of an order that another version of this package wrote, pixels, lengths, depths and solids are proved likewise; the rest
-is compared with the manifest alone, and the report says so.
+is compared with the manifest alone, to which its run sheet is tied by a digest, and the report says so.
 """
 
 from collections.abc import Collection, Iterator
@@ -27,7 +27,7 @@ from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes, re
 from fab.layout.geometry import pixel_edges
 from fab.manifest.records import Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
-from fab.order.papers import papers, tie_of
+from fab.order.papers import papers, request_digest
 from fab.order.request import order_from
 from fab.solids.write import model_entries
 from fab.verification.compare import Expected
@@ -87,7 +87,7 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         expected = Expected(wanted, level_map.planes(), pixel_edges(level_map.grid))
         checks += check_files(folder, expected, drawing.model, intact)
         if notes:
-            checks += _tie_checks(folder, recorded)
+            checks += _request_checks(folder, recorded)
         else:
             alike = recorded.tools.get("matplotlib") == ours["matplotlib"]
             checks += _paper_checks(folder, drawing, wanted, alike)
@@ -158,12 +158,12 @@ def _first_bytes(path: Path) -> bytes:
         return stream.read(16)
 
 
-def _tie_checks(folder: Path, recorded: Manifest) -> Iterator[Check]:
+def _request_checks(folder: Path, recorded: Manifest) -> Iterator[Check]:
     """Compare the digest by which a run sheet belongs to what was asked for, and to the version that wrote it."""
     for entry in recorded.files:
         if entry.file.endswith("_RUNSHEET.json") and (folder / entry.file).is_file():
             told = read_json(folder / entry.file).get("request_sha256")
-            alike = told == tie_of(recorded.request, recorded.tools)
+            alike = told == request_digest(recorded.request, recorded.tools)
             yield Check(entry.file, "of this order", () if alike else ("it belongs to another request or version",))
 
 

@@ -17,8 +17,6 @@ Words = NDArray[np.uint64]
 NONE = np.uint64(0)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _EACH = np.uint64(0x0101010101010101)
-# Carries bit 0 of byte i to bit 56 + i.
-_GATHER = np.uint64(0x0102040810204080)
 _THREADS = 4
 _ONE, _TOP = np.uint64(1), np.uint64(63)
 

@@ -120,7 +120,7 @@ class Copies(NamedTuple):
     places_m: Sequence[tuple[float, float]]
 
 
-def _moved(x_m: float, y_m: float) -> Any:
+def _place(x_m: float, y_m: float) -> Any:
     move = occ.gp_Trsf()
     move.SetTranslation(occ.gp_Vec(x_m / MM, y_m / MM, 0))
     return occ.TopLoc_Location(move)
@@ -179,7 +179,7 @@ def _silence() -> Iterator[None]:
 
 
 def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
-    """Write named parts, shapes of the kernel, as one STEP assembly whose bytes depend on them alone."""
+    """Write named parts, shapes or `Copies`, as one STEP assembly whose bytes depend on them alone."""
 
     def text(value: str) -> Any:
         return occ.TCollection_HAsciiString(value)
@@ -196,7 +196,7 @@ def write_step(path: str | Path, name: str, parts: Mapping[str, Any]) -> None:
         if isinstance(shape, Copies):
             one, label = shapes.AddShape(shape.shape, False), shapes.NewShape()
             for number, place in enumerate(shape.places_m, 1):
-                named(shapes.AddComponent(label, one, _moved(*place)), f"{part}_{number}")
+                named(shapes.AddComponent(label, one, _place(*place)), f"{part}_{number}")
             named(one, f"{part}_ONE")
         else:
             label = shapes.AddShape(shape, False)
@@ -243,7 +243,7 @@ def step_bodies(path: str | Path) -> dict[str, Body]:
             if solid.TShape() not in measured:  # the copies of a solid share their geometry
                 measured[solid.TShape()] = _body(solid, f"{path}: {name}")
         if solids:
-            bodies[name] = _together([_moved_body(measured[solid.TShape()], solid.Location()) for solid in solids])
+            bodies[name] = _together([_placed(measured[solid.TShape()], solid.Location()) for solid in solids])
     return bodies
 
 
@@ -309,7 +309,7 @@ def _body(solid: Any, where: str) -> Body:
     return Body(properties.Mass() * MM**3, _metres(properties.CentreOfMass()))
 
 
-def _moved_body(body: Body, place: Any) -> Body:
+def _placed(body: Body, place: Any) -> Body:
     return body._replace(centre_m=_metres(_point(*body.centre_m).Transformed(place.Transformation())))
 
 
