@@ -103,15 +103,19 @@ def _layout(said: Any, weights: int) -> NetworkShape:
     return layout
 
 
+def _is_array(leaf: Any) -> bool:
+    return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
+
+
 def _named(tree: Any) -> dict[str, Any]:
-    """Arrays of a tree by where they stand."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))
+    """Arrays of a tree, or their shapes, by where they stand."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, _is_array))
     return {jax.tree_util.keystr(where): leaf for where, leaf in leaves}
 
 
 def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) -> Network:
     """A network of a layout with the weights of a file."""
-    empty = Network.make(layout, 0)
+    empty = eqx.filter_eval_shape(Network.make, layout, 0)  # its weights are not drawn
     slots = _named(empty)
     for name, slot in slots.items():
         if name not in arrays:
@@ -125,6 +129,6 @@ def _filled(path: Path, layout: NetworkShape, arrays: Mapping[str, np.ndarray]) 
         raise InputError(str(path), "must hold the layout's arrays alone", f"also {extra[0]}", _CURE)
 
     def filled(where: Any, leaf: Any) -> Any:
-        return jnp.asarray(arrays[jax.tree_util.keystr(where)].astype(leaf.dtype)) if eqx.is_array(leaf) else leaf
+        return jnp.asarray(arrays[jax.tree_util.keystr(where)].astype(leaf.dtype)) if _is_array(leaf) else leaf
 
     return jax.tree_util.tree_map_with_path(filled, empty)

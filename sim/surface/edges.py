@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from sim.surface.cell import Cuts, axis_moments, axis_values, plane_moments, point_moments
-from sim.surface.pieces import STATES, Pair, summed, turned
+from sim.surface.pieces import Pair, share_of, summed, turned
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
 
@@ -41,25 +41,31 @@ def walls(
         lit_there, deep_there = (
             jax.lax.dynamic_index_in_dim(a, longest, 1 - axis, keepdims=False) for a in (lit, deep)
         )
-        toward_floor = jnp.diff(lit_there, axis=0) * jnp.sign(jnp.diff(deep_there, axis=0))[:, None, None]
         owner = jnp.zeros((plan.masks, across.edges.shape[0] - 2))
         owner = owner.at[jnp.arange(plan.masks)[:, None], across.line].add(1.0)
+
+        def beside(line: tuple[Array, Array]) -> Array:
+            number, share = line
+            toward_floor = jnp.sign(deep_there[number + 1] - deep_there[number])
+            return (lit_there[number + 1] - lit_there[number]) * toward_floor * share[:, None]
+
+        # A loop compiles to passes over rows; in one expression, every element would look for its line.
+        strips = jax.lax.map(beside, (jnp.arange(owner.shape[1]), owner.T @ strength.T))
         # A strip's share of a part of the cell is as many times larger as the part is smaller.
         points, lengths = axis_values(across.edges[1:-1], plan.parts), axis_moments(jnp.array([0.0, 1.0]), plan.parts)
         weights = plane_moments(points, lengths) if axis == 0 else plane_moments(lengths, points)
-        return summed(weights, toward_floor * (owner.T @ strength.T)[:, None, :, None])
+        return summed(weights, strips)
 
     return turned(over(along_y, along_x, 0) + over(along_x, along_y, 1))
 
 
 # Where the middle of the area between a square corner and its rounding lies, along each axis, in radii.
 _CORNER_MIDDLE = (1 / 2 - np.pi / 4 * (1 - 4 / (3 * np.pi))) / (1 - np.pi / 4)
-_SIDE_Y, _SIDE_X = np.indices((2, 2)).reshape(2, -1)  # of a crossing: 0 below the line, 1 above
 
 
 def corners(
     light: Float[Array, "p 2 w c"],
-    kinds: Bool[Array, "mask j i c"],
+    is_open: Bool[Array, "mask 2 2 window window"],
     along_y: Cuts,
     along_x: Cuts,
     relief: EtchParameters,
@@ -82,54 +88,61 @@ def corners(
     # joined or parted them.
     apart = jnp.clip(2 * jnp.abs(bias) / jnp.maximum(radius, 1e-6), 0.0, 1.0)
     shared = _shared_corners(along_y, along_x, bias, radius)
-    segments_x = along_x.state.shape[1]
+    segments_x, step = along_x.state.shape[1], _CORNER_MIDDLE * radius
 
-    def seen_from_sides(mask_and_opening: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
-        """Places (y, x) and amounts `[side, cell]` of a mask's odd openings (or gaps), and the light there."""
-        k, opening = mask_and_opening
-        step, own_kinds = _CORNER_MIDDLE * radius, kinds[k]
-        y, row, low_y, outer_y = _beside(along_y, k, _SIDE_Y, opening, bias[k], step)
-        x, column, low_x, outer_x = _beside(along_x, k, _SIDE_X, opening, bias[k], step)
+    def seen_from(viewpoint: tuple[Array, ...]) -> tuple[Array, Array, Array, Array]:
+        """Place (y, x) of a mask's odd openings (or gaps) seen from one side, their amount `[cell]`, and the light."""
+        k, opening, side_y, side_x = viewpoint
+        y, row, low_y, outer_y = _beside(along_y, k, side_y, opening, bias[k], step)
+        x, column, low_x, outer_x = _beside(along_x, k, side_x, opening, bias[k], step)
         own, other_y, other_x, far = (
-            own_kinds[low_y + (_SIDE_Y ^ dy), low_x + (_SIDE_X ^ dx)] for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
+            share_of(is_open, k, low_y + (side_y ^ dy), low_x + (side_x ^ dx))
+            for dy, dx in ((0, 0), (1, 0), (0, 1), (1, 1))
         )
-        around = [own_kinds[outer_y + dy, outer_x + dx] for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
+        around = [share_of(is_open, k, outer_y + dy, outer_x + dx) for dy, dx in ((0, 0), (2, 2), (0, 2), (2, 0))]
         touching = (around[0] == around[1]) & (around[2] == around[3]) & (around[0] != around[2])
         odd = (own == opening) & (own != other_y) & (own != other_x) & (own != far)
         return y, x, odd * jnp.where(touching, apart[k], 1.0), light[row * segments_x + column]
 
-    # A loop, because its results exist: fused into what follows, they would be computed again for every colour.
-    masks, openings = np.indices((plan.masks, 2)).reshape(2, -1)
-    ys, xs, amounts, found = jax.lax.map(seen_from_sides, (masks, openings > 0))
-    total, earlier = jnp.zeros(()), []
+    # Where a mask's etch is missing from an opening, or added to a gap, by what the light changes: factor - 1.
+    phase = 2 * jnp.pi * jnp.array([-1, 1])[:, None] * rates * relief.depth_m[:, None, None]
+    turns = jnp.stack([jnp.cos(phase) - 1, jnp.sin(phase)], axis=2)  # [mask, opening, 2, w]
+
+    def gain(amount: Array, turn: Array) -> Pair:
+        return Pair(turn[0, :, None] * amount, turn[1, :, None] * amount)
+
+    # Loops, because their results exist: fused into what follows, they would be computed again for every colour.
+    viewpoints = tuple(np.indices((plan.masks, 2, 2, 2)).reshape(4, -1))
+    ys, xs, amounts, lights = jax.lax.map(seen_from, viewpoints)
+    points = point_moments(axis_values(ys, plan.parts), axis_values(xs, plan.parts))
+    each = amounts, turns[viewpoints[:2]]
+    gained = jax.lax.map(lambda at: gain(*at[1:]).times(Pair(*at[0])), (lights, *each))
+    gained = Pair(*(part.reshape(plan.masks, 2, 4, *part.shape[1:]) for part in gained))
+    amounts = amounts.reshape(plan.masks, 2, 4, 1, -1)
+
+    def after(found: Pair, earlier: tuple[Array, ...]) -> tuple[Pair, None]:
+        """The light that a mask gains where an earlier one changes what it finds."""
+        amount, turn, share = earlier
+        # On one side a cell has an odd opening or an odd gap of a mask, not both.
+        gaps, openings = (gain(amount[o], turn[o]) for o in (0, 1))
+        return found.plus(found.times(gaps.plus(openings)), share), None
+
+    total = Pair(jnp.zeros(()), jnp.zeros(()))
     for k in range(plan.masks):
-        # What the masks before this one change on each side, and with it the light that this one finds there.
-        changed = Pair(jnp.ones(()), jnp.zeros(()))
-        for other, before in enumerate(earlier):
-            changed = changed.plus(changed.times(before), shared[k, other])
-        gains = []
-        for opening in range(2):
-            at = 2 * k + opening
-            # Light gained where this mask's etch is missing from an opening, or added to a gap: factor - 1.
-            phase = 2 * jnp.pi * (2 * opening - 1) * rates * relief.depth_m[k]
-            turn = jnp.cos(phase) - 1, jnp.sin(phase)
-            gain = Pair(*(part[:, None] * amounts[at][:, None] for part in turn))
-            gained = changed.times(gain).times(Pair(found[at, :, 0], found[at, :, 1]))
-            points = point_moments(axis_values(ys[at], plan.parts), axis_values(xs[at], plan.parts))
-            total = total + jnp.stack([summed(points, part, kept=2) for part in gained], axis=1)
-            gains.append(gain)
-        # On one side a cell has an odd opening or an odd gap of this mask, not both.
-        earlier.append(gains[0].plus(gains[1], jnp.ones(())))
-    return (1 - np.pi / 4) * radius**2 * total
+        own = Pair(*(part[k] for part in gained))
+        own, _ = jax.lax.scan(after, own, (amounts[:k], turns[:k], shared[k, :k]))
+        at = points.reshape(-1, plan.masks, 8)[:, k]
+        total = total.plus(Pair(*(summed(at, part.reshape(8, *part.shape[2:]), kept=2) for part in own)))
+    return (1 - np.pi / 4) * radius**2 * jnp.stack(total, axis=1)
 
 
 def _beside(
-    along: Cuts, mask: Array, side: Int[np.ndarray, " side"], opening: Array, bias: Array, step: Array
+    along: Cuts, mask: Array, side: Array, opening: Array, bias: Array, step: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Points `step` to one side of a mask's lines in the cells where they lie, segments there, and indices of `STATES`.
+    """The point `step` to one side (0 or 1) of a mask's line, in the cell where it lies, and the segment there.
 
-    An opening above its line (or a gap below it) begins at shift - bias, all others at shift + bias. The indices are of
-    the mask below each line and below both lines.
+    An opening above its line (or a gap below it) begins at shift - bias, all others at shift + bias. The last two are
+    the states (`mask_states`) of the mask below that line and below both lines.
     """
     upper = (side != opening) ^ (bias < 0)
     rank = along.line[mask]
@@ -138,8 +151,10 @@ def _beside(
     at = along.edges[1 + line] + (2 * side - 1) * step
     cell = jnp.floor(at).astype(jnp.int32)
     at = at - cell
-    segment = jnp.clip(jnp.searchsorted(along.edges, at, side="right") - 1, 0, along.state.shape[1] - 1)
-    below_both = -2 * cell - STATES[0]
+    # A binary search would be a loop of its own for every viewpoint.
+    segment = jnp.searchsorted(along.edges, at, side="right", method="compare_all") - 1
+    segment = jnp.clip(segment, 0, along.state.shape[1] - 1)
+    below_both = -2 * cell
     return at, segment, below_both + second, below_both
 
 

@@ -4,12 +4,12 @@ Complex numbers are kept as real and imaginary parts here, and sums over pieces 
 what compiles to fast loops.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Shaped
 
 from sim.surface.cell import Cuts
 from sim.surface.relief import TilePlan
@@ -19,36 +19,50 @@ PRECISION = jax.lax.Precision.HIGHEST
 
 
 # States of a mask along an axis: 0, 1 and 2 are before, between and behind its lines in the cell; 2 is also the first
-# of the next cell, and so on.
+# of the next cell, and so on. Corners are seen from cells beside their own, so these states are looked at, too.
 STATES = range(-2, 5)
+_NEIGHBOURS = range(STATES[0] // 2, STATES[-1] // 2 + 1)  # cells in which these states are the first or the second
 
 
 def mask_states(
-    state: Float[Array, "side side"],
-    along_y: Cuts,
-    along_x: Cuts,
-    mask: Int[Array, ""],
-    bias: Float[Array, ""],
-    kinds: range,
-    plan: TilePlan,
-) -> Float[Array, "j i t t"]:
-    """Open share of one mask in each of its kinds of piece, for all cells of a tile.
+    states: Float[Array, "mask side side"], along_y: Cuts, along_x: Cuts, bias: Float[Array, " mask"], plan: TilePlan
+) -> Float[Array, "mask 2 2 window window"]:
+    """Open share of every mask in states 0 and 1 of the cells of a tile and of their `_NEIGHBOURS`.
 
-    `state` holds the mask's pixels with a halo; of `bias`, the growth of openings, only the sign counts; `kinds` are
-    the states along either axis.
+    `states` holds the masks' pixels with a halo; of `bias`, the growth of openings, only the sign counts. The second
+    and third axes are the states along y and x; see `share_of`.
     """
-    cell, within = (np.array(part) for part in zip(*(divmod(kind, 2) for kind in kinds), strict=True))
+    window, masks = TILE + len(_NEIGHBOURS) - 1, states.shape[0]
+    grows = jnp.repeat(bias >= 0, 2)
 
-    def seen(along: Cuts) -> tuple[Array, Array]:
-        return plan.reach + along.low[mask, within] + cell, plan.reach + along.high[mask, within] + cell
+    def joined(of: Array, low: Array, high: Array, grows: Array, axis: int) -> Array:
+        starts = (plan.reach + _NEIGHBOURS[0] + pixel for pixel in (low, high))
+        first, second = (jax.lax.dynamic_slice_in_dim(of, start, window, axis) for start in starts)
+        return jnp.where(grows, jnp.maximum(first, second), jnp.minimum(first, second))
 
-    def joined(of: Array, pixels: tuple[Array, Array], axis: int) -> Array:
-        first, second = (jax.lax.dynamic_slice_in_dim(of, pixel, TILE, axis) for pixel in pixels)
-        return jnp.where(bias >= 0, jnp.maximum(first, second), jnp.minimum(first, second))
+    def both(along: Cuts) -> tuple[Array, Array, Array]:
+        return along.low[:, :2].reshape(-1), along.high[:, :2].reshape(-1), grows
 
     # Loops compile to copies of rows; side by side in one expression, every element would look for its piece.
-    across = jax.lax.map(lambda pixels: joined(state, pixels, 1), seen(along_x))
-    return jax.lax.map(lambda pixels: joined(across, pixels, 1), seen(along_y))
+    mask = np.arange(2 * masks) // 2
+    across = jax.lax.map(lambda at: joined(states[at[0]], *at[1:], axis=1), (mask, *both(along_x)))
+    across = across.reshape(masks, 2, -1, window)
+    found = jax.lax.map(lambda at: joined(across[at[0]], *at[1:], axis=1), (mask, *both(along_y)))
+    return found.reshape(masks, 2, 2, window, window)
+
+
+def share_of(shares: Shaped[Array, "mask 2 2 window window"], mask: Any, along_y: Any, along_x: Any) -> Array:
+    """Open share `[cell]` of one mask in given `STATES` along y and x, as `mask_states` has it."""
+    places = [(state % 2, state // 2 - _NEIGHBOURS[0]) for state in (along_y, along_x)]
+    (within_y, y), (within_x, x) = places
+    return jax.lax.dynamic_slice(shares, (mask, within_y, within_x, y, x), (1, 1, 1, TILE, TILE)).reshape(-1)
+
+
+def own_states(shares: Float[Array, "mask 2 2 window window"]) -> Float[Array, "mask 3 3 cell"]:
+    """Open share of every mask in its states 0, 1 and 2 along either axis of the cells of a tile."""
+    masks = shares.shape[0]
+    found = jax.lax.map(lambda at: share_of(shares, *at), tuple(np.indices((masks, 3, 3)).reshape(3, -1)))
+    return found.reshape(masks, 3, 3, -1)
 
 
 @jax.custom_jvp
@@ -92,8 +106,8 @@ class Pair(NamedTuple):
             self.real * other.imaginary + self.imaginary * other.real,
         )
 
-    def plus(self, other: "Pair", factor: Array) -> "Pair":
-        """Sum with a multiple."""
+    def plus(self, other: "Pair", factor: Array | float = 1.0) -> "Pair":
+        """Sum with a multiple of another."""
         return Pair(self.real + factor * other.real, self.imaginary + factor * other.imaginary)
 
 

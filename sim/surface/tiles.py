@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float, UInt8
 
 from sim.surface.cell import DEGREES, FILTER_REACH, axis_moments, cuts, moment_filter, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
-from sim.surface.pieces import PRECISION, STATES, TILE, light_of, mask_states, summed
+from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 
 
@@ -24,13 +24,15 @@ def transmission_of(
     """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean."""
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
-    halo = ((plan.reach, plan.reach + count_y * TILE - ny), (plan.reach, plan.reach + count_x * TILE - nx))
+    missing = count_y * TILE - ny, count_x * TILE - nx
+    # One pixel more behind than before: the corners of a cell are seen from up to two cells behind it.
+    halo = [(plan.reach, plan.reach + 1 + after) for after in missing]
     etched = jnp.pad(etched, halo)
     widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))
-    rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after - plan.reach) for _, after in halo])
+    rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after) for after in missing])
 
     def tile(start_y: Array, start_x: Array) -> Array:
-        side = TILE + 2 * plan.reach
+        side = TILE + 2 * plan.reach + 1
         bits = jax.lax.dynamic_slice(etched, (start_y, start_x), (side, side))
         masks = (bits[None] >> jnp.arange(plan.masks, dtype=jnp.uint8)[:, None, None]) & 1
         states = masks.astype(jnp.float32)
@@ -69,16 +71,12 @@ def _tile_moments(
         bias = effective_bias(relief) / pitch
         along_y = cuts((relief.shift_m[:, 0] + relief.growth * middle_y + relief.turn * middle_x) / pitch, bias)
         along_x = cuts((relief.shift_m[:, 1] + relief.growth * middle_x - relief.turn * middle_y) / pitch, bias)
-        around = STATES if plan.corners else range(3)
-        kinds = jax.lax.map(
-            lambda k: mask_states(states[k], along_y, along_x, k, bias[k], around, plan), jnp.arange(plan.masks)
-        )
-        own = slice(-around[0], 3 - around[0])
-        pieces = kinds[:, own, own]
+        shares = mask_states(states, along_y, along_x, bias, plan)
+        pieces = own_states(shares)
     else:
         along_y = along_x = whole_cell(plan.masks)
         inner = states[:, plan.reach : plan.reach + tile, plan.reach : plan.reach + tile]
-        pieces = kinds = jnp.broadcast_to(inner[:, None, None], (plan.masks, 3, 3, tile, tile))
+        shares, pieces = None, jnp.broadcast_to(inner.reshape(plan.masks, 1, 1, -1), (plan.masks, 3, 3, tile * tile))
     chosen_y, chosen_x = (jax.nn.one_hot(c.state, 3, axis=1) for c in (along_y, along_x))
     taken = relief.depth_m[:, None, None, None, None] * jnp.einsum("kia,kjb->kijab", chosen_y, chosen_x)
     segments = along_y.state.shape[1], along_x.state.shape[1]
@@ -87,7 +85,7 @@ def _tile_moments(
     y, x = middle_y + plan.die_m[0] + axis[:, None], middle_x + plan.die_m[1] + axis[None, :]
     uniform = 1.0 + relief.bowl * (y * y + x * x) + relief.tilt[0] * y + relief.tilt[1] * x
     # What differs from cell to cell goes into the product; after it, it would be computed again for every piece.
-    pieces = (pieces * uniform).reshape(-1, tile * tile)
+    pieces = (pieces * uniform.reshape(-1)).reshape(-1, tile * tile)
     if bump is not None:
         pieces = jnp.concatenate([pieces, -bump.reshape(1, -1)])
         taken = jnp.concatenate([taken, jnp.ones((taken.shape[0], 1))], axis=1)
@@ -97,9 +95,8 @@ def _tile_moments(
     moments = summed(weights, light)
     if plan.walls:
         moments = moments + walls(light, depth, along_y, along_x, relief, rates, plan)
-    if plan.corners:
-        kinds = kinds.reshape(*kinds.shape[:3], -1) > 0
-        moments = moments + corners(light, kinds, along_y, along_x, relief, rates, plan)
+    if shares is not None and plan.corners:
+        moments = moments + corners(light, shares > 0, along_y, along_x, relief, rates, plan)
     return moments.reshape(*moments.shape[:3], tile, tile)
 
 
