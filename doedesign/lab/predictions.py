@@ -38,7 +38,7 @@ from sim.surface import FabricatedDoe, as_fabricated
 # A laser of the kind that most optics labs have, and that of the published prototype.
 PROBE_M = 520e-9
 _DEPTH_ERRORS = (-0.05, -0.02, 0.0, 0.02, 0.05)
-_PATCH = 256
+_PATCH = 128  # shares of variance are within 0.04 of those on 512 cells, as they are on 256
 
 
 def predicted_metrics(rows: Sequence[dict[str, Any]]) -> tuple[PredictedMetrics, ...]:
