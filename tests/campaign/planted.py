@@ -137,8 +137,11 @@ def _state(folder: Path, *files: str) -> None:
             if entry["file"] == file:
                 digests[entry["sha256"]] = sha256_file(path)
                 entry |= {"bytes": path.stat().st_size, "sha256": sha256_file(path)}
-                if entry["cells"]:
-                    layout = _layout(path)
+                try:
+                    layout = _layout(path) if entry["cells"] else None
+                except InputError:  # what masks may not hold, such as a text, has no entry
+                    layout = None
+                if layout is not None:
                     around = [cell_entry(cell, layout.dbu_m) for cell in layout.cells if cell.name not in does]
                     found = {cell.cell: json.loads(canonical_json(_plain(cell))) for cell in around}
                     known = [found.pop(cell["cell"]) for cell in entry["cells"] if cell["cell"] in found]
