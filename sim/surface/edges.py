@@ -44,13 +44,13 @@ def walls(
         owner = jnp.zeros((plan.masks, across.edges.shape[0] - 2))
         owner = owner.at[jnp.arange(plan.masks)[:, None], across.line].add(1.0)
 
-        def beside(line: tuple[Array, Array]) -> Array:
+        def strip(line: tuple[Array, Array]) -> Array:
             number, share = line
             toward_floor = jnp.sign(deep_there[number + 1] - deep_there[number])
             return (lit_there[number + 1] - lit_there[number]) * toward_floor * share[:, None]
 
         # A loop compiles to passes over rows; in one expression, every element would look for its line.
-        strips = jax.lax.map(beside, (jnp.arange(owner.shape[1]), owner.T @ strength.T))
+        strips = jax.lax.map(strip, (jnp.arange(owner.shape[1]), owner.T @ strength.T))
         # A strip's share of a part of the cell is as many times larger as the part is smaller.
         points, lengths = axis_values(across.edges[1:-1], plan.parts), axis_moments(jnp.array([0.0, 1.0]), plan.parts)
         weights = plane_moments(points, lengths) if axis == 0 else plane_moments(lengths, points)

@@ -40,14 +40,14 @@ def mask_states(
         first, second = (jax.lax.dynamic_slice_in_dim(of, start, window, axis) for start in starts)
         return jnp.where(grows, jnp.maximum(first, second), jnp.minimum(first, second))
 
-    def both(along: Cuts) -> tuple[Array, Array, Array]:
+    def pixels(along: Cuts) -> tuple[Array, Array, Array]:
         return along.low[:, :2].reshape(-1), along.high[:, :2].reshape(-1), grows
 
     # Loops compile to copies of rows; side by side in one expression, every element would look for its piece.
     mask = np.arange(2 * masks) // 2
-    across = jax.lax.map(lambda at: joined(states[at[0]], *at[1:], axis=1), (mask, *both(along_x)))
+    across = jax.lax.map(lambda at: joined(states[at[0]], *at[1:], axis=1), (mask, *pixels(along_x)))
     across = across.reshape(masks, 2, -1, window)
-    found = jax.lax.map(lambda at: joined(across[at[0]], *at[1:], axis=1), (mask, *both(along_y)))
+    found = jax.lax.map(lambda at: joined(across[at[0]], *at[1:], axis=1), (mask, *pixels(along_y)))
     return found.reshape(masks, 2, 2, window, window)
 
 

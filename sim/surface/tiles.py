@@ -25,7 +25,7 @@ def transmission_of(
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
     missing = count_y * TILE - ny, count_x * TILE - nx
-    # One pixel more behind than before: the corners of a cell are seen from up to two cells behind it.
+    # One pixel more on the upper side: corners of a cell are seen from up to two cells above it, but one below.
     halo = [(plan.reach, plan.reach + 1 + after) for after in missing]
     etched = jnp.pad(etched, halo)
     widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))

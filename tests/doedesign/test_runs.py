@@ -94,7 +94,7 @@ def test_another_spec_overwrites_on_request_alone(done: Run, spec: Spec, tmp_pat
     (tmp_path / "kept.txt").write_text("mine")
     (done.folder / "link").symlink_to(tmp_path)
     changed = load_spec(QUICK, ["optimize.seed=2", "objective[0].weight=3.0"])
-    found = pytest.raises(InputError, match=r"with another objective, optimize\.seed\. .*give `overwrite`")
+    found = pytest.raises(InputError, match=r"spec\.toml has another objective, optimize\.seed\. .*give `overwrite`")
     with found, claim_run(done.folder, changed, {}):
         pytest.fail("claimed")
     with claim_run(done.folder, spec, {}, overwrite=True) as run:
