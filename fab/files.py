@@ -156,6 +156,8 @@ def require_text(path: Path) -> None:
 
 def _require_replaceable(path: Path) -> None:
     require_text(path)
+    if path.is_symlink():  # still, with all links followed
+        raise InputError(str(path), "the output must be a folder", "a link to itself", "Choose another output path.")
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not path.is_dir():
@@ -187,6 +189,11 @@ def _swap(fresh: Path, path: Path) -> None:
     _sync(path.parent)
 
 
+def real_path(path: Path) -> Path:
+    """Where a path leads to through links; one that goes round in links, for which `Path.resolve` fails, stays so."""
+    return Path(os.path.realpath(path))
+
+
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Fill a folder that appears at its final path only when everything in it is on the disk.
@@ -199,7 +206,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     if path.is_symlink():
-        path = path.resolve()  # the link stays, and what it points to is replaced
+        path = real_path(path)  # the link stays, and what it points to is replaced
     with os_errors_explained(path):
         if path.parent.is_dir():
             _clear_killed(path)

@@ -22,7 +22,7 @@ from doedesign.runs.folder import alone_in
 from doedesign.runtime.progress import meter
 from fab.errors import InputError
 from fab.figure import length_text
-from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_file, write_atomic
+from fab.files import MANIFEST_NAME, canonical_json, read_json, real_path, sha256_file, write_atomic
 
 FORMAT = "doedesign reconstructions 1"
 
@@ -107,7 +107,7 @@ def _names(captures: Sequence[Path], kind: str | None) -> list[str]:
         raise InputError("kind", f"must be one of {', '.join(WRITTEN_FILES)}", kind, "Choose one of them.")
     stems = [path.stem for path in captures]
     if len(set(stems)) < len(stems):
-        stems = [f"{path.resolve().parent.name}_{path.stem}" for path in captures]
+        stems = [f"{real_path(path).parent.name}_{path.stem}" for path in captures]
     if len(set(stems)) < len(stems):
         twice = next(stem for stem in stems if stems.count(stem) > 1)
         raise InputError("captures", "must differ in name or folder", f"{twice} twice", "Give them one by one.")
@@ -124,9 +124,9 @@ def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[
     if content and manifest.get("format") != FORMAT:
         rule = "reconstructions need a folder of their own, new or empty"
         raise InputError(str(folder), rule, "one with other content", "Choose another output folder.")
-    given = {path.resolve() for path in captures}
+    given = {real_path(path) for path in captures}
     for name in names:
-        if (folder / name).resolve() in given:
+        if real_path(folder / name) in given:
             rule, cure = "a capture must not be overwritten", "Choose another output folder."
             raise InputError(str(folder / name), rule, "its own name", cure)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from doedesign.runs.folder import alone_in
 from fab.errors import InputError
-from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_file
+from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, real_path, sha256_file
 
 
 @contextlib.contextmanager
@@ -37,7 +37,7 @@ def results_folder(
             if path.name not in listed:
                 rule = "a folder of results that is replaced must hold nothing else"
                 raise InputError(str(folder), rule, f"also {path.name!r}", "Move that file.")
-    inside = run is not None and folder.resolve().is_relative_to(run.resolve())
+    inside = run is not None and real_path(folder).is_relative_to(real_path(run))
     with alone_in(run) if run and inside else contextlib.nullcontext(), atomic_folder(folder) as fresh:
         yield fresh
         digests = {path.name: sha256_file(path) for path in sorted(fresh.iterdir())}

@@ -170,8 +170,10 @@ class Sample:
 def sample_of(draws: Mapping[str, Rows | OutOfModel], limits: Sequence[LimitSpec] = ()) -> Sample:
     """Sample of the results of some draws.
 
-    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite. Draws must have the same
-    rows, and one of them any.
+    A ring:disc ratio of None, as a DOE without any light in the disc has, counts as infinite.
+
+    Raises:
+        ValueError: no draw has rows, or two have different colours or depths.
     """
     first = next((found for found in draws.values() if not isinstance(found, OutOfModel)), None)
     if first is None:

@@ -18,7 +18,7 @@ from doedesign.spec import LimitSpec
 from doedesign.tolerancing.analysis import Sample, limit_from_text, sample_of, yield_of
 from doedesign.tolerancing.budget import FACTORS, Budget, budget_of
 from doedesign.tolerancing.cluster import evaluate_there
-from doedesign.tolerancing.journal import Journal
+from doedesign.tolerancing.journal import DRAWS_NAME, Journal
 from doedesign.tolerancing.pool import DrawModel, Evaluate, OutOfModel, default_workers, evaluate_here, predicted_rows
 from doedesign.tolerancing.sensitivity import Effect, VarianceShare, one_at_a_time, sobol
 from fab.draws import (
@@ -95,7 +95,14 @@ class Study:
             if key in beyond:
                 rule, cure = "must be within what can be evaluated", "Lower the means and sigmas of the errors."
                 raise InputError(f"draw {key}", rule, f'"{beyond[key]}"', cure)
-        return sample_of({key: self.journal.finished[key] for key in keys}, self.limits)
+        try:
+            return sample_of({key: self.journal.finished[key] for key in keys}, self.limits)
+        except ValueError as error:
+            if self.journal.folder is None:
+                raise
+            path = self.journal.folder / DRAWS_NAME
+            cure = f"Remove {path} to compute all draws again."
+            raise InputError(str(path), "all draws must have the same rows", f'"{error}"', cure) from error
 
     def beyond(self, keys: Sequence[str]) -> dict[str, str]:
         """Why some of these draws could not be evaluated, by key; they count as bad."""

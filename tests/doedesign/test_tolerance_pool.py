@@ -183,6 +183,16 @@ DAMAGED = [
 ]
 
 
+def test_draws_with_other_rows_are_refused(ask: Callable[..., Study], tmp_path: Path):
+    """A line that is a draw by itself, but none of this study."""
+    (tmp_path / "out").mkdir()
+    ask(out=tmp_path / "out").monte_carlo(1)
+    path = tmp_path / "out" / "draws.jsonl"
+    path.write_text('{"key": "normal/0", "rows": [{"colour": "green", "depth_m": 0.125}]}\n')
+    with pytest.raises(InputError, match=r"draws\.jsonl: all draws must have the same rows.*normal/.*Remove"):
+        ask(out=tmp_path / "out").monte_carlo(2)
+
+
 def test_a_damaged_line_is_named(ask: Callable[..., Study], tmp_path: Path):
     (tmp_path / "out").mkdir()
     ask(out=tmp_path / "out").monte_carlo(1)

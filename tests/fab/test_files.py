@@ -124,6 +124,14 @@ def test_foreign_content_is_refused_and_kept(tmp_path):
         pass
 
 
+def test_a_link_to_itself_is_refused(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    expected = pytest.raises(InputError, match=r"loop: the output must be a folder, but got a link to itself")
+    with expected, atomic_folder(tmp_path / "loop"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["loop"]
+
+
 def test_an_empty_folder_may_be_filled(tmp_path):
     (tmp_path / "out").mkdir()
     with atomic_folder(tmp_path / "out") as fresh:

@@ -313,6 +313,15 @@ def test_a_capture_is_never_overwritten(tmp_path: Path, run: Path, capture: Path
     assert first.read_bytes() == whole
 
 
+def test_a_result_that_became_a_link_to_itself_is_made_again(tmp_path: Path, run: Path, capture: Path):
+    (first,) = reconstruct(run, [capture], tmp_path / "out")
+    whole = first.read_bytes()
+    first.unlink()
+    first.symlink_to(first.name)
+    assert reconstruct(run, [capture], tmp_path / "out") == [first]
+    assert first.read_bytes() == whole
+
+
 def test_a_broken_capture_leaves_the_others(tmp_path: Path, run: Path, capture: Path):
     (tmp_path / "broken.exr").write_bytes(capture.read_bytes()[:200])
     out = tmp_path / "out"
