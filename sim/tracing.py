@@ -13,6 +13,11 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def in_jit() -> bool:
+    """Whether `jax.jit` is tracing: then constants are traced like everything else."""
+    return is_traced(jnp.zeros(()))
+
+
 def on_host(array: Any) -> Any:
     """The array as numpy, or as it is where it is traced."""
     return array if isinstance(array, Tracer) else np.asarray(array)

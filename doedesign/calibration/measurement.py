@@ -197,7 +197,7 @@ def read_measurement(path: Path, camera: Camera) -> Measurement:
         frame = read_frame(file, channel=spec.channel, pixel_m=spec.pixel_m, allow_8bit=spec.allow_8bit)
         return frame._replace(counts=_turned(spec, frame.counts), valid=_turned(spec, frame.valid))
 
-    merged = [_merged(spec, image, read) for image in spec.image]
+    merged = [_merged(path, spec, image, read) for image in spec.image]
     smallest = min(min(psf.rate.shape) for psf in merged)
     window = spec.window or min(round(camera.window * camera.pixel_m / spec.pixel_m), smallest)
     images, full = [], {}
@@ -217,20 +217,23 @@ def _turned(spec: MeasurementSpec, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.rot90(picture[:, ::-1] if spec.mirrored else picture, -spec.quarter_turns))
 
 
-def _merged(spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], CameraFrame]) -> MeasuredPsf:
+def _merged(path: Path, spec: MeasurementSpec, image: ImageSpec, read: Callable[[str], CameraFrame]) -> MeasuredPsf:
     frames = [read(name) for name in image.files]
     files = [read(name) for name in image.dark]
     black = image.black_level
     darks = files * (len(frames) if len(files) == 1 else 1) or [f.black if black is None else black for f in frames]
-    return merge_exposures(
-        frames,
-        image.exposures or (1.0,),
-        darks,
-        Noise(spec.gain, spec.read_noise),
-        clipped_at=spec.saturation,
-        dark_count=image.dark_frames,
-        names=image.files,
-    )
+    try:
+        return merge_exposures(
+            frames,
+            image.exposures or (1.0,),
+            darks,
+            Noise(spec.gain, spec.read_noise),
+            clipped_at=spec.saturation,
+            dark_count=image.dark_frames,
+            names=image.files,
+        )
+    except InputError as error:  # in the image, or in what the file says of it
+        raise InputError(f"{path}: {error.where}", error.rule, error.got, error.cure) from error
 
 
 def _measured_image(

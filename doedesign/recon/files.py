@@ -120,8 +120,7 @@ def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[
     if not folder.is_dir():
         return  # `alone_in` makes it, or says why it cannot be made
     content = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    manifest = read_json(folder / MANIFEST_NAME) if MANIFEST_NAME in content else {}
-    if content and manifest.get("format") != FORMAT:
+    if content and _results(folder) is None:
         rule = "reconstructions need a folder of their own, new or empty"
         raise InputError(str(folder), rule, "one with other content", "Choose another output folder.")
     given = {real_path(path) for path in captures}
@@ -129,6 +128,14 @@ def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[
         if real_path(folder / name) in given:
             rule, cure = "a capture must not be overwritten", "Choose another output folder."
             raise InputError(str(folder / name), rule, "its own name", cure)
+
+
+def _results(folder: Path) -> dict[str, Any] | None:
+    """What the manifest of a folder of reconstructions says of each; None if it is none of such a folder."""
+    path = folder / MANIFEST_NAME
+    manifest = read_json(path) if path.is_file() else {}
+    results = manifest.get("results")
+    return results if manifest.get("format") == FORMAT and isinstance(results, dict) else None
 
 
 def _bits(photo: Photo, ending: str) -> int | None:
@@ -141,6 +148,6 @@ def _bits(photo: Photo, ending: str) -> int | None:
 def _note(folder: Path, results: Mapping[str, Any]) -> None:
     """Add results to the folder's manifest."""
     path = folder / MANIFEST_NAME
-    known: Mapping[str, Any] = read_json(path).get("results", {}) if path.is_file() else {}
+    known = _results(folder) or {}
     units = "SI; EXR and TIFF of floats hold linear light, the rest display values; files have the top row first"
     write_atomic(path, canonical_json({"format": FORMAT, "units": units, "results": {**known, **results}}))

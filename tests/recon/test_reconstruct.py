@@ -306,10 +306,11 @@ def test_a_capture_is_never_overwritten(tmp_path: Path, run: Path, capture: Path
     (first,) = reconstruct(run, [capture], out)
     with pytest.raises(InputError, match="a capture must not be overwritten"):
         reconstruct(run, [first], out)
-    whole = first.read_bytes()
-    (out / "manifest.json").write_bytes(canonical_json({"format": "another"}))
-    with pytest.raises(InputError, match="a folder of their own"):
-        reconstruct(run, [capture], out)
+    whole, manifest = first.read_bytes(), read_json(out / "manifest.json")
+    for changed in ({"format": "another"}, {"results": []}):
+        (out / "manifest.json").write_bytes(canonical_json(manifest | changed))
+        with pytest.raises(InputError, match="a folder of their own"):
+            reconstruct(run, [capture], out)
     assert first.read_bytes() == whole
 
 
