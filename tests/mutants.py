@@ -5,9 +5,11 @@
     python -m tests.mutants --sample 500 --all          # 500 of everything, chosen by the seed
     python -m tests.mutants doedesign/design/patterns.py
 
-Cosmic Ray makes the changes, in a copy of the project. The tests meant for a file are those that bear its name
-(`test_sensor.py`, `test_sensor_noise.py` for `sensor.py`) and those that import it, of the fast tier; a mutant that
-survives them meets those of the files that use it. One that survives all, but harms nothing, is listed with the reason
+Cosmic Ray makes the changes, in a copy of the project. The tests of the fast tier, with `--all`, or else those that are
+meant for the files, run once under Coverage, which notes the lines that each of them runs. A mutant first meets the
+tests that run its line, the quickest first; if it survives them, all tests of those files, because others of a file may
+look at what one of them, or a fixture, has made. A line that is run on import meets the tests with its file's name,
+those that import the file, and those of its users. Mutants that survive, but harm nothing, are listed with the reason
 in `mutants.toml`.
 """
 
@@ -16,16 +18,15 @@ import ast
 import functools
 import itertools
 import os
+import queue
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +35,7 @@ import numpy as np
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
+from coverage import CoverageData
 
 ROOT = Path(__file__).parents[1]
 HARMLESS = Path(__file__).with_suffix(".toml")
@@ -45,7 +47,11 @@ EVERYTHING = (
     "doedesign/calibration/*.py",
     "doedesign/tolerancing/*.py",
 )
-_NONE_SELECTED = 5  # pytest's exit code where all tests of a file are slow ones
+_NOT_FOUND, _NONE_SELECTED = (
+    4,
+    5,
+)  # pytest's exit codes where a file breaks on import, and where all tests are slow ones
+_QUICK_S, _FILES_S = 60.0, 120.0  # of tests by themselves, and of all tests of files, that a mutant meets
 _COPIED = ("doedesign", "fab", "sim", "tests", "bench", "examples", "masks", "pyproject.toml", "README.md")
 _COPIED += ("CONTRIBUTING.md", "Makefile", "constraints.txt")
 
@@ -107,7 +113,7 @@ def _annotations(code: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     return found
 
 
-def tests_for(file: str) -> list[list[str]]:
+def tests_for(file: str) -> list[str]:
     """Test files meant for a file: with its name or importing it; then those of the nearest files that use it."""
     own, users, seen = _own_tests(file), [file], {file}
     others: dict[str, None] = {}
@@ -115,7 +121,7 @@ def tests_for(file: str) -> list[list[str]]:
         users = [user for user in _users(users) if user not in seen]
         seen |= set(users)
         others = dict.fromkeys(test for user in users for test in _own_tests(user) if test not in own)
-    return [tests for tests in (own, list(others)) if tests]
+    return [*own, *others]
 
 
 def _own_tests(file: str) -> list[str]:
@@ -151,72 +157,121 @@ def _texts(pattern: str) -> dict[str, str]:
     return {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in sorted(ROOT.glob(pattern))}
 
 
-def survives(mutant: Mutant, tree: Path, tests: Sequence[str], limit_s: float) -> bool:
-    """Whether tests pass although a file is changed; `tree` is a copy of the project."""
+class Coverage(NamedTuple):
+    """What the tests do: how long each takes, in seconds, and which of them run each line of a file; "" on import."""
+
+    seconds: dict[str, float]
+    running: dict[str, dict[int, list[str]]]
+
+    def tests(self, file: str, line: int) -> list[str]:
+        """Tests that run a line, or where that is none of its own, the statement that it is in; the quickest first."""
+        lines = self.running.get(file, {})
+        near = {line} if line in lines else _statement(file, line)
+        found = {test for one in near for test in lines.get(one, ()) if test}
+        return sorted(found, key=lambda test: (self.seconds.get(test, 0.0), test))
+
+    def of_file(self, test_file: str) -> float:
+        """How long all tests of a file take."""
+        return sum(seconds for test, seconds in self.seconds.items() if test.startswith(f"{test_file}::"))
+
+
+def _statement(file: str, line: int) -> set[int]:
+    """Lines of the smallest statement that a line is in."""
+    spans = [
+        (node.end_lineno - node.lineno, node.lineno, node.end_lineno)
+        for node in ast.walk(ast.parse(_texts(file)[file]))
+        if isinstance(node, ast.stmt) and node.end_lineno and node.lineno <= line <= node.end_lineno
+    ]
+    _, first, last = min(spans, default=(0, line, line))
+    return set(range(first, last + 1))
+
+
+def _pytest(tree: Path, arguments: Sequence[str], limit_s: float) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *arguments]
+    environment = os.environ | {"PYTHONPATH": str(tree), "COVERAGE_FILE": str(tree / "coverage")}
+    return subprocess.run(command, cwd=tree, env=environment, capture_output=True, check=False, timeout=limit_s)
+
+
+def covered(tree: Path, tests: Sequence[str], jobs: int) -> Coverage:
+    """Run tests, all by default, on the files as they are."""
+    packages = [f"--cov={top}" for top in ("fab", "sim", "doedesign")]
+    how = ["-vv", "--durations=0", "-n", str(jobs), "--dist", "loadfile", "--cov-context=test", "--cov-report="]
+    done = _pytest(tree, [*how, *packages, *tests], 7200.0)
+    said = done.stdout.decode(errors="replace")
+    if done.returncode != 0:
+        raise SystemExit(f"tests fail on the files as they are:\n{said[-3000:]}")
+    seconds: dict[str, float] = defaultdict(float)
+    for took, test in re.findall(r"^\s*([\d.]+)s (?:setup|call|teardown)\s+(tests/.*)$", said, re.MULTILINE):
+        seconds[test] += float(took)
+    data = CoverageData(str(tree / "coverage"))
+    data.read()
+    running: dict[str, dict[int, list[str]]] = {}
+    for name in data.measured_files():
+        lines = data.contexts_by_lineno(name)
+        found = {line: sorted({one.rpartition("|")[0] for one in contexts}) for line, contexts in lines.items()}
+        running[str(Path(name).resolve().relative_to(tree.resolve()))] = found
+    return Coverage(dict(seconds), running)
+
+
+def survives(mutant: Mutant, tree: Path, known: Coverage) -> bool | None:
+    """Whether all tests pass although a file is changed; None where no test runs its line. `tree` is a copy."""
+    quickest = known.tests(mutant.file, mutant.line)
+    files = list(dict.fromkeys(test.partition("::")[0] for test in quickest)) or tests_for(mutant.file)
+    meant = tests_for(mutant.file)
+    files.sort(key=lambda file: (file not in meant, known.of_file(file)))
+    if not files:
+        return None
+    groups = [_first(quickest, known.seconds.get, _QUICK_S), _first(files, known.of_file, _FILES_S)]
     path = tree / mutant.file
     code = path.read_text("utf-8")
     try:
         path.write_text(mutant.code, "utf-8")
-        return _passes(tree, tests, limit_s)
+        return all(_pass(tree, tests, known) for tests in groups if tests)
     finally:
         path.write_text(code, "utf-8")
 
 
-class _Judge:
-    """Runs the tests of several mutants at once, each in a copy of the project of its own."""
-
-    def __init__(self, folder: Path, jobs: int) -> None:
-        self._folder, self._jobs = folder, jobs
-        self._local, self._trees = threading.local(), itertools.count()
-
-    def verdicts(self, mutants: Sequence[Mutant]) -> Iterator[tuple[Mutant, bool | None]]:
-        """Every mutant, in their order, with whether it survives; None where no test is meant for it.
-
-        The tests run once on the files as they are: those that fail there judge nothing, and the others tell how long
-        they take.
-        """
-        meant = {file: tests_for(file) for file in {mutant.file for mutant in mutants}}
-        every = sorted({test for groups in meant.values() for tests in groups for test in tests})
-        with ThreadPoolExecutor(self._jobs) as pool:
-            times = dict(zip(every, pool.map(self._seconds, every), strict=True))
-            if failing := [test for test, seconds in times.items() if seconds is None]:
-                raise SystemExit(f"tests fail on the files as they are: {', '.join(failing)}")
-
-            def lives(mutant: Mutant) -> bool | None:
-                groups = meant[mutant.file]
-                limits = [30.0 + 3 * sum(times[test] or 0.0 for test in tests) for tests in groups]
-                tree = self._tree()
-                found = (survives(mutant, tree, *of_it) for of_it in zip(groups, limits, strict=True))
-                return all(found) if groups else None
-
-            yield from zip(mutants, pool.map(lives, mutants), strict=True)
-
-    def _seconds(self, test: str) -> float | None:
-        """How long the tests of a file take; None if one fails."""
-        began = time.monotonic()
-        return time.monotonic() - began if _passes(self._tree(), [test], 1800.0) else None
-
-    def _tree(self) -> Path:
-        if not hasattr(self._local, "tree"):
-            self._local.tree = self._folder / f"tree{next(self._trees)}"
-            self._local.tree.mkdir()
-            for name in _COPIED:
-                source = ROOT / name
-                (shutil.copytree if source.is_dir() else shutil.copy2)(source, self._local.tree / name)
-        return self._local.tree
+def _first(tests: Sequence[str], seconds: Callable[[str], float | None], most_s: float) -> list[str]:
+    """As many as take so long together, and at least one."""
+    ends = itertools.accumulate(seconds(test) or 0.0 for test in tests)
+    return [test for k, (test, end) in enumerate(zip(tests, ends, strict=True)) if end <= most_s or k == 0]
 
 
-def _passes(tree: Path, tests: Sequence[str], limit_s: float) -> bool:
-    how = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not slow"]
-    command = [sys.executable, "-B", "-m", "pytest", *how, *tests]
-    environment = os.environ | {"PYTHONPATH": str(tree)}
+def _pass(tree: Path, tests: Sequence[str], known: Coverage) -> bool:
+    expected = sum(known.seconds.get(test) or known.of_file(test) for test in tests)
     try:
-        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, check=False, timeout=limit_s)
+        done = _pytest(tree, ["-x", "-p", "no:xdist", *tests], 60.0 + 5 * expected)
     except subprocess.TimeoutExpired:
         return False
-    if done.returncode not in (0, 1, 2, _NONE_SELECTED):
+    if done.returncode not in (0, 1, 2, _NOT_FOUND, _NONE_SELECTED):
         print(done.stdout.decode(errors="replace")[-2000:])
     return done.returncode in (0, _NONE_SELECTED)
+
+
+def _copy(tree: Path) -> Path:
+    """Copy the project."""
+    tree.mkdir()
+    for name in _COPIED:
+        source = ROOT / name
+        (shutil.copytree if source.is_dir() else shutil.copy2)(source, tree / name)
+    return tree
+
+
+def verdicts(mutants: Sequence[Mutant], trees: Sequence[Path], known: Coverage) -> Iterator[tuple[Mutant, bool | None]]:
+    """Every mutant, in their order, with whether it survives; as many at once as there are copies of the project."""
+    idle: queue.SimpleQueue[Path] = queue.SimpleQueue()
+    for tree in trees:
+        idle.put(tree)
+
+    def lives(mutant: Mutant) -> bool | None:
+        tree = idle.get()
+        try:
+            return survives(mutant, tree, known)
+        finally:
+            idle.put(tree)
+
+    with ThreadPoolExecutor(len(trees)) as pool:
+        yield from zip(mutants, pool.map(lives, mutants), strict=True)
 
 
 def chosen(files: Sequence[str], count: int | None, seed: int) -> list[Mutant]:
@@ -246,20 +301,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     every = sorted(str(path.relative_to(ROOT)) for pattern in EVERYTHING for path in ROOT.glob(pattern))
     files = asked.file or (every if asked.all else _changed_files(asked.since))
-    known = {(one["file"], one["was"], one["now"]): one["why"] for one in tomllib.loads(HARMLESS.read_text())["mutant"]}
+    harmless_ones = {
+        (one["file"], one["was"], one["now"]): one["why"] for one in tomllib.loads(HARMLESS.read_text())["mutant"]
+    }
     survived, harmless, untested = [], 0, []
     picked = chosen(files, asked.sample, asked.seed)
     print(f"{len(picked)} mutants of {len({m.file for m in picked})} files, seed {asked.seed}", flush=True)
     with tempfile.TemporaryDirectory(prefix="doedesign-mutants-") as folder:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", f"{folder}/compiled")
-        judge = _Judge(Path(folder), asked.jobs)
-        for number, (mutant, lives) in enumerate(judge.verdicts(picked), 1):
+        trees = [_copy(Path(folder) / f"tree{k}") for k in range(asked.jobs)]
+        few = [] if asked.all else sorted({test for mutant in picked for test in tests_for(mutant.file)})
+        known = covered(trees[0], few, asked.jobs)
+        for number, (mutant, lives) in enumerate(verdicts(picked, trees, known), 1):
             if lives is None:
                 untested.append(mutant)
                 print(f"{number}: no test is meant for {mutant}", flush=True)
             elif not lives:
                 print(f"{number}: killed {mutant}", flush=True)
-            elif why := known.get((mutant.file, mutant.was, mutant.now)):
+            elif why := harmless_ones.get((mutant.file, mutant.was, mutant.now)):
                 harmless += 1
                 print(f"{number}: harmless, {why} {mutant}", flush=True)
             else:
