@@ -2,7 +2,7 @@
 
 import tomllib
 
-from tests.mutants import HARMLESS, ROOT, chosen, mutant_of, places
+from tests.mutants import HARMLESS, ROOT, Coverage, chosen, mutant_of, places
 from tests.mutants import tests_for as meant_for
 
 
@@ -10,7 +10,20 @@ def test_tests_are_found_by_name_first_and_by_what_they_import():
     found = meant_for("sim/noise.py")
     assert "tests/sim/test_noise.py" in found[:2]
     assert all((ROOT / test).is_file() for test in found)
-    assert meant_for("doedesign/design/patterns.py") == ["tests/doedesign/test_objectives.py"]
+    assert meant_for("doedesign/design/patterns.py")[0] == "tests/doedesign/test_objectives.py"
+
+
+def test_tests_that_run_a_line_come_the_quickest_first():
+    file, lines = "doedesign/runs/results.py", (ROOT / "doedesign/runs/results.py").read_text().splitlines()
+    (raised,) = (k for k, line in enumerate(lines, 1) if "raise InputError(" in line)
+    known = Coverage({"a::slow": 9.0, "a::quick": 0.1, "b::other": 1.0}, {file: {raised: ["a::slow", "", "a::quick"]}})
+    assert known.tests(file, raised) == ["a::quick", "a::slow"]
+    assert known.tests(file, 1) == []
+    assert known.of_file("a") == 9.1
+    # A line of a statement that another line stands for.
+    first = next(k for k, line in enumerate(lines, 1) if line.startswith("def "))
+    body = Coverage({}, {file: {first: ["a::quick"]}})
+    assert body.tests(file, first + 1) == ["a::quick"]
 
 
 def test_a_place_is_changed_in_every_way_and_annotations_are_left_alone():

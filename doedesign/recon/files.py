@@ -131,7 +131,7 @@ def _require_own_folder(folder: Path, captures: Sequence[Path], names: Sequence[
 
 
 def _results(folder: Path) -> dict[str, Any] | None:
-    """What the manifest of a folder of reconstructions says of each; None if it is none of such a folder."""
+    """Results in the manifest of a folder of reconstructions; None if it is not that of one."""
     path = folder / MANIFEST_NAME
     manifest = read_json(path) if path.is_file() else {}
     results = manifest.get("results")
