@@ -8,6 +8,7 @@ Reading order, from the substance to the picture:
     source      that wave as arrays for one wavelength, depth and field angle
     propagation pupil -> pixel energies: the far field (eqs. 7-9 of the paper), for rings, and the direct path (eq. 5)
     optic       whatever images a point source: height maps and rings
+    rigorous    Maxwell's equations for rows of cells, and height maps with the light of their walls (`with_edges`)
     surface     the DOE as a process with errors makes it (`as_fabricated`), its leaked and its diffracted light
     psf_bank    PSFs: every colour and depth of one optic (`psf`)
     metrics     numbers read off a PSF or a DOE: far-spot energy, ring:disc, 0th order, Strehl ratio, energy budget

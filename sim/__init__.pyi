@@ -34,6 +34,11 @@ from .optic import RingOptic as RingOptic
 from .psf_bank import BankOptic as BankOptic
 from .psf_bank import PsfBank as PsfBank
 from .psf_bank import psf as psf
+from .rigorous import RowComparison as RowComparison
+from .rigorous import compare_row as compare_row
+from .rigorous import edge_widths as edge_widths
+from .rigorous.edge_optic import EdgeOptic as EdgeOptic
+from .rigorous.edge_optic import with_edges as with_edges
 from .sensor import Sensor as Sensor
 from .sensor import developed as developed
 from .sensor import expose as expose

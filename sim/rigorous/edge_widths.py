@@ -10,11 +10,13 @@ ridge as high as the wall and half as wide as its period, of which the rigorous 
 through, differs from the thin element's by 2 w / period.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.linalg import eigh
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from sim.rigorous.rows import Polarisation
 
@@ -66,17 +68,31 @@ def edge_widths(
     returned = (up - down) / 2 @ inverse_sum
     light = np.zeros(size, complex)
     light[0] = 2 * before[0]
+    onward, backward = before[:, None] * modes + other * decay, before[:, None] * modes - other * decay
+    entered, turned = np.linalg.solve(onward, light), np.linalg.solve(onward, backward)
     face = 2 / (1 + index) * (1.0 if te else index)
     found = []
     for height in heights_m:
-        turns = 2 * np.pi * height / wavelength_m
-        through = np.exp(-decay * turns)
-        back = through[:, None] * returned * through
-        top = other * decay @ (np.eye(size) - back) + before[:, None] * (modes @ (np.eye(size) + back))
-        amplitude = inverse_sum[0] @ (through * np.linalg.solve(top, light))
-        thin = (np.exp(1j * index * turns) + np.exp(1j * turns)) / 2
+        waves_of_it = height / wavelength_m
+        through = np.exp(-2 * np.pi * decay * waves_of_it)
+        excited = _with_echoes(entered, lambda modes, t=through: turned @ (t * (returned @ (t * modes))))
+        amplitude = inverse_sum[0] @ (through * excited)
+        thin = (np.exp(2j * np.pi * index * waves_of_it) + np.exp(2j * np.pi * waves_of_it)) / 2
         found.append((amplitude / face - thin) * period * wavelength_m / 2)
     return np.array(found)
+
+
+def _with_echoes(
+    entered: Complex[np.ndarray, " mode"], echo: Callable[[Complex[np.ndarray, " mode"]], Complex[np.ndarray, " mode"]]
+) -> Complex[np.ndarray, " mode"]:
+    """Modes with all that comes back after one, two ... ways down and up, to twelve digits."""
+    size = (len(entered), len(entered))
+    # The stubs take the type for a second one.
+    operator = LinearOperator(size, lambda modes: modes + echo(modes.ravel()), dtype=complex)  # pyright: ignore[reportCallIssue]
+    excited, left = gmres(operator, entered, entered, rtol=1e-12, restart=60, maxiter=5)
+    if left:
+        raise ValueError(f"light between the faces of a ridge does not settle: {left} iterations were not enough")
+    return excited
 
 
 def _coefficients(ridge: float, groove: float, count: int) -> Float[np.ndarray, " order"]:
