@@ -47,7 +47,7 @@ class _Counted(io.FileIO):
     shim: "Shim"
 
     def write(self, data: Any) -> int:
-        self.shim.met("write", os.fstat(self.fileno()) and _name_of(self.fileno()))
+        self.shim.met("write", self.fileno())
         return super().write(data)
 
 
@@ -72,6 +72,8 @@ class Shim:
         fault = self._fault
         if isinstance(path, int):
             path = _name_of(path)
+            if not path.startswith("/"):  # a pipe, which no disk holds
+                return
         where = os.path.realpath(os.fsdecode(path))
         if not where.startswith(self._folder):
             return
