@@ -9,8 +9,8 @@ Cosmic Ray makes the changes, in a copy of the project. The tests of the fast ti
 meant for the files, run once under Coverage, which notes the lines that each of them runs. A mutant first meets the
 tests that run its line, the quickest first; if it survives them, all tests of those files, because others of a file may
 look at what one of them, or a fixture, has made. A line that is run on import meets the tests with its file's name,
-those that import the file, and those of its users. Mutants that survive, but harm nothing, are listed with the reason
-in `mutants.toml`.
+those that import the file, and those of its users. With `--slow`, what survives meets the long tests, too, that have
+its file's name or import it. Mutants that survive, but harm nothing, are listed with the reason in `mutants.toml`.
 """
 
 import argparse
@@ -213,7 +213,7 @@ def covered(tree: Path, tests: Sequence[str], jobs: int) -> Coverage:
     return Coverage(dict(seconds), running)
 
 
-def survives(mutant: Mutant, tree: Path, known: Coverage) -> bool | None:
+def survives(mutant: Mutant, tree: Path, known: Coverage, slow: bool = False) -> bool | None:
     """Whether all tests pass although a file is changed; None where no test runs its line. `tree` is a copy."""
     quickest = known.tests(mutant.file, mutant.line)
     files = list(dict.fromkeys(test.partition("::")[0] for test in quickest)) or tests_for(mutant.file)
@@ -226,7 +226,8 @@ def survives(mutant: Mutant, tree: Path, known: Coverage) -> bool | None:
     code = path.read_text("utf-8")
     try:
         path.write_text(mutant.code, "utf-8")
-        return all(_pass(tree, tests, known) for tests in groups if tests)
+        fast = all(_pass(tree, tests, known) for tests in groups if tests)
+        return fast and not (slow and _kill(tree, _own_tests(mutant.file)))
     finally:
         path.write_text(code, "utf-8")
 
@@ -248,6 +249,15 @@ def _pass(tree: Path, tests: Sequence[str], known: Coverage) -> bool:
     return done.returncode in (0, _NONE_SELECTED)
 
 
+def _kill(tree: Path, tests: Sequence[str]) -> bool:
+    """Whether a long test of these files fails."""
+    try:
+        done = _pytest(tree, ["-x", "-p", "no:xdist", "-m", "slow", *tests], 1800.0) if tests else None
+    except subprocess.TimeoutExpired:
+        return True
+    return done is not None and done.returncode not in (0, _NONE_SELECTED)
+
+
 def _copy(tree: Path) -> Path:
     """Copy the project."""
     tree.mkdir()
@@ -257,7 +267,9 @@ def _copy(tree: Path) -> Path:
     return tree
 
 
-def verdicts(mutants: Sequence[Mutant], trees: Sequence[Path], known: Coverage) -> Iterator[tuple[Mutant, bool | None]]:
+def verdicts(
+    mutants: Sequence[Mutant], trees: Sequence[Path], known: Coverage, slow: bool = False
+) -> Iterator[tuple[Mutant, bool | None]]:
     """Every mutant, in their order, with whether it survives; as many at once as there are copies of the project."""
     idle: queue.SimpleQueue[Path] = queue.SimpleQueue()
     for tree in trees:
@@ -266,7 +278,7 @@ def verdicts(mutants: Sequence[Mutant], trees: Sequence[Path], known: Coverage) 
     def lives(mutant: Mutant) -> bool | None:
         tree = idle.get()
         try:
-            return survives(mutant, tree, known)
+            return survives(mutant, tree, known, slow)
         finally:
             idle.put(tree)
 
@@ -298,6 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sample", type=int, help="how many places to change; all by default")
     parser.add_argument("--seed", type=int, default=0, help="which places, and how")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="mutants at once")
+    parser.add_argument("--slow", action="store_true", help="run long tests, too, on what survives")
     asked = parser.parse_args(arguments)
     every = sorted(str(path.relative_to(ROOT)) for pattern in EVERYTHING for path in ROOT.glob(pattern))
     files = asked.file or (every if asked.all else _changed_files(asked.since))
@@ -312,7 +325,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         trees = [_copy(Path(folder) / f"tree{k}") for k in range(asked.jobs)]
         few = [] if asked.all else sorted({test for mutant in picked for test in tests_for(mutant.file)})
         known = covered(trees[0], few, asked.jobs)
-        for number, (mutant, lives) in enumerate(verdicts(picked, trees, known), 1):
+        for number, (mutant, lives) in enumerate(verdicts(picked, trees, known, asked.slow), 1):
             if lives is None:
                 untested.append(mutant)
                 print(f"{number}: no test is meant for {mutant}", flush=True)
