@@ -14,6 +14,7 @@ from doedesign.spec import LimitSpec
 from doedesign.tolerancing.analysis import QUANTITIES, Sample, limit_from_text, limit_text, sample_of, yield_of
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
+from doedesign.tolerancing.results import tolerance
 from doedesign.tolerancing.sensitivity import source_shares
 from doedesign.tolerancing.studies import Study, study
 from fab.errors import InputError
@@ -91,6 +92,8 @@ def test_statistics_of_every_row_and_of_the_worst():
     assert found["far_spot", "red", math.inf]["mean"] == pytest.approx(0.45)
     assert ("far_spot", "red", 0.05) not in found
     assert found["ring_to_disc", "blue", 0.05]["mean"] == math.inf
+    one = {(s["quantity"], s["colour"], s["depth_m"]): s for s in TWO.of(["normal/1"]).statistics()}
+    assert (one["strehl", "red", 0.05]["mean"], one["strehl", "red", 0.05]["std"]) == (0.7, 0.0)
     # Four quantities, of which two have four rows and two have two.
     assert len(found) == 4 + 2 * 4 + 2 * 2
 
@@ -176,6 +179,7 @@ def test_a_plate_beyond_the_model_is_bad_and_nothing_else():
 def test_the_worst_plate_is_farthest_beyond_a_limit():
     assert limited(TWO, []).worst_draw == "normal/1"  # Strehl 0.7
     assert limited(TWO, [limit_from_text("zeroth_order <= 1 %")]).worst_draw == "normal/0"
+    assert limited(TWO, [limit_from_text("zeroth_order <= 1.5 % for red")]).worst_draw == "normal/1"
     # 0.2 below 0.3 is worse than 0.04 above 0.035, against the size of the limits.
     limits = [limit_from_text("far_spot >= 0.3"), limit_from_text("zeroth_order <= 3.5 %")]
     assert limited(TWO, limits).worst_draw == "normal/1"
@@ -254,6 +258,26 @@ def test_the_budget_for_overlay_agrees_with_the_one_worked_out(ask: Callable[...
         assert found.share == pytest.approx(exact, abs=0.06)  # three sigma at a yield of 50 %
     assert str(budget).startswith("overlay x 0.9")
     assert asked.budget("overlay_x[0]", 0.9, 100, (0.0, 0.5, 1.0)).sigmas.keys() == {"overlay_x_m[0]"}
+
+
+def test_a_result_holds_what_was_asked_for(fakes, monkeypatch: pytest.MonkeyPatch):
+    def asked(design: Any, **settings: Any) -> Study:
+        return dataclasses.replace(study(design, quiet=True, **settings), run=one_after_another)
+
+    monkeypatch.setattr("doedesign.tolerancing.results.study", asked)
+    settings = {"process": fakes.process(), "evaluate": fakes.rows, "limits": ["strehl >= 0.9"], "draws": 4}
+    few = tolerance(fakes.design(), sensitivity="none", **settings)
+    assert (few.effects, few.variance_shares, few.corners, few.budget) == (None, None, None, None)
+    more = tolerance(fakes.design(), sensitivity="sobol", sobol=4, corners=True, budget="overlay", **settings)
+    assert (few.effects, more.effects) == (None, None)
+    assert more.variance_shares
+    assert more.corners is not None
+    assert all(key.startswith("corner") for key in more.corners.keys)
+    assert more.budget is not None
+    assert more.budget.what == "overlay"
+    assert {key.partition("/")[0] for key in few.keys} == {"nominal", "expected", "normal"}
+    assert set(few.keys) < set(more.keys)
+    assert tolerance(fakes.design(), **settings).effects
 
 
 def yields(*shares: float, plates: int = 100) -> list[Any]:

@@ -45,6 +45,19 @@ def test_write_atomic_replaces_the_file_and_leaves_nothing_else(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["file.bin"]
 
 
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+def test_files_and_folders_have_the_permissions_of_others(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        write_atomic(tmp_path / "file.bin", b"new")
+        with atomic_folder(tmp_path / "folder"):
+            pass
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file.bin").stat().st_mode & 0o777 == 0o666 & ~mask
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o777 & ~mask
+
+
 def test_write_atomic_keeps_the_old_content_when_the_new_cannot_be_written(tmp_path, monkeypatch):
     path = tmp_path / "file.bin"
     write_atomic(path, b"old")
