@@ -5,6 +5,7 @@ import sys
 
 TABLES = (
     "bench.psf",
+    "bench.edges",
     "bench.step",
     "bench.masks",
     "bench.rules",
