@@ -135,6 +135,17 @@ def test_a_patch_of_another_place_is_told(patched):
         assert any(words in problem for problem in model_problems(patched, other, model))
 
 
+def test_a_disk_too_full_to_compare_is_no_fault_of_the_file(written_order, tmp_path, monkeypatch):
+    """The file is drawn again elsewhere to compare it: what goes wrong there is told as it is."""
+    manifest = read_manifest(written_order)
+    model = draw(order_from(manifest.request, np.load(written_order / manifest.level_map_file), "here")).model
+    plate = next(entry for name, entry in entries(written_order).items() if name == "PLATE.step")
+    assert model_problems(written_order, plate, model) == []
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="nowhere"):
+        model_problems(written_order, plate, model)
+
+
 def test_a_mesh_alone_may_be_larger_and_a_step_patch_is_refused_before_anything_is_drawn(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     level_map = level_map_from(np.indices((60, 60)).sum(axis=0) % 2, LEVELS, UM, 60 * UM, "p")
