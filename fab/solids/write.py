@@ -49,8 +49,8 @@ def model_problems(folder: Path, entry: ModelEntry, model: DoeModel) -> list[str
     try:
         return _kind(entry).problems(folder / entry.file, entry, model)
     except (InputError, CheckFailed) as error:
-        # A disk too full to draw the file again says nothing about the file.
-        if isinstance(error, InputError) and not error.where.startswith(str(folder)):
+        # A disk too full to draw the file again, elsewhere, says nothing about the file.
+        if isinstance(error, InputError) and isinstance(error.__cause__, OSError) and str(folder) not in error.where:
             raise
         return [str(error)]
 
