@@ -180,7 +180,10 @@ def claim_run(
             for path in folder.iterdir():
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
             known = False
-        yield Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
+        run = Run(folder, spec, known and _is_done(folder, spec, inputs), inputs, overrides)
+        if run.done:  # perhaps stopped before the last line of `finish_run`
+            run.path(CHECKPOINT).unlink(missing_ok=True)
+        yield run
 
 
 def _belongs(found: "_Manifest", spec: Spec, inputs: Mapping[str, str]) -> bool:

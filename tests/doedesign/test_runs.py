@@ -71,8 +71,10 @@ def test_a_run_is_begun_resumed_and_finished(spec: Spec, tmp_path: Path):
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["results_sha256"] == {"history.jsonl": sha256_file(folder / "history.jsonl")}
     assert manifest["overrides"] == ["optimize.seed=1"]
+    save_checkpoint(run, [np.zeros(3)], 2, [])  # as if stopped before the last line
     with claim_run(folder, spec, {"image": "ab"}, ["optimize.seed=1"]) as run:
         assert run.done
+    assert not (folder / CHECKPOINT).exists()
     assert open_run(folder) == run
 
 
