@@ -197,9 +197,9 @@ def _is_done(folder: Path, spec: Spec, inputs: Mapping[str, str]) -> bool:
     if found.state != "done" and {path.name for path in folder.iterdir()} <= {MANIFEST_NAME, "spec.toml"}:
         return False  # begun and nothing more: there is nothing to lose, whatever the spec was
     if not _belongs(found, spec, inputs):
-        known = folder / "spec.toml"
-        keys = _changed_keys(known, spec)
-        got = "the run of another spec or other input files" + (f": {known} has another {keys}" if keys else "")
+        own = folder / "spec.toml"
+        keys = _changed_keys(own, spec)
+        got = "the run of another spec or other input files" + (f": {own} has another {keys}" if keys else "")
         cure = "Choose another output folder, or give `overwrite` to remove that run and all that was made of it."
         raise InputError(str(folder), "the folder must belong to this spec", got, cure)
     return found.state == "done" and open_run(folder).done

@@ -4,7 +4,7 @@ Light that passes near a wall is not that of a thin element (`sim.rigorous.edge_
 borders of cells, where the transform has no sample: they are spread over the cells to either side, by weights whose far
 field is that of a line up to the highest wave number on the sensor, the obliquity of a near source included. So a PSF
 with edges takes the same transform as one without; where the light of a near source or that to the window's edge is too
-oblique for the cells, every cell is first split into two by two.
+oblique for the cells, every cell is first split into smaller ones.
 
 The wall between two cells side by side along x is crossed by light polarised along x (TM), and lies along light
 polarised along y (TE). The mean image of unpolarised light is that of mean widths: the square of half the difference
@@ -31,7 +31,7 @@ from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.material import refractive_index
-from sim.optic import CellOptic
+from sim.optic import ON_AXIS, CellOptic, CellSource
 from sim.propagation.pupil import cis
 from sim.rigorous.edge_widths import edge_widths
 from sim.source import SourceMap
@@ -54,6 +54,7 @@ class EdgeOptic(CellOptic):
         coverage: `[y, x]` open share of every cell.
         transmission: `[wavelength, y, x]` values of the cells whose far field is that of cells and walls.
         wavelengths_m: different vacuum wavelengths.
+        depths_m: nearest and farthest depth of sources for which that holds, metres.
         source_kind: how sources are described.
     """
 
@@ -61,6 +62,7 @@ class EdgeOptic(CellOptic):
     coverage: Float[Array, "y x"]
     transmission: Complex[Array, "w y x"]
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
+    depths_m: tuple[float, float] = eqx.field(static=True)
     source_kind: type[SourceMap] = eqx.field(static=True, default=SourceMap)
 
     @property
@@ -72,6 +74,19 @@ class EdgeOptic(CellOptic):
         """Transmission at one wavelength."""
         return None, self.transmission[self.wavelengths_m.index(line.wavelength_m)]
 
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
+        """The path to every cell; a ValueError for a depth that the light of the walls was not prepared for."""
+        nearest, farthest = self.depths_m
+        if not nearest <= depth_m <= farthest:
+            raise ValueError(
+                f"`depth_m` must lie within {nearest} to {farthest} m, the depths of `with_edges`: {depth_m}"
+            )
+        return super().source(line, depth_m, field_rad)
+
+    def with_camera(self, camera: Camera) -> "EdgeOptic":
+        """A ValueError, for the light of walls is prepared for one lens and window."""
+        raise ValueError("`camera` must be given to `with_edges`, which prepares the light of walls for it")
+
 
 def with_edges(
     height_m: Any, camera: Camera, polarisation: str = "unpolarised", *, depths_m: Sequence[float] = (np.inf,)
@@ -79,7 +94,8 @@ def with_edges(
     """A DOE of upright walls, with their light.
 
     Args:
-        height_m: `[y, x]` height of every cell of `camera.grid`, metres; numpy, or jax, perhaps traced.
+        height_m: `[y, x]` height of every cell of `camera.grid`, metres; numpy, or jax. Traced heights must not differ
+            by more than two waves from one cell to the next.
         camera: DOE grid, aperture, substrate, lens and sensor.
         polarisation: "unpolarised", or the axis along which the light's electric field lies.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between.
@@ -116,7 +132,7 @@ def with_edges(
         rate = camera.waves_per_metre(wavelength)
         found.append(_transmission(height, rate, *table, *weights, camera.grid.pitch_m))
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    return EdgeOptic(camera, coverage, jnp.stack(found), wavelengths)
+    return EdgeOptic(camera, coverage, jnp.stack(found), wavelengths, (min(depths_m), max(depths_m)))
 
 
 class ObliqueWaves(NamedTuple):

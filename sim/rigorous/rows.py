@@ -7,7 +7,7 @@ inverse of the transform of 1 / permittivity where a product of two jumps is con
 1870 (1996); P. Lalanne and G. M. Morris, ibid. 779), without which it hardly converges.
 
 Glass without loss makes every matrix Hermitian, so that a slab costs one eigenproblem of a Hermitian matrix.
-Fields are exp(i k z - i omega t), z along the light; double precision throughout, NumPy alone.
+Fields are exp(i k z - i omega t), z along the light; double precision throughout.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class Orders(NamedTuple):
 
 
 def row_slabs(height_m: Float[np.ndarray, " cell"], cell_m: float, index: float) -> list[Slab]:
-    """Layers of a row of cells of glass in air, the highest first.
+    """Slabs of a row of cells of glass in air, the highest first.
 
     Args:
         height_m: height of every cell; the row repeats.

@@ -176,3 +176,9 @@ def test_what_cannot_be_is_refused():
         with_edges(levels(32), lens, "round")
     with pytest.raises(ValueError, match=r"`height_m` must have the grid's shape \(32, 32\)"):
         with_edges(levels(16), lens)
+    optic = with_edges(levels(32), lens, depths_m=(0.1, 1.0))
+    for depth in (0.05, np.inf):
+        with pytest.raises(ValueError, match=r"`depth_m` must lie within 0\.1 to 1\.0 m"):
+            psf(optic, depths=depth)
+    with pytest.raises(ValueError, match="`camera` must be given to `with_edges`"):
+        psf(optic, camera(32, 48, 1e-3), depths=0.5)
