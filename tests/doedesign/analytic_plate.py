@@ -1,0 +1,117 @@
+"""A plate whose images are known in closed form, in the place of the one that light goes through.
+
+An image is base + s(first error) A + second error B + motion · C with patterns of random numbers, so every derivative,
+every least-squares fit and every covariance can be written down. `s` is the identity, or climbs with waves on it, so
+that a search that only climbs stays behind the first of them.
+"""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, VariedDoe
+from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.target import MeasuredImage, Target
+from doedesign.calibration.unknowns import Unknowns
+from fab.levels import Levels
+from fab.process import Process
+from sim.measured import MeasuredPsf
+
+SIDE = 18
+NOISE = 0.01
+SIGMA = np.array([2.0, 0.5])
+NUMERICS = 1e-9  # what the transform says of itself; the plate's own 0.4 % comes on top
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyticModel(ForwardModel):
+    """`patterns[image, pattern, y, x]` are base, A, B and three of the motion; `asked` collects all plates' values."""
+
+    patterns: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    waves: float = 0.0
+    asked: list[Values] = field(default_factory=list)
+
+    def first(self, value: float) -> tuple[float, float]:
+        """s and its derivative."""
+        return value + self.waves * np.sin(2 * value), 1 + 2 * self.waves * np.cos(2 * value)
+
+    def plate(self, values: Values) -> "AnalyticImages":
+        """The plate with some errors."""
+        self.asked.append(np.array(values))
+        nothing: Any = None
+        return AnalyticImages(self, nothing, nothing, np.array(values))
+
+    def plate_and_vjp(self, values: Values) -> tuple["AnalyticImages", Any]:
+        """The plate, and its derivative backwards: the gradient with respect to s and the second error comes in."""
+        slopes = np.array([self.first(values[0])[1], 1.0])
+        return self.plate(values), lambda gradient: slopes * np.array(gradient)
+
+    def optic(self, index: int, grid: Any) -> Any:
+        """What `search` asks for: the error of the transform."""
+        return SimpleNamespace(plan=SimpleNamespace(expected_error=NUMERICS))
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyticImages(DoeImages):
+    """A plate with errors `values`."""
+
+    model: AnalyticModel
+    values: Values = field(default_factory=lambda: np.empty(0))
+
+    def image(self, index: int, motion: Values) -> NDArray[np.float64]:
+        """One image."""
+        factors = [1.0, self.model.first(self.values[0])[0], self.values[1], *motion]
+        return np.tensordot(factors, self.model.patterns[index], 1)
+
+    def image_and_vjp(self, index: int, motion: Values) -> tuple[NDArray[np.float64], Any]:
+        """One image and its derivative backwards."""
+
+        def back(gradient: NDArray[np.float64]) -> tuple[VariedDoe, Values]:
+            each = np.tensordot(self.model.patterns[index], gradient, 2)
+            to_doe: Any = VariedDoe(each[1], each[2])
+            return to_doe, each[3:]
+
+        return self.image(index, motion), back
+
+    def zeroth_order(self) -> float:
+        """A curve, so that its difference over a step differs from its value."""
+        return float(0.1 + 0.02 * self.values[0] + 0.05 * self.values[1])
+
+
+def analytic_objective(
+    truth: Values,
+    *,
+    images: int = 2,
+    waves: float = 0.0,
+    noise: float = NOISE,
+    defocus_sigma: float = 0.0,
+    gain_sigma: float | None = 0.03,
+    seed: int = 3,
+    **limits: Any,
+) -> FitObjective:
+    """Images of a plate with errors `truth`, with noise, and the model that made them; only the first may be blurred.
+
+    `limits` replace attributes of the unknowns.
+    """
+    rng = np.random.default_rng(seed)
+    patterns = rng.normal(size=(images, 6, SIDE, SIDE)) * np.array([0.0, 0.1, 0.1, 0.05, 0.05, 0.05])[:, None, None]
+    patterns[:, 0] = rng.uniform(0.5, 1.5, (images, SIDE, SIDE))
+    ranges = {"mean": np.zeros(2), "root": np.diag(SIGMA), "low": -5 * SIGMA, "high": 5 * SIGMA, "start": np.zeros(2)}
+    unseen: Any = None  # the drawing and the camera
+    names = ("common_depth_scale", "common_cd_bias_m")
+    unknowns = Unknowns(Process(Levels(4, 0.3e-6), name="analytic"), names, **{**ranges, **limits})
+    model = AnalyticModel(unseen, unseen, unknowns, (0.1,) * images, patterns=patterns, waves=waves)
+    targets = []
+    for i in range(images):
+        light = model.plate(truth).image(i, np.zeros(3)) + noise * rng.normal(size=(SIDE, SIDE))
+        floor = np.full((SIDE, SIDE), max(noise, 1e-6) ** 2)
+        psf = MeasuredPsf(light, floor, np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE), bool))
+        brightness = None if gain_sigma is None else (1.0, gain_sigma)
+        image = MeasuredImage(f"image{i}", 0.1, psf, (0.0, 0.0), brightness, defocus_sigma if i == 0 else 0.0)
+        targets.append(Target(image, psf, 1.0, (0.0, 0.0)))
+    return FitObjective(model, tuple(targets))

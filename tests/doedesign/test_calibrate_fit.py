@@ -1,0 +1,177 @@
+"""The search and its uncertainty on a plate whose images are known in closed form."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from doedesign.calibration.fit import search
+from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.target import match
+from doedesign.calibration.uncertainty import cost_rises, left_out, posterior_of
+from tests.doedesign.analytic_plate import NOISE, SIDE, SIGMA, AnalyticModel, analytic_objective
+
+TRUTH = np.array([1.3, -0.4])
+
+
+def weights_of(objective: FitObjective) -> tuple[np.ndarray, ...]:
+    return tuple(np.full((SIDE, SIDE), NOISE**-2) for _ in objective.targets)
+
+
+def asked(objective: FitObjective) -> list[np.ndarray]:
+    """Values of every plate that was asked for."""
+    assert isinstance(objective.model, AnalyticModel)
+    return objective.model.asked
+
+
+def patterns_of(objective: FitObjective) -> np.ndarray:
+    """Patterns of all images."""
+    assert isinstance(objective.model, AnalyticModel)
+    return objective.model.patterns
+
+
+def test_motions_are_two_of_every_image_and_a_third_where_the_depth_is_uncertain():
+    objective = analytic_objective(TRUTH, defocus_sigma=0.2)
+    assert objective.motions == ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1))
+    scores = np.arange(1.0, 8.0)
+    # Two pixels per standard deviation, and the curvature's own.
+    np.testing.assert_allclose(objective.motion(scores, 0), [2 * 3, 2 * 4, 0.2 * 5])
+    np.testing.assert_allclose(objective.motion(scores, 1), [2 * 6, 2 * 7, 0])
+
+
+@pytest.mark.parametrize("gain_sigma", [None, 0.03])
+def test_the_exact_gradient_is_the_slope_of_the_cost(gain_sigma: float | None):
+    objective = analytic_objective(TRUTH, waves=0.3, defocus_sigma=0.2, gain_sigma=gain_sigma)
+    scores = np.random.default_rng(1).normal(size=7) * 0.1
+    at, gradient = objective.evaluate_with_gradient(weights_of(objective), scores)
+    assert at.cost == pytest.approx(objective.evaluate(weights_of(objective), scores).cost, rel=1e-12)
+    for k in range(7):
+        ends = [objective.evaluate(weights_of(objective), scores + s * np.eye(7)[k]).cost for s in (1e-4, -1e-4)]
+        # The cost is of 1e4, its difference of 1, in double precision; curvature of the wave: 1e-4 squared.
+        assert gradient[k] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-5, abs=1e-5 * abs(gradient).max())
+
+
+def test_differences_are_the_patterns_themselves():
+    """The images are linear in errors and motions, so any step gives the derivative; and so it is for the 0th order."""
+    objective = analytic_objective(TRUTH, defocus_sigma=0.2)
+    patterns = patterns_of(objective)
+    at, told = objective.evaluate(weights_of(objective), np.zeros(7)), []
+    jacobian = at.difference_jacobian(np.full(7, 0.05), told.append)
+    first = [SIGMA[0] * patterns[0, 1], SIGMA[1] * patterns[0, 2], 2 * patterns[0, 3], 2 * patterns[0, 4]]
+    zeros = np.zeros((2, SIDE, SIDE))
+    np.testing.assert_allclose(jacobian.images[0], [*first, 0.2 * patterns[0, 5], *zeros], atol=1e-12)
+    second = [SIGMA[0] * patterns[1, 1], SIGMA[1] * patterns[1, 2], *np.zeros((3, SIDE, SIDE))]
+    np.testing.assert_allclose(jacobian.images[1], [*second, 2 * patterns[1, 3], 2 * patterns[1, 4]], atol=1e-12)
+    np.testing.assert_allclose(jacobian.zeroth_order, [0.02 * SIGMA[0], 0.05 * SIGMA[1], 0, 0, 0, 0, 0], atol=1e-12)
+    assert told == ["derivatives"] * 2  # one for every error
+
+
+def test_at_the_end_of_a_range_the_derivative_is_that_to_one_side():
+    objective = analytic_objective(TRUTH, high=np.array([0.0, 2.0]), waves=0.3)
+    at = objective.evaluate(weights_of(objective), np.zeros(6))
+    asked(objective).clear()
+    column = at.difference_jacobian(np.full(6, 0.05)).images[0][0]
+    assert max(values[0] for values in asked(objective)) == 0.0
+    pattern = patterns_of(objective)[0, 1]
+    slope = (0.1 + 0.3 * np.sin(0.2)) / 0.05  # s over a step of 0.05 standard deviations of 2
+    np.testing.assert_allclose(column, slope * pattern, rtol=1e-9)
+
+
+@pytest.mark.parametrize("polish", [0, 5])
+def test_errors_are_found_as_weighted_least_squares_has_them(polish: int):
+    """The images are linear in the errors, so the answer is one linear system; gain and background are solved for."""
+    objective = analytic_objective(TRUTH, gain_sigma=None, noise=NOISE)
+    found = search(objective, polish=polish)
+    posterior = posterior_of(found)
+    assert abs(posterior.values - TRUTH) == pytest.approx(0, abs=4 * posterior.sigma.max())
+    # At a minimum the exact gradient is nothing beside what a standard deviation changes.
+    _, gradient = objective.evaluate_with_gradient(found.at.weights, found.at.scores)
+    assert abs(gradient * found.sigma).max() < 0.25  # a tenth of a standard deviation may be left, of slope 2
+    assert posterior.chi2_per_pixel == pytest.approx(1.0, abs=0.15)  # of 648 pixels: 0.055 is one standard deviation
+
+
+def test_weights_come_from_the_model_once_it_explains_the_images():
+    """Then they know of the model's own error, 0.4 % of the light about a pixel, and no more of the image's noise."""
+    objective = analytic_objective(TRUTH)
+    weights = search(objective).at.weights
+    found = search(objective).at.matches[0]
+    expected = 1 / (NOISE**2 + 4e-3**2 * gaussian_filter((found.gain * found.model) ** 2, 1.0))
+    # A last step of a tenth of a standard deviation comes after the weights.
+    np.testing.assert_allclose(weights[0], expected, rtol=2e-3)
+
+
+def test_a_search_through_the_range_gets_behind_waves():
+    """s climbs to 1.91, falls to 1.23 and climbs again: steps from zero end at the first top, the truth lies behind."""
+    truth = np.array([3.0, 0.2])
+    near = search(analytic_objective(truth, waves=1.0))
+    assert posterior_of(near).values[0] < 1.2
+    objective, words = analytic_objective(truth, waves=1.0), []
+    found = search(objective, evaluations=60, seed=4, on_model=words.append)
+    assert posterior_of(found).values == pytest.approx(truth, abs=0.05)
+    assert sum(word.startswith("global") for word in words) in (60, 61)  # NLopt may compute one more than its limit
+    assert found.at.cost < near.at.cost
+
+
+def test_the_search_through_the_range_stays_within_two_standard_deviations():
+    objective = analytic_objective(np.array([3.0, 0.2]), waves=1.0)
+    seen: list[np.ndarray] = []
+    search(objective, evaluations=60, on_model=lambda w: seen.append(asked(objective)[-1]) if "global" in w else None)
+    farthest = abs(np.array(seen) / SIGMA).max(axis=0)
+    assert (farthest <= 2 + 1e-9).all()
+    assert (farthest > 1.7).all()  # 60 points of a square: with odds of one in 1e4 none comes so near its edge
+
+
+def test_what_is_explained_needs_no_search_through_the_range():
+    words: list[str] = []
+    search(analytic_objective(TRUTH), evaluations=60, on_model=words.append)
+    assert not [word for word in words if word.startswith("global")]
+
+
+def test_the_posterior_of_a_linear_model_is_the_inverse_of_its_normal_matrix():
+    """Errors, motions, gain and background of one image as columns of one least-squares problem with a prior."""
+    objective = analytic_objective(TRUTH, images=1, gain_sigma=None)
+    found = search(objective)
+    at, posterior = found.at.matches[0], posterior_of(found)
+    patterns = patterns_of(objective)[0]
+    scaled = at.gain * np.array([SIGMA[0], SIGMA[1], 2.0, 2.0])[:, None, None] * patterns[1:5]
+    columns = np.array([*scaled, at.model, np.ones((SIDE, SIDE))]).reshape(6, -1)
+    prior = np.diag([1.0, 1.0, 1.0, 1.0, 0.0, 0.0])
+    images = (columns * at.weights.ravel()) @ columns.T / posterior.inflation**2
+    expected = np.sqrt(np.diag(np.linalg.inv(images + prior)))[:2] * SIGMA
+    # The scatter over 36 blocks may widen a standard deviation, by what 36 numbers know of their own variance.
+    assert (posterior.sigma >= expected * (1 - 1e-6)).all()
+    assert (posterior.sigma < 1.5 * expected).all()
+    np.testing.assert_allclose(posterior.ratio, posterior.sigma / SIGMA)
+    np.testing.assert_allclose(np.diag(posterior.correlation), 1.0)
+    gradient = np.array([1.0, 2.0, 0.0, 0.0])
+    assert posterior.spread(gradient) == pytest.approx(np.sqrt(gradient @ posterior.covariance @ gradient))
+
+
+def test_an_image_left_out_is_predicted_from_the_others():
+    """One linear step is exact here: the same as a fit of the other image alone."""
+    objective = analytic_objective(TRUTH, gain_sigma=None)
+    found = search(objective)
+    for i, chi2 in enumerate(left_out(found)):
+        other = FitObjective(objective.model, (objective.targets[1 - i],))
+        patterns, root = patterns_of(objective)[1 - i], np.sqrt(found.at.weights[1 - i]).ravel()
+        columns = [SIGMA[0] * patterns[1], SIGMA[1] * patterns[2], 2 * patterns[3], 2 * patterns[4]]
+        # Gain times (base + columns · scores) + background: linear in gain and gain · scores; without a prior, whose
+        # pull is a ten-thousandth of the images'.
+        design = np.array([patterns[0], np.ones((SIDE, SIDE)), *columns]).reshape(6, -1).T * root[:, None]
+        fitted = np.linalg.lstsq(design, other.targets[0].psf.rate.ravel() * root, rcond=None)[0]
+        scores = found.at.scores.copy()
+        scores[:2] = fitted[2:4] / fitted[0]
+        image = objective.model.plate(objective.values(scores)).image(i, objective.motion(scores, i))
+        expected = match(objective.targets[i], found.at.weights[i], image).chi2_per_pixel
+        assert chi2 == pytest.approx(expected, rel=2e-3)  # the gain of the images left in moved with them
+
+
+def test_the_cost_of_a_linear_model_rises_by_one():
+    found = search(analytic_objective(TRUTH, gain_sigma=None))
+    rises = cost_rises(found, posterior_of(found))
+    # Two directions, both ways; gain times error makes the model a little curved.
+    assert rises == pytest.approx([1.0] * 4, abs=0.05)
+
+
+def test_directions_beyond_the_range_are_left_out():
+    found = search(analytic_objective(np.array([1.3, 0.0]), gain_sigma=None, high=np.array([1.3, 2.5])))
+    assert len(cost_rises(found, posterior_of(found))) in (1, 2, 3)
