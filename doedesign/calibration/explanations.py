@@ -253,6 +253,14 @@ class _ScoredModel:
         points = sorted((score, row["ring_to_disc"], row["throughput"]) for score, row in known)
         return Curve(*zip(*points, strict=True))
 
+    def whole_curve(self, name: str) -> Curve:
+        """The curve of an error to the end of the reach, either way, or as far as the model describes it."""
+        for sign in (1.0, -1.0):
+            for score in np.arange(1, self.reach + 1e-9):
+                if self.row({name: sign * float(score)}) is None:
+                    break
+        return self.curve(name)
+
 
 def explain_ratio(
     design: Design | Run | str | Path,
@@ -291,7 +299,7 @@ def explain_ratio(
         raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
     names = chosen_names(prior.masks, errors or _DEFAULT)
     writing = results_folder(out, design.name, design.folder)
-    # About ten models for every error and six for a pair.
+    # About ten models for every error and six for a pair; those of a pair are followed to the end.
     with writing as fresh, models_meter("explanations", 200) as on_model:
         camera = replace(design.camera, colours=(Colour("probe", (targets.wavelength_m,), (1.0,)),))
         probed = replace(design, camera=camera, near_m=(targets.depth_m,), far_m=())
@@ -311,8 +319,7 @@ def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:
         met = [model.explanation(scores) for scores in crossings if scores is not None]
         singles += met
         none += [] if met else [(name,)]
-    curves = {name: model.curve(name) for name in model.sigma}
-    both, apart = _pairs(model, curves, singles) if pairs else ([], [])
+    both, apart = _pairs(model, singles) if pairs else ([], [])
     stated = {name for name, spread in model.process.spreads.items() if spread.sigma}
     return ExplanationSet(
         model.targets,
@@ -320,16 +327,15 @@ def _explained(model: _ScoredModel, pairs: bool) -> ExplanationSet:
         sorted(singles, key=lambda e: e.distance),
         sorted(both, key=lambda e: e.distance),
         none + apart,
-        curves,
+        {name: model.curve(name) for name in model.sigma},
         {name: sigma for name, sigma in model.sigma.items() if name not in stated},
         model.reach,
     )
 
 
-def _pairs(
-    model: _ScoredModel, curves: Mapping[str, Curve], singles: Sequence[Explanation]
-) -> tuple[list[Explanation], list[tuple[str, ...]]]:
+def _pairs(model: _ScoredModel, singles: Sequence[Explanation]) -> tuple[list[Explanation], list[tuple[str, ...]]]:
     """Most plausible pairs of errors of different kinds, and the pairs that do not reach the ratio."""
+    curves = {name: model.curve(name) for name in model.sigma}
 
     def promise(name: str) -> tuple[float, float]:
         """Sort key: what explains most easily alone, then what changes the ratio most."""
@@ -340,6 +346,8 @@ def _pairs(
     for name in curves:
         kind = name.partition("[")[0]
         best[kind] = min(best.get(kind, name), name, key=promise)
+    # One error may go beyond where it meets the ratio alone if the other pulls back.
+    curves = {name: model.whole_curve(name) for name in best.values()}
     met, apart = [], []
     for one, other in combinations(best.values(), 2):
         mixtures = list(_mixtures(model, curves[one], curves[other]))

@@ -16,13 +16,18 @@ from doedesign.calibration.forward_model import DoeImages, ForwardModel, VariedD
 from doedesign.calibration.objective import FitObjective
 from doedesign.calibration.target import MeasuredImage, Target
 from doedesign.calibration.unknowns import Unknowns
+from fab.grid import Grid
 from fab.levels import Levels
 from fab.process import Process
+from sim.camera import Camera, Colour
 from sim.measured import MeasuredPsf
 
 SIDE = 18
 NOISE = 0.01
 SIGMA = np.array([2.0, 0.5])
+NEAR_M = 13.5e-3  # blurs to 7.4 um, four pixels
+_PROBE = Colour("probe", (520e-9,), (1.0,))
+CAMERA = Camera(Grid((110, 110), 1.85e-6), 200e-6, "fused_silica", (_PROBE,), 1e-3, 1.85e-6, SIDE)
 NUMERICS = 1e-9  # what the transform says of itself; the plate's own 0.4 % comes on top
 
 Values = NDArray[np.float64]
@@ -91,27 +96,28 @@ def analytic_objective(
     noise: float = NOISE,
     defocus_sigma: float = 0.0,
     gain_sigma: float | None = 0.03,
-    seed: int = 3,
+    noise_seed: int = 3,
+    depths_m: tuple[float, ...] = (NEAR_M, np.inf),
     **limits: Any,
 ) -> FitObjective:
     """Images of a plate with errors `truth`, with noise, and the model that made them; only the first may be blurred.
 
     `limits` replace attributes of the unknowns.
     """
-    rng = np.random.default_rng(seed)
+    rng, noise_rng = np.random.default_rng(3), np.random.default_rng((noise_seed, 1))
     patterns = rng.normal(size=(images, 6, SIDE, SIDE)) * np.array([0.0, 0.1, 0.1, 0.05, 0.05, 0.05])[:, None, None]
     patterns[:, 0] = rng.uniform(0.5, 1.5, (images, SIDE, SIDE))
     ranges = {"mean": np.zeros(2), "root": np.diag(SIGMA), "low": -5 * SIGMA, "high": 5 * SIGMA, "start": np.zeros(2)}
-    unseen: Any = None  # the drawing and the camera
+    unseen: Any = None  # the drawing
     names = ("common_depth_scale", "common_cd_bias_m")
     unknowns = Unknowns(Process(Levels(4, 0.3e-6), name="analytic"), names, **{**ranges, **limits})
-    model = AnalyticModel(unseen, unseen, unknowns, (0.1,) * images, patterns=patterns, waves=waves)
+    model = AnalyticModel(unseen, CAMERA, unknowns, depths_m[:images], patterns=patterns, waves=waves)
     targets = []
     for i in range(images):
-        light = model.plate(truth).image(i, np.zeros(3)) + noise * rng.normal(size=(SIDE, SIDE))
+        light = model.plate(truth).image(i, np.zeros(3)) + noise * noise_rng.normal(size=(SIDE, SIDE))
         floor = np.full((SIDE, SIDE), max(noise, 1e-6) ** 2)
         psf = MeasuredPsf(light, floor, np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE), bool))
         brightness = None if gain_sigma is None else (1.0, gain_sigma)
-        image = MeasuredImage(f"image{i}", 0.1, psf, (0.0, 0.0), brightness, defocus_sigma if i == 0 else 0.0)
+        image = MeasuredImage(f"image{i}", depths_m[i], psf, (0.0, 0.0), brightness, defocus_sigma if i == 0 else 0.0)
         targets.append(Target(image, psf, 1.0, (0.0, 0.0)))
     return FitObjective(model, tuple(targets))

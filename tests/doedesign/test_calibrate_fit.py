@@ -5,12 +5,15 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from doedesign.calibration.fit import search
-from doedesign.calibration.objective import FitObjective
+from doedesign.calibration.objective import FitObjective, Linearization
 from doedesign.calibration.target import match
-from doedesign.calibration.uncertainty import cost_rises, left_out, posterior_of
-from tests.doedesign.analytic_plate import NOISE, SIDE, SIGMA, AnalyticModel, analytic_objective
+from doedesign.calibration.uncertainty import Reading, cost_rises, left_out, posterior_of, readings
+from tests.doedesign.analytic_plate import NEAR_M, NOISE, SIDE, SIGMA, AnalyticModel, analytic_objective
 
 TRUTH = np.array([1.3, -0.4])
+# Radii of the blur and of the first dark ring of the lens, in pixels.
+NEAR_PX = 200e-6 * 1e-3 / (2 * NEAR_M) / 1.85e-6
+FAR_PX = 1.2197 * 520e-9 * 1e-3 / 200e-6 / 1.85e-6
 
 
 def weights_of(objective: FitObjective) -> tuple[np.ndarray, ...]:
@@ -175,3 +178,94 @@ def test_the_cost_of_a_linear_model_rises_by_one():
 def test_directions_beyond_the_range_are_left_out():
     found = search(analytic_objective(np.array([1.3, 0.0]), gain_sigma=None, high=np.array([1.3, 2.5])))
     assert len(cost_rises(found, posterior_of(found))) in (1, 2, 3)
+
+
+def read(found: Linearization) -> dict[tuple[str, str], Reading]:
+    return {(one.image, one.quantity): one for one in readings(found, posterior_of(found))}
+
+
+def disc(radius_px: float, centre_px: tuple[float, float]) -> np.ndarray:
+    """Share of every pixel inside a disc, by 40 x 40 samples."""
+    y, x = (np.arange(40 * SIDE) + 0.5) / 40 - SIDE / 2 - np.array(centre_px)[:, None]
+    inside = np.hypot(y[:, None], x) <= radius_px
+    return inside.reshape(SIDE, 40, SIDE, 40).mean(axis=(1, 3))
+
+
+def test_readings_are_those_of_a_lab():
+    """Ring over disc of the near image, share in the spot of the far one, about the chief ray that the fit finds."""
+    objective = analytic_objective(TRUTH)
+    found = search(objective)
+    numbers, scores = read(found), found.at.scores
+    for i, (quantity, radius_px) in enumerate((("ring_to_disc", NEAR_PX), ("far_spot", FAR_PX))):
+        y, x, _ = objective.motion(scores, i)
+        inner, fitted = disc(radius_px + 1, (y, x)), found.at.matches[i]
+        light = (objective.targets[i].psf.rate - fitted.background) / fitted.gain
+        reading = numbers[f"image{i}", quantity]
+        assert reading.measured is not None
+        for seen, (value, _) in ((light, reading.measured), (fitted.model, reading.predicted)):
+            inside = (inner * seen).sum()
+            expected = seen.sum() / inside - 1 if quantity == "ring_to_disc" else inside / seen.sum()
+            assert value == pytest.approx(expected, rel=2e-3)  # of 1600 samples in a pixel on the rim
+        assert numbers[f"image{i}", "throughput"].predicted[0] == pytest.approx(fitted.model.sum(), rel=1e-12)
+        measured = numbers[f"image{i}", "throughput"].measured
+        assert measured is not None
+        assert measured == pytest.approx((light.sum() * fitted.gain, 0.03 * light.sum()), rel=1e-12)
+    zeroth = numbers["plate", "zeroth_order"]
+    assert zeroth.measured is None
+    values = posterior_of(found).values
+    assert zeroth.predicted[0] == pytest.approx(0.1 + 0.02 * values[0] + 0.05 * values[1], rel=1e-9)
+
+
+def test_unusable_pixels_are_read_off_the_model():
+    objective = analytic_objective(TRUTH)
+    target = objective.targets[0]
+    rate, valid = target.psf.rate.copy(), target.psf.valid.copy()
+    rate[8, 9], valid[8, 9] = 1e6, False
+    holed = target._replace(psf=target.psf._replace(rate=rate, valid=valid))
+    found = search(FitObjective(objective.model, (holed, objective.targets[1])))
+    plain = read(search(objective))["image0", "ring_to_disc"]
+    assert plain.measured is not None
+    assert read(found)["image0", "ring_to_disc"].measured == pytest.approx(plain.measured, rel=0.02)
+
+
+@pytest.mark.parametrize("image", [0, 1])
+def test_the_uncertainty_of_a_reading_is_the_scatter_of_many(image: int):
+    """Of 60 measurements of one plate, read about the same point: their scatter is known to a tenth."""
+    quantity, values, stated = ("ring_to_disc", "far_spot")[image], [], []
+    for seed in range(60):
+        objective = analytic_objective(TRUTH, gain_sigma=None, noise_seed=seed, noise=0.05)
+        at = objective.evaluate(weights_of(objective), np.array([*(TRUTH / SIGMA), 0, 0, 0, 0]))
+        at = at.reweighted(tuple(w / 25 for w in weights_of(objective)))
+        found = at.linearised(at.difference_jacobian(np.full(6, 0.01)))
+        measured = read(found)[f"image{image}", quantity].measured
+        assert measured is not None
+        values.append(measured[0])
+        stated.append(measured[1])
+    assert np.mean(stated) == pytest.approx(np.std(values, ddof=1), rel=0.3)  # three standard deviations of 60
+
+
+def test_the_uncertainty_of_a_prediction_is_that_of_errors_and_motions():
+    found = search(analytic_objective(TRUTH))
+    at, posterior, zeroth = found.at, posterior_of(found), read(found)["plate", "zeroth_order"]
+    gradient = np.array([0.02 * SIGMA[0], 0.05 * SIGMA[1], 0, 0, 0, 0])
+    assert zeroth.predicted[1] == pytest.approx(np.sqrt(gradient @ posterior.covariance @ gradient), rel=1e-6)
+
+    def predicted(scores: np.ndarray) -> tuple[float, float, float]:
+        """Ring over disc, share in the spot and throughput about fixed places."""
+        doe = at.objective.model.plate(at.objective.values(scores))
+        out = []
+        for i, radius_px in enumerate((NEAR_PX + 1, FAR_PX + 1)):
+            y, x, _ = at.objective.motion(at.scores, i)
+            image = doe.image(i, at.objective.motion(scores, i))
+            inside = (disc(radius_px, (y, x)) * image).sum()
+            out.append(image.sum() / inside - 1 if i == 0 else inside / image.sum())
+        return out[0], out[1], float(doe.image(1, at.objective.motion(scores, 1)).sum())
+
+    numbers = read(found)
+    keys = [("image0", "ring_to_disc"), ("image1", "far_spot"), ("image1", "throughput")]
+    slopes = np.array(
+        [np.subtract(predicted(at.scores + 1e-3 * e), predicted(at.scores - 1e-3 * e)) for e in np.eye(6)]
+    )
+    for key, slope in zip(keys, (slopes / 2e-3).T, strict=True):
+        expected = np.sqrt(slope @ posterior.covariance @ slope)
+        assert numbers[key].predicted[1] == pytest.approx(expected, rel=0.01)  # discs of samples
