@@ -162,3 +162,11 @@ def test_a_whole_mask_set_comes_back_with_a_move_per_mask():
 def test_a_bias_that_is_no_number_is_refused():
     with pytest.raises(InputError, match="CD bias"):
         edge_moves((0.0, float("nan")), 1e-9)
+
+
+def test_moves_up_to_the_last_32_bit_coordinate_are_drawn():
+    ends = np.array([-(2**31 - 1 - 50), 2**31 - 1 - 50], dtype=np.int32)
+    edges, plane = PixelEdges(ends, ends, 1e-9, 0.0), np.ones((1, 1), np.uint8)
+    assert grown(plane, edges, 50).rectangles.tolist() == [[-(2**31 - 1)] * 2 + [2**31 - 1] * 2]
+    with pytest.raises(InputError, match="must fit 32-bit coordinates, but got an edge at 2147483648 units"):
+        grown(plane, edges, 51)

@@ -17,7 +17,7 @@ from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds, write_gds
 from fab.grid import Grid
 from fab.layout.doe import mask_layout
-from fab.layout.geometry import Cell, Chrome, Layer, Layout, Shapes
+from fab.layout.geometry import Cell, Chrome, Layer, Layout, Reference, Shapes
 from fab.layout.polygons import rectangles
 from fab.levels import Levels
 from fab.units import NM, UM
@@ -93,6 +93,42 @@ def test_both_libraries_read_the_database_unit(gds, dbu_nm):
     assert layout.dbu == pytest.approx(dbu_nm / 1000, rel=1e-14)
     assert layout.top_cell().dbbox().width() == pytest.approx(4 * dbu_nm, rel=1e-12)
     assert read_gds(gds).dbu_m == pytest.approx(dbu_nm * NM, rel=1e-14)
+
+
+@pytest.mark.parametrize("dbu_m", [62.4e-9, 60e-9, 1e-9, 3.9e-12])
+def test_reals_have_no_leading_zero(gds, dbu_m):
+    """The standard wants a fraction from 1/16 on; 0.0624 um lies just below it, and so do 60 nm and 3.9 pm."""
+    write_gds(gds, one_layer([], dbu_m=dbu_m))
+    units = dict(records(gds))[0x0305]
+    assert min(units[1], units[9]) >= 0x10
+    assert read_gds(gds).dbu_m == pytest.approx(dbu_m, rel=1e-14)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.5, 1 + 1e-8])
+def test_another_user_unit_is_refused(gds, factor):
+    """The database unit in user units and in metres tell two different micrometres."""
+    write_gds(gds, one_layer([], dbu_m=1e-9))
+    content = gds.read_bytes()
+    start = content.index(struct.pack(">HH", 20, 0x0305)) + 4
+    fraction = int.from_bytes(content[start + 1 : start + 8], "big")
+    other = round(fraction * factor).to_bytes(7, "big")
+    gds.write_bytes(content[: start + 1] + other + content[start + 8 :])
+    with pytest.raises(InputError, match="the user unit must be 1 um"):
+        read_gds(gds)
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+@pytest.mark.parametrize(("columns", "rows"), [(1, 1), (1, 3), (3, 1), (2, 2), (3, 2)])
+def test_repeated_cells_lie_where_they_should(tmp_path, suffix, columns, rows):
+    die = Cell("DIE", {Layer(1): Shapes(np.array([[0, 0, 10, 20]], np.int32))})
+    placed = Reference("DIE", 5, -7, columns, rows, 100, 300)
+    layout = Layout(NM, (die, Cell("TOP", {}, (placed,))))
+    {"gds": write_gds, "oas": write_oasis}[suffix](tmp_path / f"a.{suffix}", layout)
+    again = kdb.Layout()
+    again.read(str(tmp_path / f"a.{suffix}"))
+    shapes = kdb.Region(again.top_cell().begin_shapes_rec(again.find_layer(1, 0)))
+    corners = {(p.bbox().left, p.bbox().bottom) for p in shapes.each()}
+    assert corners == {(5 + 100 * i, -7 + 300 * j) for i in range(columns) for j in range(rows)}
 
 
 def plane_region(plane):
