@@ -144,8 +144,13 @@ def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Floa
     """
     parts = doe.camera.grid.shape[0] // nominal.camera.grid.shape[0]
     xp = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np
-    meant = xp.repeat(xp.repeat(xp.conj(xp.asarray(nominal.means)), parts, axis=1), parts, axis=2)
+    meant = in_parts(xp.conj(xp.asarray(nominal.means)), parts)
     return abs(_mean_over_aperture(doe, xp.asarray(doe.means) * meant)) ** 2
+
+
+def in_parts(values: Any, parts: int) -> Any:
+    """Values `[..., y, x]` of cells, numpy's or jax's, as those of `parts` by `parts` equal parts of every cell."""
+    return values if parts == 1 else values.repeat(parts, axis=-2).repeat(parts, axis=-1)
 
 
 class EnergyBudget(NamedTuple):

@@ -3,9 +3,11 @@
 # Abstract fields become fields, or properties, of subclasses.
 # pyright: reportIncompatibleVariableOverride=false
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -19,6 +21,7 @@ from fab.units import metres
 from sim.camera import Camera, SpectralLine
 from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
 from sim.optic import ON_AXIS, CellOptic, HeightOptic, Optic, Propagation
+from sim.propagation.farfield import FarField
 from sim.tracing import in_jit, is_traced, on_host, stacked
 
 if TYPE_CHECKING:
@@ -235,18 +238,56 @@ def psf(
         InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
     """
     chosen, depths_m = optic_of(optic, camera), depths_from(depths)
+    way = propagation, sampling
+    prepared = _prepared(chosen, [(line, depth) for depth in depths_m for line in chosen.lines], way, field_rad)
     rows = []
-    for depth in depths_m:
+    for _ in depths_m:
         images: list[Any] = [0.0] * len(chosen.colours)
         for line in chosen.lines:
-            plan = chosen.plan(line, depth, propagation, sampling)
-            source = chosen.source(line, depth, field_rad)
-            energy = _compiled if is_traced(chosen, source) or in_jit() else _compiled_quickly()
+            plan, source = next(prepared)
+            energy = _compiled
+            if not (is_traced(chosen, source) or in_jit()):
+                energy = _compiled_quickly()
+                if isinstance(plan, FarField) and next(_images(chosen.camera, line.wavelength_m)) < _FEW:
+                    plan = plan.looped
             image = energy(chosen, line, plan, source)
             images[line.colour] = images[line.colour] + line.factor * on_host(image)
             on_psf()
         rows.append(stacked(images))
     return PsfBank(stacked(rows, 1), chosen.colours, depths_m, chosen.pixel_m, field_rad, chosen.camera)
+
+
+def _prepared(
+    optic: Optic,
+    asked: Sequence[tuple[SpectralLine, float]],
+    way: tuple[Propagation, float | None],
+    field_rad: tuple[float, float],
+) -> Iterator[tuple[Any, Any]]:
+    """Plan and source of every line and depth, each made while the light of the one before it is computed."""
+
+    def prepare(line: SpectralLine, depth: float) -> tuple[Any, Any]:
+        return optic.plan(line, depth, *way), optic.source(line, depth, field_rad)
+
+    if is_traced(optic) or in_jit():  # a trace is one thread's own
+        yield from (prepare(*each) for each in asked)
+        return
+    with ThreadPoolExecutor(1) as ahead:
+        begun = ahead.submit(prepare, *asked[0])
+        for each in asked[1:]:
+            following = ahead.submit(prepare, *each)
+            yield begun.result()
+            begun = following
+        yield begun.result()
+
+
+# Up to so many images of a wavelength take less time than what makes each of them quicker takes to compile.
+_FEW = 8
+
+
+@lru_cache(maxsize=256)
+def _images(camera: Camera, wavelength_m: float) -> Iterator[int]:
+    """Counts the images of a wavelength."""
+    return count()
 
 
 def _energy(optic: Optic, line: SpectralLine, plan: Any, source: Any) -> Array:

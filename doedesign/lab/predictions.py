@@ -30,7 +30,7 @@ from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictio
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.material import full_wave_wavelength_m, refractive_index
-from sim.metrics import strehl, zeroth_order
+from sim.metrics import in_parts, strehl, zeroth_order
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
@@ -129,16 +129,21 @@ def _measured(error: str) -> str:
 def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, Any]], Prediction]:
     """Predict the DOE as drawn (its rows) and the one with mean errors."""
     variation, camera = process.expected(), design.camera
-    expected = predict(design, process, variation)
     if variation.nominal:
+        expected = predict(design, process, variation)
         return expected.rows, expected
-    nominal, grid = as_fabricated(design.level_map.level, camera, process, Variation()), expected.surface.grid
+    surface = as_fabricated(design.level_map.level, camera, process, variation)
+    bank, grid = psf(surface, depths=design.depths_m), surface.grid
+    nominal = as_fabricated(design.level_map.level, camera, process, Variation())
     # On the raster of the other, whose propagation is compiled already.
     parts = grid.shape[0] // nominal.grid.shape[0]
-    field = jnp.repeat(jnp.repeat(nominal.transmission, parts, axis=1), parts, axis=2)
+    field = in_parts(nominal.transmission, parts)
     coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
-    alike = FabricatedDoe(expected.surface.camera, coverage, field, field, nominal.wavelengths_m)
-    return plate_rows(design, alike, psf(alike, depths=design.depths_m)), expected
+    alike = FabricatedDoe(surface.camera, coverage, field, field, nominal.wavelengths_m)
+    with ThreadPoolExecutor(1) as beside:
+        rows = beside.submit(plate_rows, design, surface, bank)
+        as_drawn = plate_rows(design, alike, psf(alike, depths=design.depths_m))
+    return as_drawn, Prediction(surface, bank, rows.result())
 
 
 def predict_sheet(
@@ -188,5 +193,8 @@ def predict_sheet(
         ),
         ranking=ranking,
     )
-    picture = plot_psfs(expected.bank, design.camera, design.near_m, design.far_m)
-    return SheetPrediction(predictions, png_bytes(picture))
+
+    def picture() -> bytes:
+        return png_bytes(plot_psfs(expected.bank, design.camera, design.near_m, design.far_m))
+
+    return SheetPrediction(predictions, picture)

@@ -5,7 +5,7 @@ The writer writes what is drawn here; `fab.order.verify` draws it again from the
 
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any, TypeVar
@@ -51,12 +51,13 @@ class DrawnOrder:
         return DoeModel(order.level_map, order.chrome, order.wafer, *at, order.patch, order.direct_write, cells)
 
     def kept(self, what: str, make: Callable[[], T]) -> T:
-        """Return what was made from this very order before, or make it."""
+        """Return what was made from this very order before, whatever its light, or make it."""
         return _kept(self.order, what, make)
 
 
 def _kept(order: Order, what: str, make: Callable[[], T]) -> T:
-    key = (what, sha256_bytes(canonical_json([request_of(order), order.level_map.digest])))
+    request = request_of(replace(order, light=None))
+    key = (what, sha256_bytes(canonical_json([request, order.level_map.digest])))
     if key not in _KEPT:
         while len(_KEPT) >= _MOST_KEPT:
             del _KEPT[next(iter(_KEPT))]

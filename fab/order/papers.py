@@ -28,9 +28,8 @@ def papers(
         made_by: versions of the tools that made the order.
         psfs: PNG of the PSFs for the run sheet, if there is one.
     """
-    order = drawing.order
+    order, kept = drawing.order, pictures(drawing)
     stem = order.stem
-    pictures: dict[str, Paper] = {"PREVIEW.png": lambda: png_bytes(order.plot())}
     form = form_record(drawing, plates)
     sheets: dict[str, Paper] = {
         "ORDER.csv": lambda: form_csv(form),
@@ -39,21 +38,28 @@ def papers(
         "CHECK.drc": lambda: drc_deck(order, f"{stem}_ALL.oas"),
     }
     if order.papers:
-        pictures["WAFER.png"] = partial(_wafer, drawing)
-        pictures["MARKS.png"] = partial(_marks, drawing)
-        if not order.rules.clean:
-            title = f"{stem}: where the masks break the rules of {order.process.name}"
-            pictures["RULES.png"] = lambda: png_bytes(order.rules.plot(title=title))
         content = record(run_sheet(drawing, plates, made_by))
         sheets["RUNSHEET.json"] = lambda: canonical_json(content)
         sheets["RUNSHEET.html"] = lambda: run_sheet_page(content, f"{stem}_RUNSHEET.json", shown())
-    kept = {name: partial(drawing.kept, name, draw) for name, draw in pictures.items()}
 
     def shown() -> dict[str, bytes]:
         embedded = {"wafer": kept["WAFER.png"](), "marks": kept["MARKS.png"]()}
         return embedded if psfs is None else {**embedded, "psfs": psfs}
 
     return {f"{stem}_{name}": make for name, make in {**kept, **sheets}.items()}
+
+
+def pictures(drawing: DrawnOrder) -> dict[str, Paper]:
+    """Return what draws every picture of an order, by the end of its name; each is drawn once and kept."""
+    order = drawing.order
+    drawn: dict[str, Paper] = {"PREVIEW.png": lambda: png_bytes(order.plot())}
+    if order.papers:
+        drawn["WAFER.png"] = partial(_wafer, drawing)
+        drawn["MARKS.png"] = partial(_marks, drawing)
+        if not order.rules.clean:
+            title = f"{order.stem}: where the masks break the rules of {order.process.name}"
+            drawn["RULES.png"] = lambda: png_bytes(order.rules.plot(title=title))
+    return {name: partial(drawing.kept, name, draw) for name, draw in drawn.items()}
 
 
 def _wafer(drawing: DrawnOrder) -> bytes:

@@ -14,10 +14,10 @@ Of an order that another version of this package wrote, pixels, lengths, depths 
 is compared with the manifest alone, to which its run sheet is tied by a digest, and the report says so.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, opened, os_errors_explained, read_bytes, read_json, require_text
 from fab.layout.geometry import pixel_edges
-from fab.manifest.records import Manifest, read_manifest
+from fab.manifest.records import FileEntry, Manifest, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
 from fab.order.papers import papers, request_digest
 from fab.order.request import order_from
@@ -58,7 +58,32 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
         InputError: the folder is not a mask order, or its manifest is corrupt.
         CheckFailed: no level map is left to compare with; differences alone raise in `VerificationReport.require`.
     """
-    folder = Path(order) if isinstance(order, str | Path) else order.folder
+    return verify_folder(Path(order) if isinstance(order, str | Path) else order.folder)
+
+
+class FilesRead(NamedTuple):
+    """What was found in the mask files and models of a folder, and the digests that they had then."""
+
+    sha256: Mapping[str, str]
+    checks: Sequence[Check]
+
+    def of_same(self, files: Sequence[FileEntry], intact: Mapping[str, bool]) -> dict[str, list[Check]]:
+        """Checks, by file, of the files that are still what they were."""
+        same = {entry.file for entry in files if intact[entry.file] and self.sha256.get(entry.file) == entry.sha256}
+        return {file: [check for check in self.checks if check.file == file] for file in same}
+
+
+def read_files(folder: Path, drawing: DrawnOrder, written: Manifest) -> FilesRead:
+    """Read the mask files and models of an order that is being written; `written` lists what is there already."""
+    level_map = drawing.order.level_map
+    expected = Expected(written, level_map.planes(), pixel_edges(level_map.grid))
+    intact = dict.fromkeys((entry.file for entry in written.files), True)
+    checks = check_files(folder, expected, drawing.model, intact)
+    return FilesRead({entry.file: entry.sha256 for entry in written.files}, checks)
+
+
+def verify_folder(folder: Path, known: FilesRead | None = None) -> VerificationReport:
+    """`verify`; what is `known` of the very same bytes is not read again."""
     require_text(folder)
     recorded, ours = read_manifest(folder), tools()
     with os_errors_explained(folder):
@@ -85,7 +110,8 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
             map_check,
         ]
         expected = Expected(wanted, level_map.planes(), pixel_edges(level_map.grid))
-        checks += check_files(folder, expected, drawing.model, intact)
+        same = known.of_same(wanted.files, intact) if known else {}
+        checks += check_files(folder, expected, drawing.model, intact, same)
         if notes:
             checks += _request_checks(folder, recorded)
         else:

@@ -31,13 +31,13 @@ from fab.gds.writer import write_gds
 from fab.layout.geometry import Chrome
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
-from fab.manifest.records import Manifest, read_manifest
+from fab.manifest.records import Manifest, ModelEntry, read_manifest
 from fab.order.drawing import DrawnOrder, draw, file_entries, manifest_of, tools
 from fab.order.formats import Formats
 from fab.order.order import Light, OnViolation, Order, plan_order
-from fab.order.papers import papers
+from fab.order.papers import papers, pictures
 from fab.order.terms import OrderTerms
-from fab.order.verify import verify
+from fab.order.verify import FilesRead, read_files, verify_folder
 from fab.process import Process
 from fab.runsheet.tables import SheetPrediction
 from fab.solids.patch import Patch
@@ -71,32 +71,47 @@ def _write_masks(folder: Path, drawing: DrawnOrder) -> None:
             one.result()
 
 
-def _write_files(folder: Path, order: Order, predict: Predict) -> Manifest:
-    """Write everything but the manifest, and return it."""
+def _write_files(folder: Path, order: Order, predict: Predict) -> tuple[Manifest, FilesRead]:
+    """Write everything but the manifest; return it, and what was found in the files that know of no light."""
     log.info("drawing the masks")
     drawing = draw(order)
     _write_masks(folder, drawing)
     np.save(folder / f"{order.stem}_LEVELS.npy", order.level_map.level, allow_pickle=False)
-    log.info("drawing the solids")
-    # What follows light takes long; the solids are drawn meanwhile.
-    with ThreadPoolExecutor(1) as pool:
-        solids = pool.submit(write_models, folder, order.stem, drawing.model)
+    # What follows light takes long; all that knows of no light is drawn, and read back, meanwhile.
+    with ThreadPoolExecutor(1) as beside:
+        begun = beside.submit(_write_models, folder, drawing)
         seen = predict(order) if order.papers else None
-        models = solids.result()
+        models, found = begun.result()
+    psfs = None
     if seen is not None:
-        light = Light(seen.predictions, sha256_bytes(seen.picture))
-        drawing = replace(drawing, order=replace(order, light=light))
-    log.info("drawing the pictures")
+        psfs = seen.picture()
+        drawing = replace(drawing, order=replace(order, light=Light(seen.predictions, sha256_bytes(psfs))))
     names = [order.plate_file(order.photomask_stem(photomask)) for photomask in order.photomasks]
     plates = {name: sha256_file(folder / name) for name in names}
-    made_by = tools()
-    for name, content in papers(drawing, plates, made_by, seen and seen.picture).items():
+    for name, content in papers(drawing, plates, tools(), psfs).items():
         write_atomic(folder / name, content())
+    return _manifest(folder, drawing, models), found
+
+
+def _write_models(folder: Path, drawing: DrawnOrder) -> tuple[list[ModelEntry], FilesRead]:
+    """Write solids and height maps, draw the pictures, and read masks and models back."""
+    log.info("drawing the solids")
+    models = write_models(folder, drawing.order.stem, drawing.model)
+    log.info("drawing the pictures")
+    for draw_picture in pictures(drawing).values():
+        draw_picture()
+    log.info("reading masks and solids back")
+    return models, read_files(folder, drawing, _manifest(folder, drawing, models))
+
+
+def _manifest(folder: Path, drawing: DrawnOrder, models: list[ModelEntry]) -> Manifest:
+    """Return the manifest of an order, of those of its files that are there."""
     files = [
         replace(entry, bytes=(folder / entry.file).stat().st_size, sha256=sha256_file(folder / entry.file))
         for entry in file_entries(drawing, models)
+        if (folder / entry.file).exists()
     ]
-    return manifest_of(drawing, models, files, made_by)
+    return manifest_of(drawing, models, files, tools())
 
 
 def _require_own(folder: Path) -> None:
@@ -188,10 +203,10 @@ def write_planned(folder: str | Path, order: Order, *, predict: Predict = lambda
     folder = Path(folder)
     _require_own(folder)
     with atomic_folder(folder) as fresh:
-        manifest = _write_files(fresh, order, predict)
+        manifest, found = _write_files(fresh, order, predict)
         (fresh / MANIFEST_NAME).write_bytes(manifest.to_json())
-        log.info("reading everything back")
-        report = verify(fresh)
+        log.info("comparing everything")
+        report = verify_folder(fresh, found)
         report.require()
         log.info("moving the folder into place")
     return WrittenOrder(folder, order, manifest, report)

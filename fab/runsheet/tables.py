@@ -3,7 +3,7 @@
 Predictions of the light come as plain numbers from outside, since `fab` does not compute it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -90,10 +90,10 @@ class Predictions:
 
 
 class SheetPrediction(NamedTuple):
-    """Predictions on the sheet, and a PNG of the PSFs of the DOE with the process's mean errors."""
+    """Predictions on the sheet, and what draws the PSFs of the DOE with the process's mean errors, as PNG."""
 
     predictions: Predictions
-    picture: bytes
+    picture: Callable[[], bytes]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,12 +221,20 @@ def _found_by(
     return checks
 
 
-def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping[str, bool]) -> list[Check]:
+def check_files(
+    folder: Path,
+    expected: Expected,
+    doe: DoeModel,
+    intact: Mapping[str, bool],
+    known: Mapping[str, Sequence[Check]] = MappingProxyType({}),
+) -> list[Check]:
     """Read every mask file and every model of an order, and compare it with what it should hold.
 
-    `doe` is what the models show; `intact` says of every file whether its bytes are those of the manifest.
+    `doe` is what the models show; `intact` says of every file whether its bytes are those of the manifest; `known` has
+    what was found before in the very same bytes.
     """
     files = [entry for entry in expected.manifest.files if (folder / entry.file).is_file()]
+    unread = [entry for entry in files if entry.file not in known]
     with scratch_folder() as scratch, child_process() as child, ThreadPoolExecutor(1) as beside:
 
         def begin(entry: FileEntry, *works: _Work) -> Future[list[Check]]:
@@ -233,20 +242,24 @@ def check_files(folder: Path, expected: Expected, doe: DoeModel, intact: Mapping
 
         # Libraries read in a process of their own, beside this one.
         found = {
-            entry.file: [begin(entry, _klayout_check, _library_check)] for entry in files if entry.format == _OASIS
+            entry.file: [begin(entry, _klayout_check, _library_check)] for entry in unread if entry.format == _OASIS
         }
         own: dict[str, Check] = {}
-        for entry in files:
+        for entry in unread:
             if entry.format == _GDS:
                 own[entry.file], fit = _own_check(folder / entry.file, entry, expected)
                 found[entry.file] = [begin(entry, _library_check)] if fit else []
-        models = [
-            Check(model.file, "read back, volume or every height", tuple(model_problems(folder, model, doe)))
-            for model in expected.manifest.models
-            if intact[model.file]  # libraries of solids and pictures are given whole files only
-        ]
+        models: list[Check] = []
+        for model in expected.manifest.models:
+            if model.file in known:
+                models += known[model.file]
+            elif intact[model.file]:  # libraries of solids and pictures are given whole files only
+                problems = tuple(model_problems(folder, model, doe))
+                models.append(Check(model.file, "read back, volume or every height", problems))
+        solid = {model.file for model in expected.manifest.models}
         checks: list[Check] = []
         for entry in files:
+            checks += [] if entry.file in solid else known.get(entry.file, [])
             checks += [own[entry.file]] if entry.file in own else []
             checks += [check for one in found.get(entry.file, []) for check in one.result()]
     return checks + models

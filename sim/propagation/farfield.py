@@ -27,6 +27,7 @@ short integration rule needs for a predicted error of 2e-3. At 1 the transform i
 of the work, enough to estimate energies when the image moves by a fraction of a pixel from call to call (`displaced`).
 """
 
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, cast
 
@@ -66,6 +67,13 @@ class FarField(eqx.Module):
     spacing_m: float = eqx.field(static=True)  # distance of the field's samples on the sensor
     # No static field: it changes with depth, and every depth would be compiled anew.
     expected_error: float  # predicted relative L2 error of the pixel energies of a speckle-like image
+
+    @property
+    def looped(self) -> "FarField":
+        """The same for few images: to the same bits, compiled in a third of the time, a quarter slower."""
+        parts = (self.gather, self.spread, self.refine, self.coarsen)
+        gather, spread, refine, coarsen = (part and part.looped for part in parts)
+        return replace(self, gather=gather, spread=spread, refine=refine, coarsen=coarsen)
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy `[y, x]` in every pixel of the window, per unit power incident on the clear aperture.

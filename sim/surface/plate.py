@@ -21,7 +21,7 @@ from sim.source import SourceMap
 from sim.surface.relief import plan_of, relief_of, require_possible
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
-from sim.tracing import is_traced
+from sim.tracing import is_traced, single
 
 
 class FabricatedDoe(CellOptic):
@@ -87,7 +87,8 @@ def as_fabricated(
     levels = process.levels
     lines = wavelengths_m or tuple(dict.fromkeys(w for c in camera.colours for w in c.wavelengths_m))
     traced = is_traced(variation)
-    rates = jnp.asarray([camera.waves_per_metre(w) for w in lines], jnp.float32)
+    waves = np.array([camera.waves_per_metre(w) for w in lines])
+    rates = jnp.asarray(waves, jnp.float32)
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
@@ -109,8 +110,9 @@ def as_fabricated(
     packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
     transmission, means = transmission_of(packed, widths, relief, rates, plan)
     if traced or variation.roughness_m:  # amplitude left after the roughness within a cell
-        rest = 1.0 - cell_share(jnp.asarray(variation.correlation_m, jnp.float32) / camera.grid.pitch_m)
-        loss = jnp.exp(-0.5 * rest * (2 * jnp.pi * rates * variation.roughness_m) ** 2)[:, None, None]
+        rest = 1.0 - cell_share(variation.correlation_m / camera.grid.pitch_m)
+        variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
+        loss = (jnp if traced else np).exp(single(-0.5 * variance))[:, None, None]
         transmission, means = transmission * loss, means * loss
     (ny, nx), parts = camera.grid.shape, plan.parts
     grid = camera.grid if parts == 1 else Grid((ny * parts, nx * parts), camera.grid.pitch_m / parts)

@@ -4,38 +4,46 @@ The covariance of cell means is separable and has a closed form, so the field is
 then the other, with the filter whose square has that covariance. The field repeats at the plate's edges.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.fft
+import scipy.special
 from jaxtyping import Array, Float
 
 from fab.grid import Grid
 from sim.propagation.pupil import block_size, in_blocks
+from sim.tracing import is_traced
+
+# White noise is the limit of a length of zero; its cell means have no variance.
+_SHORTEST = 1e-4  # cells
+_THREADS = 2
 
 
-def _covariance(length: Array, lags: Float[Array, " lag"]) -> Float[Array, " lag"]:
-    """Covariance of means over cells, along one axis, of a field of variance 1; `length` and `lags` in cells."""
+def _covariance(length: Any, size: int) -> Any:
+    """Covariance of means over cells, along one axis of `size` cells, of a field of variance 1; `length` in cells.
+
+    In single precision where the length is traced.
+    """
+    traced = is_traced(length)
+    xp, erfc = (jnp, jax.lax.erfc) if traced else (np, scipy.special.erfc)
+    lags = np.arange(size // 2 + 1, dtype=np.float32 if traced else np.float64)
+    length = xp.maximum(length, _SHORTEST)
 
     # The second antiderivative of exp(-x^2 / L^2) less its asymptote, whose second difference is at lag 0 alone.
-    def tail(x: Array) -> Array:
-        x = jnp.abs(x)
-        square = (x / length) ** 2
-        return jnp.sqrt(jnp.pi) / 2 * length * x * jax.lax.erfc(x / length) - length**2 / 2 * jnp.exp(-square)
+    def tail(x: np.ndarray) -> Any:
+        scaled = np.abs(x) / length
+        return length**2 / 2 * (np.sqrt(np.pi) * scaled * erfc(scaled) - xp.exp(-(scaled**2)))
 
     bend = tail(lags + 1) - 2 * tail(lags) + tail(lags - 1)
-    return jnp.where(lags == 0, jnp.sqrt(jnp.pi) * length, 0.0) - bend
+    return xp.where(lags == 0, np.sqrt(np.pi) * length, 0.0) - bend
 
 
-def _positive(length: Array) -> Array:
-    # White noise is the limit of a length of zero; its cell means have no variance.
-    return jnp.maximum(length, 1e-4)
-
-
-# Compiled as a whole: one by one its operations take seconds to compile.
-@jax.jit
-def cell_share(length: Float[Array, ""]) -> Float[Array, ""]:
+def cell_share(length: Any) -> Any:
     """Share of the variance that means over square cells keep; `length` is the correlation length in cells."""
-    return _covariance(_positive(length), jnp.zeros(1))[0] ** 2
+    return _covariance(length, 1)[0] ** 2
 
 
 def cell_roughness(grid: Grid, rms_m: Array | float, length_m: Array | float, seed: int) -> Float[Array, "y x"]:
@@ -43,27 +51,28 @@ def cell_roughness(grid: Grid, rms_m: Array | float, length_m: Array | float, se
 
     The same seed gives the same hills for every rms and length.
     """
-    noise = np.random.default_rng(seed).standard_normal(grid.shape, np.float32)
-    return _hills(noise, _positive(jnp.asarray(length_m, jnp.float32) / grid.pitch_m)) * rms_m
-
-
-@jax.jit
-def _hills(field: Float[Array, "y x"], length: Array) -> Float[Array, "y x"]:
+    field: Any = np.random.default_rng(seed).standard_normal(grid.shape, np.float32)
     for _ in range(2):  # along x, then along what was y
-        size = field.shape[1]
-        lags = np.arange(size // 2 + 1, dtype=np.float32)
-        covariance = _covariance(length, jnp.asarray(lags))
-        around = jnp.concatenate([covariance, covariance[1 : (size + 1) // 2][::-1]])
-        # Rounding can push the spectrum's tail below zero.
-        gain = jnp.sqrt(jnp.maximum(jnp.fft.rfft(around).real, 1e-12))
-        field = _filtered_rows(field, gain).T
-    return field
+        field = _filtered_rows(field, _gain(length_m / grid.pitch_m, field.shape[1])).T
+    return jnp.asarray(field) * rms_m
 
 
-def _filtered_rows(field: Float[Array, "y x"], gain: Float[Array, " f"]) -> Float[Array, "y x"]:
+def _gain(length: Any, size: int) -> Any:
+    """Amplitudes of the filter whose square has the covariance of cell means."""
+    xp = jnp if is_traced(length) else np
+    covariance = _covariance(length, size)
+    around = xp.concatenate([covariance, covariance[1 : (size + 1) // 2][::-1]])
+    # Rounding can push the spectrum's tail below zero.
+    return xp.sqrt(xp.maximum(xp.fft.rfft(around).real, 1e-12)).astype(np.float32)
+
+
+def _filtered_rows(field: Float[Array, "y x"] | Float[np.ndarray, "y x"], gain: Any) -> Any:
     rows, size = field.shape
+    if not is_traced(field, gain):
+        spectrum = scipy.fft.rfft(field, workers=_THREADS) * gain
+        return scipy.fft.irfft(spectrum, size, workers=_THREADS)
 
     def block(part: Array) -> Array:
         return jnp.fft.irfft(jnp.fft.rfft(part) * gain, n=size)
 
-    return jax.lax.map(block, in_blocks(field, block_size(rows))).reshape(-1, size)[:rows]
+    return jax.lax.map(block, in_blocks(jnp.asarray(field), block_size(rows))).reshape(-1, size)[:rows]

@@ -100,7 +100,7 @@ def write_base(folder: Path) -> None:
     ranking = (Importance("overlay of mask 3", 0.61, 0.02),)
     light = Predictions((near, far), (near, far), 550e-9, 552e-9, 520e-9, 1.0645, gratings, ranking)
     picture = _png(np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8))
-    write_planned(folder, order, predict=lambda _: SheetPrediction(light, picture))
+    write_planned(folder, order, predict=lambda _: SheetPrediction(light, lambda: picture))
 
 
 # --- tools ------------------------------------------------------------------------------------------------------------

@@ -81,7 +81,8 @@ def test_no_other_etch_makes_up_for_a_wrong_depth():
 def test_the_outlook_is_the_prediction_of_one_depth(design):
     spreads = {"common_depth_scale": Normal(0.03, 0.01), "overlay_x_m[3]": Normal(0.1 * UM, 0.3 * UM)}
     process = Process(LEVELS, spreads=spreads)
-    predictions, picture = predict_sheet(design, process, 550e-9)
+    predictions, draw = predict_sheet(design, process, 550e-9)
+    picture = draw()
     assert [(seen.depth_m, seen.far_spot) for seen in predictions.drawn] == [(6e-3, None)]
     short = replace(design, near_m=(6e-3,), far_m=())
     # The plate as drawn is cut into the pieces of the other one, and added up again in single precision.
