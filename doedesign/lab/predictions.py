@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
-from doedesign.prediction import Prediction, plate_rows, predict
+from doedesign.prediction import Prediction, as_drawn, plate_rows, predict
 from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at, varying
@@ -134,7 +134,7 @@ def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, A
         return expected.rows, expected
     surface = as_fabricated(design.level_map.level, camera, process, variation)
     bank, grid = psf(surface, depths=design.depths_m), surface.grid
-    nominal = as_fabricated(design.level_map.level, camera, process, Variation())
+    nominal = as_drawn(camera, design.level_map)
     # On the raster of the other, whose propagation is compiled already.
     parts = grid.shape[0] // nominal.grid.shape[0]
     field = in_parts(nominal.transmission, parts)
@@ -142,8 +142,8 @@ def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, A
     alike = FabricatedDoe(surface.camera, coverage, field, field, nominal.wavelengths_m)
     with ThreadPoolExecutor(1) as beside:
         rows = beside.submit(plate_rows, design, surface, bank)
-        as_drawn = plate_rows(design, alike, psf(alike, depths=design.depths_m))
-    return as_drawn, Prediction(surface, bank, rows.result())
+        rows_as_drawn = plate_rows(design, alike, psf(alike, depths=design.depths_m))
+    return rows_as_drawn, Prediction(surface, bank, rows.result())
 
 
 def predict_sheet(

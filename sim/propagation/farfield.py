@@ -175,12 +175,13 @@ def field_weights(
     cell, power = np.cos(angle) * (aperture + 1) / 2, np.sin(angle) ** 2 * 2 / 65
     lags = np.arange(_FIELD_TAPS)
     gram = np.cos(2 * np.pi * (lags[:, None] - lags)[:, :, None] * cell / length) @ power + _FLOOR * np.eye(_FIELD_TAPS)
-    waves = np.exp(2j * np.pi * (first[:, None] + lags - positions[:, None])[:, :, None] * cell / length)
+    # The wave of a cell at a tap is that at the first tap, turned by that of the lag.
+    waves = np.exp(2j * np.pi * (first - positions)[:, None] * cell / length)
+    turns = np.exp(2j * np.pi * lags[:, None] * cell / length)
     seen = (positions - samples // 2)[:, None] / length
     target = np.ones((len(positions), len(cell))) if slope is None else np.sinc(seen - slope * cell)
-    right = np.einsum("ptf,pf->pt", waves, power * target)
-    weights = np.linalg.solve(gram, right.T).T
-    missed = np.abs(np.einsum("pt,ptf->pf", weights, waves.conj()) - target) ** 2 @ power
+    weights = np.linalg.solve(gram, turns @ (waves * power * target).T).T
+    missed = np.abs((weights @ turns.conj()) * waves.conj() - target) ** 2 @ power
     matrix = np.zeros((samples, len(positions)), np.complex128)
     matrix[first[:, None] + lags, np.arange(len(positions))[:, None]] = weights
     error = float(np.sqrt(missed.mean() / (target**2 @ power).mean()))

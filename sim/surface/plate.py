@@ -108,12 +108,12 @@ def as_fabricated(
         rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
     relief = relief_of(process, variation, rough)
     packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
-    transmission, means = transmission_of(packed, widths, relief, rates, plan)
-    if traced or variation.roughness_m:  # amplitude left after the roughness within a cell
+    left = np.ones(len(waves), np.float32)
+    if traced or variation.roughness_m:
         rest = 1.0 - cell_share(variation.correlation_m / camera.grid.pitch_m)
         variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
-        loss = (jnp if traced else np).exp(single(-0.5 * variance))[:, None, None]
-        transmission, means = transmission * loss, means * loss
+        left = (jnp if traced else np).exp(single(-0.5 * variance))
+    transmission, means = transmission_of(packed, widths, relief, rates, left, plan)
     (ny, nx), parts = camera.grid.shape, plan.parts
     grid = camera.grid if parts == 1 else Grid((ny * parts, nx * parts), camera.grid.pitch_m / parts)
     coverage = _coverage(grid, camera, variation, traced)

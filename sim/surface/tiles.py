@@ -19,9 +19,13 @@ def transmission_of(
     widths: UInt8[Array, "mask y x"] | None,
     relief: EtchParameters,
     rates: Float[Array, " w"],
+    left: Float[Array, " w"],
     plan: TilePlan,
 ) -> tuple[Complex[Array, "w v u"], Complex[Array, "w v u"]]:
-    """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean."""
+    """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean.
+
+    `left` is the amplitude that roughness finer than a cell leaves of each wavelength.
+    """
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
     missing = count_y * TILE - ny, count_x * TILE - nx
@@ -46,7 +50,7 @@ def transmission_of(
     def strip(start_y: Array) -> tuple[Array, Array]:
         starts = jnp.arange(count_x) * TILE
         moments = jax.lax.map(jax.checkpoint(lambda start_x: tile(start_y, start_x)), starts)
-        return _strip_values(moments, plan)
+        return _strip_values(moments * left[:, None, None], plan)
 
     strips, means = jax.lax.map(strip, jnp.arange(count_y) * TILE)
     means = jnp.moveaxis(means, 0, 1).reshape(rates.shape[0], -1, means.shape[3])
