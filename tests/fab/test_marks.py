@@ -238,3 +238,18 @@ def test_notes_say_what_is_done_in_each_window():
     assert "the marks of the zero layer included" in wet[-1]
     light = alignment_notes(JOBS["clear field"])
     assert "the wafer's marks stay under resist" in light[1]
+
+
+def test_the_middle_of_a_vernier_has_the_longest_line_and_every_fourth_one_is_longer():
+    """So that the line that meets its partner can be counted from the middle."""
+    plates = JOBS["deep first"]
+    part = alignment_site(plates, NM)
+    for plate in plates[:2]:
+        x, y = (round(v / part.dbu_m) for v in part.places[f"vernier x, {plates[1].name}"])
+        boxes = part.shapes[plate.on(1)].rectangles - np.array([x, y, x, y])
+        thin = (boxes[:, 2] - boxes[:, 0] == 4000) & (abs(boxes[:, 0]) < 125_000) & (abs(boxes[:, 1]) < 70_000)
+        comb = boxes[thin & (boxes[:, 3] - boxes[:, 1] >= 30_000)]
+        heights = (comb[:, 3] - comb[:, 1])[np.argsort(comb[:, 0])]
+        assert len(heights) == 25
+        assert np.flatnonzero(heights == heights.max()).tolist() == [12]
+        assert np.flatnonzero(heights > heights.min()).tolist() == [0, 4, 8, 12, 16, 20, 24]

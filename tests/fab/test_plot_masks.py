@@ -35,6 +35,10 @@ def test_masks_are_shown_where_they_etch():
     assert (x0, y0) == (-x1, -y1)
     assert first.origin == "lower"
     np.testing.assert_array_equal(np.asarray(first.get_array()), level == 2)
+    assert first.get_clim() == (0, 1)
+    glass, etched = np.asarray(first.cmap(np.array([0.0, 1.0])))[:, :3]
+    assert etched[2] > etched[0] + 0.3  # where it is blue, as its title says
+    assert np.ptp(glass) < 0.1
     assert not np.any(second.get_array())
     heights = np.asarray(panel(drawn, "height: ").images[0].get_array())
     np.testing.assert_allclose(heights, 300 * level, rtol=1e-6)  # nanometres in float32

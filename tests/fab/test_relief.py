@@ -58,7 +58,7 @@ def test_our_own_reader_gives_the_map_back_from_every_kind(tmp_path):
     assert np.allclose(read_height(tmp_path / "h.tif", GRID.pitch_m, scale_m).height_m, height, rtol=1e-15, atol=0)
     scale_m = write_greymap(tmp_path / "h.png", level_map, bits=16)
     assert np.allclose(read_height(tmp_path / "h.png", GRID.pitch_m, scale_m).height_m, height, rtol=1e-15, atol=0)
-    write_npy(tmp_path / "h.npy", level_map)
+    assert write_npy(tmp_path / "h.npy", level_map) == 1.0
     # Single precision: a ten-thousandth of a nanometre in a micrometre.
     assert np.allclose(read_height(tmp_path / "h.npy", GRID.pitch_m).height_m, height, rtol=2**-24, atol=0)
 

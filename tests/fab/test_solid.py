@@ -112,7 +112,8 @@ def test_a_wafer_carries_the_chrome_of_every_die(tmp_path, wafer):
 
 @pytest.mark.parametrize("place", [(0.0, 46.5 * MM), (0.0, -43.8 * MM)], ids=["rim", "flat"])
 def test_a_die_beyond_the_wafer_is_refused(tmp_path, place):
-    with pytest.raises(InputError, match="the dies must lie on it"):
+    size = rf"a chrome of {2e3 * CHROME.outer_m:g} mm at "
+    with pytest.raises(InputError, match=f"the dies must lie on it, but got {size}"):
         wafer_step(tmp_path / "w.step", FLAT, APERTURE, CHROME, [place])
     assert not list(tmp_path.iterdir())
 

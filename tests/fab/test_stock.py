@@ -85,3 +85,19 @@ def test_the_ideal_process_has_no_errors():
     assert IDEAL.name not in STOCK
     assert Defects(**{name: figure.value for name, figure in IDEAL.defects.items()}) == Defects()
     assert IDEAL.wafer_radius_m.value == Process(Levels(2, 1e-7)).wafer_radius_m
+
+
+# What any lab would call usual; a number outside is a slip of units.
+USUAL = {
+    "mean": {"corner_radius_m": (0.05e-6, 2e-6), "sidewall_rad": (0.0, 0.3), "etch_lag": (0.0, 0.3)},
+    "sigma": {"magnification": 1e-5, "rotation_rad": 1e-4, "corner_radius_m": 1e-6, "sidewall_rad": 0.1},
+}
+
+
+@pytest.mark.parametrize("stock", STOCK.values(), ids=STOCK)
+def test_numbers_are_those_of_a_cleanroom(stock: Stock):
+    for key, typical in stock.errors.items():
+        low, high = USUAL["mean"].get(key, (-1e-6 if key.endswith("_m") else -0.1, 1e-6 if key.endswith("_m") else 0.1))
+        assert low <= typical.mean <= high, key
+        most = USUAL["sigma"].get(key, 5e-6 if key.endswith("_m") else 0.1)
+        assert 0 <= typical.sigma <= most, key

@@ -8,7 +8,7 @@ import pytest
 
 from bench.reference import make_camera
 from fab.errors import InputError
-from sim.imaging.formation import Optics, capture, shadow_px
+from sim.imaging.formation import Optics, capture, own_margin_px, shadow_px
 from sim.imaging.occlusion import Model, follows_light
 from sim.imaging.scene import Obstruction, Scene
 from sim.psf_bank import PsfBank
@@ -205,3 +205,9 @@ def test_what_does_not_fit_is_refused(rng):
     odd = eqx.tree_at(lambda s: s.obstructions[0].mask, scene, np.zeros((24, 31), np.float32))
     with pytest.raises(ValueError, match="must have the background's shape"):
         capture(odd, optics, "paper")
+
+
+@pytest.mark.parametrize(("model", "pixels"), [("paper", 8), ("radiometric", 12), ("reciprocal", 16)])
+def test_the_margin_is_that_of_the_psf_and_of_every_shadow(model: Model, pixels: int):
+    """Windows of 9 and 5 pixels reach 8 and 4 beyond a pixel."""
+    assert own_margin_px(9, 5, model) == pixels

@@ -86,6 +86,17 @@ def test_an_exr_of_one_psf_keeps_its_values(tmp_path: Path):
         read_frame(tmp_path / "two.exr", pixel_m=3.7e-6)
 
 
+def test_an_exr_in_colour_gives_the_channel_that_is_named(tmp_path: Path):
+    image = np.stack([counts(seed) for seed in range(3)]).astype(np.float32)[:, None]
+    write_bank(tmp_path / "rgb.exr", PsfBank(image, ("R", "G", "B"), (0.1,), 3.7e-6))
+    for number, channel in enumerate(("red", "green", "blue")):
+        frame = read_frame(tmp_path / "rgb.exr", channel=channel, pixel_m=3.7e-6)
+        np.testing.assert_array_equal(frame.counts, image[number, 0])
+    write_bank(tmp_path / "ab.exr", PsfBank(image[:2], ("A", "B"), (0.1,), 3.7e-6))
+    with pytest.raises(InputError, match="must have one colour, or red, green, blue, but got the colours A, B"):
+        read_frame(tmp_path / "ab.exr", channel="red", pixel_m=3.7e-6)
+
+
 def test_a_raw_mosaic_keeps_the_pixels_of_one_colour(tmp_path: Path):
     pytest.importorskip("rawpy", reason="rawpy (the extra raw) is not installed")
     mosaic = counts(most=4000, shape=(64, 96))  # much less is no RAW file to the library

@@ -12,6 +12,7 @@ from sim.measured import (
     centre_of_light,
     cut_window,
     merge_exposures,
+    parabola_vertex,
     without_background,
 )
 
@@ -155,3 +156,16 @@ def test_binned_pixels_add_light_and_noise(rng: np.random.Generator):
     assert not small.valid[2, 3]
     with pytest.raises(ValueError, match="multiples of 7"):
         binned(image, 7)
+
+
+@pytest.mark.parametrize("vertex", [3.0, 3.2, 2.7, 0.1, 6.8])
+def test_a_parabola_has_its_vertex_where_it_is(vertex: float):
+    """Seven samples of a period, so that the neighbours of the first and the last lie at the other end."""
+    away = (np.arange(7) - vertex + 3.5) % 7 - 3.5
+    at = int(np.argmax(-(away**2)))
+    assert parabola_vertex(5 - 2 * away**2, at) == pytest.approx((vertex - at + 3.5) % 7 - 3.5, abs=1e-12)
+
+
+def test_what_is_no_peak_has_its_vertex_on_itself():
+    assert parabola_vertex(np.array([0.0, 1.0, 2.0, 3.0]), 1) == 0.0  # a line
+    assert parabola_vertex(np.array([1.0, 0.0, 1.0, 0.0]), 1) == 0.0  # a dip

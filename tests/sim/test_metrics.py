@@ -1,5 +1,6 @@
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from bench.reference import make_camera, wrapped_map
 from sim.camera import Colour
 from sim.metrics import (
+    MetricInputs,
     airy_radius_m,
     disc_weights,
     encircled_energy,
@@ -127,3 +129,17 @@ def test_encircled_energy_of_an_even_image_is_an_area(size: int):
     # Strips of 1/64 pixel round the rim.
     np.testing.assert_allclose(encircled_energy(images, 1.0, radii)[0], np.pi * radii**2, rtol=2e-3)
     np.testing.assert_allclose(encircled_energy(images, 1.0, radii)[1], 2 * np.pi * radii**2, rtol=2e-3)
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_concentration_compares_pixels_with_the_lens(traced: bool):
+    """Of light spread evenly over 12 pixels where the lens spreads it over 4, a third; whatever the energy."""
+    own, lens = np.zeros((1, 1, 8, 8), np.float32), np.zeros((1, 1, 8, 8), np.float32)
+    own[0, 0, :3, :4], lens[0, 0, 2:4, 2:4] = 0.5, 0.1
+
+    def concentration(energy):
+        return MetricInputs(energy, (0.1,), CAMERA, lens=lens).concentration(0, 0)
+
+    expected = participation(own[0, 0]) / participation(lens[0, 0])
+    found = jax.jit(concentration)(own) if traced else concentration(own)
+    assert float(found) == pytest.approx(float(expected), rel=1e-6)

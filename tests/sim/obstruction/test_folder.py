@@ -160,3 +160,12 @@ def test_folders_without_masks_and_wrong_parameters_are_refused(tmp_path: Path):
         MaskFolder(tmp_path, width_m=-1.0)
     with pytest.raises(InputError, match="folder: colour: must"):
         MaskFolder(tmp_path, width_m=5e-3, colour=(2.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_small_picture_lies_in_the_frame_and_a_large_one_fills_it(tmp_path: Path, seed: int):
+    Image.fromarray(np.full((40, 50), 255, np.uint8)).save(tmp_path / "full.png")
+    small = MaskFolder(tmp_path, width_m=5e-3, **AT).draw(np.random.default_rng(seed), VIEW, GREY)
+    assert np.asarray(small.mask).sum() == pytest.approx(50 * 40, rel=1e-3)  # none of it is cut off
+    large = MaskFolder(tmp_path, width_m=30e-3, **AT).draw(np.random.default_rng(seed), VIEW, GREY)
+    assert np.asarray(large.mask)[2:-2, 2:-2].min() > 0.999

@@ -1,12 +1,23 @@
 """What holds for every kind of obstruction."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sim.obstruction import OBSTRUCTIONS, CameraView, Dirt, DirtRaindrop, MaskFolder, ObstructionKind, Raindrop
+from fab.errors import InputError
+from sim.obstruction import (
+    OBSTRUCTIONS,
+    CameraView,
+    Dirt,
+    DirtRaindrop,
+    Fence,
+    MaskFolder,
+    ObstructionKind,
+    Raindrop,
+)
 
 # Frames as wide as those of the paper's two tasks, with four times fewer pixels each way.
 AUTOMOTIVE = CameraView((128, 128), 14.8e-6, 8e-3)
@@ -99,3 +110,22 @@ def test_the_coin_falls_on_either_side(background: np.ndarray):
         rng.bit_generator.state = state
         expected = Raindrop().draw(rng, AUTOMOTIVE, background)
         assert first(never, seed) == np.asarray(expected.mask).tobytes()
+
+
+@pytest.mark.parametrize("kind", [Dirt, Fence, Raindrop])
+def test_shares_end_at_one(kind: Any):
+    shares = [name for name, (low, high) in kind.limits.items() if (low, high) == (0.0, 1.0)]
+    assert {"light", "persistence", "opacity", "ambient", "colour_jitter", "grain"} & set(kind.limits) <= set(shares)
+    for name in shares:
+        with pytest.raises(InputError, match=f"{name}"):
+            kind(**{name: 1.01 if np.ndim(getattr(kind(), name)) == 0 else (1.01, 1.01)})
+
+
+def test_no_fence_shines_by_itself():
+    """Its light is a share, from 0 to 1, of that of a white surface in its place."""
+    view = CameraView((24, 24), 10e-6, 10e-3)
+    for seed in range(60):
+        drawn = Fence().draw(np.random.default_rng(seed), view, np.ones((3, 24, 24), np.float32))
+        light = np.asarray(drawn.radiance)
+        assert light.min() >= 0
+        assert light.max() <= 1

@@ -165,3 +165,14 @@ def test_the_cap_meets_the_glass_at_the_contact_angle():
 def test_what_cannot_be_meant_is_refused(wrong: dict[str, Any], name: str):
     with pytest.raises(InputError, match=f"raindrop: {name}: must"):
         Raindrop(**wrong)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_drops_do_not_touch(seed: int):
+    """Sparse ones, too, of which one is put into the frame when none lies there."""
+    for many in (5e3, 4e5):
+        kind = Raindrop(per_m2=(many, many), radius_m=(0.2e-3, 0.9e-3))
+        found = kind.drops(np.random.default_rng(seed), VIEW, 0.1, 0.0)
+        assert any(drop.centred(VIEW) for drop in found)
+        for k, drop in enumerate(found):
+            assert not any(drop.touches(other) for other in found[k + 1 :])
