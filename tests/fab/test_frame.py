@@ -210,6 +210,11 @@ def test_the_first_photomask_shows_where_the_flat_or_the_notch_belongs(diameter_
     assert sum(len(shapes) for shapes in marks.values()) == count
     assert {layer.number for layer in marks} <= {3}
     assert any(name.startswith(kind) for name in frame.places) if kind else not marks
+    if kind == "notch":
+        assert [at for name, at in frame.places.items() if name.startswith("notch")] == [(0.0, -0.1)]
+        boxes = marks[Layer(3, 1)].rectangles
+        assert (boxes[:, 3] < -100e6).all()  # beyond the rim, to both sides of the notch
+        assert sorted(np.sign(boxes[:, 0]).tolist()) == [-1, 1]
     if kind == "flat":
         y = -round(np.sqrt(50e6**2 - 16.25e6**2))
         gaps = sorted(box[3] if box[1] < y else box[1] for box in marks[Layer(3, 1)].rectangles.tolist())

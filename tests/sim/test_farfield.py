@@ -112,16 +112,41 @@ def test_displaced_moves_the_image():
     assert relative_error(moved[2:, :-3], still[:-2, 3:]) < 2e-2
 
 
-def test_point_cells_lack_only_the_envelope():
+@pytest.mark.parametrize("sampling", [None, 1.5])
+def test_point_cells_lack_only_the_envelope(sampling: float | None):
     camera = make_camera(256, 0.8e-3, 1.44e-3, 1.85e-6, 65)
     rows, rate = make_rows(camera), jnp.float32(camera.waves_per_metre(YELLOW_M))
     square, points = (
-        np.asarray(plan_far_field(camera, YELLOW_M, cell=cell).energy(doe_field, rows, MapColumns(rate)))
+        np.asarray(
+            plan_far_field(camera, YELLOW_M, cell=cell, sampling=sampling).energy(doe_field, rows, MapColumns(rate))
+        )
         for cell in (True, False)
     )
     envelope = np.sinc(camera.axis_m() * camera.grid.pitch_m / (YELLOW_M * camera.focal_length_m)) ** 2
     # Across one pixel the envelope changes by at most 4 %, and linearly, so its value at the centre is near its mean.
     assert relative_error(points * envelope[:, None] * envelope, square) < 2e-3
+
+
+@pytest.mark.parametrize("name", ["default", "lit from 8 mm"])
+def test_tiles_in_a_loop_give_the_same_bits(name: str):
+    camera, plan = planned(name, moved=False)
+    rows, rate = make_rows(camera), jnp.float32(camera.waves_per_metre(YELLOW_M))
+    one, other = (np.asarray(way.energy(doe_field, rows, MapColumns(rate))) for way in (plan, plan.looped))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_large_matrix_is_multiplied_alike_in_a_loop(rng: np.random.Generator):
+    """Beyond what is one batch of tiles: 900 inputs, 1000 outputs, complex weights on 24 diagonals."""
+    matrix = np.zeros((900, 1000), np.complex128)
+    first = np.arange(1000) * 876 // 1000
+    matrix[first[:, None] + np.arange(24), np.arange(1000)[:, None]] = rng.normal(size=(1000, 24)) + 1j
+    banded = Banded.from_dense(matrix, batched=True)
+    x = rng.normal(size=(2, 7, 900)).astype(np.float32)
+    one, other = (np.asarray(each.of_complex(jnp.asarray(x))) for each in (banded, banded.looped))
+    np.testing.assert_array_equal(one, other)
+    assert banded.looped is not banded
+    wanted = (x[0] + 1j * x[1].astype(np.float64)) @ matrix
+    np.testing.assert_allclose(one[0] + 1j * one[1], wanted, atol=1e-4)  # 24 products of single precision
 
 
 def test_the_default_sampling_predicts_its_tolerance():
