@@ -14,6 +14,7 @@ Of an order that another version of this package wrote, pixels, lengths, depths 
 is compared with the manifest alone, to which its run sheet is tied by a digest, and the report says so.
 """
 
+import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -38,6 +39,8 @@ from fab.verification.values import differences
 
 if TYPE_CHECKING:
     from fab.order.write import WrittenOrder
+
+log = logging.getLogger("doedesign")
 
 # Endings of layouts, and of what packs them.
 _LAYOUTS = {*[".gds", ".gds2", ".gdsii", ".gdz", ".sf", ".strm", ".oas", ".oasis", ".dxf", ".cif", ".ctb", ".lic"]}
@@ -75,6 +78,7 @@ class FilesRead(NamedTuple):
 
 def read_files(folder: Path, drawing: DrawnOrder, written: Manifest) -> FilesRead:
     """Read the mask files and models of an order that is being written; `written` lists what is there already."""
+    log.info("reading masks and solids back")
     level_map = drawing.order.level_map
     expected = Expected(written, level_map.planes(), pixel_edges(level_map.grid))
     intact = dict.fromkeys((entry.file for entry in written.files), True)

@@ -79,9 +79,15 @@ def _write_files(folder: Path, order: Order, predict: Predict) -> tuple[Manifest
     np.save(folder / f"{order.stem}_LEVELS.npy", order.level_map.level, allow_pickle=False)
     # What follows light takes long; all that knows of no light is drawn, and read back, meanwhile.
     with ThreadPoolExecutor(1) as beside:
-        begun = beside.submit(_write_models, folder, drawing)
-        seen = predict(order) if order.papers else None
-        models, found = begun.result()
+        solids = beside.submit(_write_models, folder, drawing)
+        drawn = beside.submit(_draw_pictures, drawing)
+        read = beside.submit(lambda: read_files(folder, drawing, _manifest(folder, drawing, solids.result())))
+        try:
+            seen = predict(order) if order.papers else None
+        except BaseException:
+            beside.shutdown(wait=False, cancel_futures=True)  # what has begun is waited for, and no more
+            raise
+        models, _, found = solids.result(), drawn.result(), read.result()
     psfs = None
     if seen is not None:
         psfs = seen.picture()
@@ -93,15 +99,17 @@ def _write_files(folder: Path, order: Order, predict: Predict) -> tuple[Manifest
     return _manifest(folder, drawing, models), found
 
 
-def _write_models(folder: Path, drawing: DrawnOrder) -> tuple[list[ModelEntry], FilesRead]:
-    """Write solids and height maps, draw the pictures, and read masks and models back."""
+def _write_models(folder: Path, drawing: DrawnOrder) -> list[ModelEntry]:
+    """Write solids and height maps."""
     log.info("drawing the solids")
-    models = write_models(folder, drawing.order.stem, drawing.model)
+    return write_models(folder, drawing.order.stem, drawing.model)
+
+
+def _draw_pictures(drawing: DrawnOrder) -> None:
+    """Draw the pictures, which are kept."""
     log.info("drawing the pictures")
     for draw_picture in pictures(drawing).values():
         draw_picture()
-    log.info("reading masks and solids back")
-    return models, read_files(folder, drawing, _manifest(folder, drawing, models))
 
 
 def _manifest(folder: Path, drawing: DrawnOrder, models: list[ModelEntry]) -> Manifest:
