@@ -189,7 +189,7 @@ def _calibrated(
         measurement,
         next(models),
     )
-    return replace(result, remarks=tuple(_remarks(result, expected[0])))
+    return replace(result, remarks=tuple(remarks_on(result, expected[0])))
 
 
 @contextlib.contextmanager
@@ -212,7 +212,7 @@ def _estimated(unknowns: Unknowns, posterior: Posterior, edge_moves_m: Sequence[
     return with_edge_moves(process, [-move for move in edge_moves_m])
 
 
-def _remarks(result: Calibration, expected: Float[np.ndarray, "y x"]) -> Iterator[str]:
+def remarks_on(result: Calibration, expected: Float[np.ndarray, "y x"]) -> Iterator[str]:
     """Remarks on a calibration, given the first image as it was expected."""
     posterior, unknowns = result.posterior, result.objective.unknowns
     if not result.explained:

@@ -106,7 +106,7 @@ def _local(at: Evaluation, errors: Sequence[float], on_model: OnModel) -> Linear
     most = _EXPLAINED * at.objective.pixels
     jacobian = at.difference_jacobian(np.full(len(at.scores), WIDEST_STEP), on_model)
     for _ in range(_ROUNDS):
-        explained = at.chi2 < most
+        explained = bool(at.chi2 < most)
         if explained:
             each = zip(at.matches, errors, strict=True)
             at = at.reweighted(

@@ -269,3 +269,11 @@ def test_the_uncertainty_of_a_prediction_is_that_of_errors_and_motions():
     for key, slope in zip(keys, (slopes / 2e-3).T, strict=True):
         expected = np.sqrt(slope @ posterior.covariance @ slope)
         assert numbers[key].predicted[1] == pytest.approx(expected, rel=0.01)  # discs of samples
+
+
+def test_a_search_ends_when_its_steps_no_longer_matter():
+    """Plates of a linear model: the first, three rounds of two central differences each, and four steps."""
+    objective = analytic_objective(TRUTH, gain_sigma=None)
+    asked(objective).clear()
+    search(objective)
+    assert len(asked(objective)) <= 1 + 3 * 4 + 4

@@ -1,0 +1,70 @@
+"""What is looked for, how far, and what is believed of it before."""
+
+import numpy as np
+import pytest
+
+from doedesign.calibration.unknowns import unknowns_of
+from fab.errors import InputError
+from fab.levels import Levels
+from fab.process import Normal, Process
+
+PITCH_M = 2e-6
+LEVELS = Levels(4, 0.3e-6)
+
+
+def process(**spreads: Normal) -> Process:
+    return Process(LEVELS, spreads=spreads, name="usual")
+
+
+@pytest.mark.parametrize(
+    ("errors", "limit"),
+    [
+        (["common_cd_bias"], 0.45 * PITCH_M),
+        # A mask's own bias comes on top of the common one: each has half of what a cell can lose.
+        (["common_cd_bias", "cd_bias[1]"], 0.225 * PITCH_M),
+        (["overlay_x[1]"], 2.5 * PITCH_M),
+        (["sidewall"], 0.7),
+    ],
+)
+def test_nothing_is_looked_for_beyond_what_the_model_follows(errors: list[str], limit: float):
+    names = {"common_cd_bias_m": 5e-6, "cd_bias_m[1]": 5e-6, "overlay_x_m[1]": 50e-6, "sidewall_rad": 1.0}
+    wide = process(**{name: Normal(0.0, sigma) for name, sigma in names.items()})
+    found = unknowns_of(wide, errors, PITCH_M)
+    np.testing.assert_allclose(found.high, limit)
+    np.testing.assert_allclose(found.low, 0.0 if errors == ["sidewall"] else -limit)
+
+
+def test_corners_are_rounded_by_half_a_cell_at_most():
+    found = unknowns_of(process(corner_radius_m=Normal(0.0, 5e-6)), ["corner_radius"], PITCH_M)
+    assert found.high == pytest.approx([0.49 * PITCH_M])
+    assert found.low == pytest.approx([0.0])
+    assert found.start == pytest.approx([0.49 * PITCH_M])  # half a standard deviation, as far as it may go
+
+
+def test_what_is_known_well_is_looked_for_within_five_standard_deviations():
+    found = unknowns_of(process(common_depth_scale=Normal(0.01, 0.002)), ["common_depth_scale"], PITCH_M)
+    assert (found.low, found.start, found.high) == (pytest.approx([0.0]), pytest.approx([0.01]), pytest.approx([0.02]))
+    assert found.assumed == ()
+
+
+def test_places_of_masks_share_that_of_mask_0():
+    """Two masks relative to a third, each uncertain by 3 and 4: 5 apart, and correlated by what they share."""
+    names = {"overlay_x_m[0]": 3e-7, "overlay_x_m[1]": 4e-7, "overlay_x_m[2]": 4e-7}
+    three = Process(Levels(8, 0.1e-6), spreads={n: Normal(0.0, s) for n, s in names.items()}, name="three")
+    found = unknowns_of(three, ["overlay_x"], PITCH_M)
+    assert found.names == ("overlay_x_m[1]", "overlay_x_m[2]")
+    assert found.sigma == pytest.approx([5e-7, 5e-7])
+    assert (found.root @ found.root.T)[0, 1] == pytest.approx(9e-14)
+    with pytest.raises(InputError, match="something must be left to find"):
+        unknowns_of(three, ["overlay_x[0]"], PITCH_M)
+
+
+def test_scores_are_standard_normal():
+    names = {"overlay_x_m[0]": 3e-7, "overlay_x_m[1]": 4e-7, "overlay_x_m[2]": 2e-7}
+    three = Process(Levels(8, 0.1e-6), spreads={n: Normal(1e-7, s) for n, s in names.items()}, name="three")
+    found = unknowns_of(three, ["overlay_x"], PITCH_M)
+    values = found.values(np.random.default_rng(1).normal(size=(2, 40000)).T[0])
+    np.testing.assert_allclose(found.scores(values), np.random.default_rng(1).normal(size=(2, 40000)).T[0], atol=1e-9)
+    drawn = np.array([found.values(z) for z in np.random.default_rng(2).normal(size=(20000, 2))])
+    np.testing.assert_allclose(np.cov(drawn.T), found.root @ found.root.T, rtol=0.05)  # of 20000: 0.7 % each
+    np.testing.assert_allclose(drawn.mean(axis=0), found.mean, atol=2e-8)
