@@ -277,3 +277,9 @@ def test_a_search_ends_when_its_steps_no_longer_matter():
     asked(objective).clear()
     search(objective)
     assert len(asked(objective)) <= 1 + 3 * 4 + 4
+
+
+def test_an_error_is_determined_where_the_prior_says_less_than_half():
+    posterior = posterior_of(search(analytic_objective(TRUTH)))
+    assert posterior._replace(ratio=np.array([0.49, 0.51])).determined == [True, False]
+    assert posterior.determined == [True, True]

@@ -165,6 +165,7 @@ def test_pictures_of_other_kinds_hold_the_same_light(tmp_path: Path) -> None:
     cases = {
         "grey": grey,
         "alpha": np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=-1),
+        "grey and alpha": np.stack([grey, np.full_like(grey, 255)], axis=-1),
         "unlike": np.stack([grey, 0 * grey, grey[:, ::-1]], axis=-1),
     }
     for name, values in cases.items():

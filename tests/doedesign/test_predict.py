@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from doedesign.design.design import Design
+from doedesign.design.metrics import design_metrics
 from doedesign.prediction import Prediction, plate_rows, predict
 from fab.errors import InputError
 from fab.grid import Grid
@@ -17,6 +18,7 @@ from sim.metrics import energy_budget, energy_within, mean_wavelength_m, ring_to
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
+from tests.doedesign.calibration_fakes import plate_drawn, usual_process
 
 PITCH_M = 1.85e-6
 CELLS = 64
@@ -153,3 +155,32 @@ def test_digests_tell_designs_apart(design: Design):
 def test_errors_beyond_the_model_are_refused(design: Design):
     with pytest.raises(InputError, match="half a cell"):
         predict(design, PROCESS, Variation(common_cd_bias_m=PITCH_M))
+
+
+def test_errors_of_one_doe_come_from_one_source():
+    design = plate_drawn(32, 4, window=16)
+    process = usual_process(design)
+    given = Variation(common_depth_scale=0.01)
+    assert design.plate_errors(process, given) == (given, "given errors")
+    expected, words = design.plate_errors(process)
+    assert expected == process.expected()
+    assert words == "every error of the process usual at its mean"
+    drawn, words = design.plate_errors(process, seed=3)
+    assert words == "draw normal/0 of seed 3 of the process usual"
+    assert drawn != expected
+    assert drawn != design.plate_errors(process, seed=4)[0]
+    assert drawn == design.plate_errors(process, seed=3)[0]
+    with pytest.raises(InputError, match="seed: a plate has one source of errors"):
+        design.plate_errors(process, given, seed=3)
+
+
+def test_a_row_of_a_design_says_where_its_light_goes():
+    design = plate_drawn(64, 4, window=24)
+    optic = HeightOptic.of(design.camera, design.height_m)
+    depths = (6e-3, np.inf)
+    lens = HeightOptic.of(design.camera, np.zeros((64, 64)))
+    rows = design_metrics(optic, psf(optic, depths=depths), (6e-3,), psf(lens, depths=depths))
+    assert len(rows) == 2
+    for row in rows:
+        assert sum(row["budget"].values()) == pytest.approx(1)
+        assert row["budget"]["spot"] + row["budget"]["window"] == pytest.approx(row["throughput"], rel=1e-5)
