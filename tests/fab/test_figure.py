@@ -107,3 +107,14 @@ def test_small_helpers():
     assert length_text(np.inf) == "∞"
     assert evenly_spaced(9, 3) == [0, 4, 8]
     assert evenly_spaced(2, 3) == [0, 1]
+
+
+@pytest.mark.parametrize("width_m", [1e-3, 3.9e-3, 4.0e-3, 7.99e-3, 8e-3, 19e-3, 20e-3, 123e-6])
+def test_a_scale_bar_is_the_longest_round_length_within_a_quarter(width_m: float):
+    axes = Figure().subplots()
+    scale_bar(axes, width_m)
+    (line,), (words,) = axes.lines, axes.texts
+    round_ones = [m * 10.0**n for n in range(-6, 0) for m in (1, 2, 5)]
+    wanted = max(length for length in round_ones if length <= width_m / 4 * (1 + 1e-9))
+    assert np.asarray(line.get_xdata()) == pytest.approx([0, wanted / width_m])
+    assert words.get_text() == length_text(wanted)

@@ -140,3 +140,10 @@ def test_means_below_zero_are_for_errors_that_go_both_ways():
 def test_impossible_defects_are_refused(changes: dict, message: str):
     with pytest.raises(InputError, match=message):
         Defects(**changes)
+
+
+def test_what_is_believed_of_an_unknown_process_is_that_of_a_cleanroom():
+    """Lengths to some micrometres, shares to a tenth; a number outside is a slip of units."""
+    for name, error in DEVIATIONS.items():
+        most = {"m": 5e-6, "rad": 0.2}.get(error.unit, 0.1)
+        assert 0 <= (error.prior_sigma or 0) <= most, name

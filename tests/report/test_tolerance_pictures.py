@@ -7,11 +7,11 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, FigureBase
 
 from doedesign.report.labels import error_label
 from doedesign.spec import LimitSpec
-from doedesign.tolerancing.analysis import Sample, limit_from_text, yield_of
+from doedesign.tolerancing.analysis import QUANTITIES, Sample, limit_from_text, yield_of
 from doedesign.tolerancing.budget import Budget
 from doedesign.tolerancing.plots import plot_budget, plot_effects, plot_histograms, plot_variance_shares, plot_yield
 from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, VarianceShare
@@ -144,3 +144,22 @@ def test_an_error_is_named_in_words():
     assert error_label("overlay_x_m[2]") == "overlay x, mask 2"
     assert error_label("sidewall_rad") == "sidewall"
     assert error_label("radial_nonuniformity") == "radial nonuniformity"
+
+
+def test_a_yield_has_a_curve_per_place_and_a_share_is_in_per_cent():
+    drawn = plot_yield(random_table(np.random.default_rng(5), LIMITS))
+    assert isinstance(drawn, Figure)
+    for axes in drawn.axes:
+        if not axes.get_title():
+            continue
+        name = axes.get_title().rsplit(" at ", 1)[0]
+        (quantity,) = [one for one in QUANTITIES.values() if one.label == name]
+        places = {(one.colour, one.depth_m) for one in LIMITS if QUANTITIES[one.quantity].label == name}
+        assert len([line for line in axes.lines if len(np.asarray(line.get_xdata())) > 2]) >= max(len(places), 1)
+        assert axes.get_xlabel() == quantity.label + (" (%)" if quantity.share else "")
+
+
+def test_a_budget_out_of_reach_says_what_the_yield_is_without_these_errors():
+    assert str(budget("out of reach")) == (
+        "without overlay errors the yield is 100.0 % (94.3 to 100.0 %), so no budget gives a yield of 90 %"
+    )

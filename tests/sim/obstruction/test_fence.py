@@ -6,7 +6,7 @@ import pytest
 
 from fab.errors import InputError
 from sim.obstruction import CameraView, Fence
-from sim.obstruction.fence import _Lamp, _Wires, rods, seen, tilted_plane
+from sim.obstruction.fence import _FINISHES, _Lamp, _Wires, rods, seen, tilted_plane
 
 VIEW = CameraView((256, 512), 12.9e-6, 50e-3)
 GREY = np.full((3, 256, 512), 0.5, np.float32)
@@ -148,3 +148,9 @@ def test_a_view_too_wide_for_the_tilt_is_refused(rng: np.random.Generator):
 def test_what_cannot_be_meant_is_refused(wrong: dict[str, Any], name: str):
     with pytest.raises(InputError, match=f"fence: {name}: must"):
         Fence(**wrong)
+
+
+def test_finishes_reflect_a_share_of_the_light():
+    for finish in _FINISHES:
+        assert min(finish) > 0
+        assert max(finish) < 1

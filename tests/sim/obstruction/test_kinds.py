@@ -121,6 +121,13 @@ def test_shares_end_at_one(kind: Any):
             kind(**{name: 1.01 if np.ndim(getattr(kind(), name)) == 0 else (1.01, 1.01)})
 
 
+def test_a_fence_hangs_and_bends_by_a_tenth_of_a_metre_at_most():
+    with pytest.raises(InputError, match="sag_m"):
+        Fence(sag_m=(0.0, 0.11))
+    with pytest.raises(InputError, match="bend_m"):
+        Fence(bend_m=(0.0, 0.11))
+
+
 def test_no_fence_shines_by_itself():
     """Its light is a share, from 0 to 1, of that of a white surface in its place."""
     view = CameraView((24, 24), 10e-6, 10e-3)

@@ -176,3 +176,15 @@ def test_drops_do_not_touch(seed: int):
         assert any(drop.centred(VIEW) for drop in found)
         for k, drop in enumerate(found):
             assert not any(drop.touches(other) for other in found[k + 1 :])
+
+
+def test_a_drop_that_is_put_into_the_frame_takes_the_place_of_those_that_it_touches():
+    """Large drops about a frame in which none is centred: of many draws some have such neighbours."""
+    kind, kept = Raindrop(per_m2=(2e3, 2e3), radius_m=(4e-3, 7e-3)), 0
+    for seed in range(400):
+        found = kind.drops(np.random.default_rng(seed), VIEW, 0.1, 0.0)
+        if sum(drop.centred(VIEW) for drop in found) == 1:
+            kept += len(found) > 1
+        for k, drop in enumerate(found):
+            assert not any(drop.touches(other) for other in found[k + 1 :])
+    assert kept > 20
