@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.campaign.field import Field, clear
-from tests.campaign.full_disk import FULL_DISK
+from tests.campaign.full_disk import EVERY_WRITE, FULL_DISK
 from tests.campaign.ground import Ground
 from tests.campaign.kills import KILLS, SIGNALLED
 from tests.campaign.mutations import MUTATIONS
@@ -35,6 +35,7 @@ FAMILIES = {
     "kills": KILLS,
     "signals": SIGNALLED,
     "full_disk": FULL_DISK,
+    "every_write": EVERY_WRITE,
     "two_processes": TWO_PROCESSES,
     "mutations": MUTATIONS,
     "bombs": BOMBS,

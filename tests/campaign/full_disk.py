@@ -24,8 +24,27 @@ def _cases(ground: Ground, seed: int, count: int) -> Iterator[str]:
             continue
         if not left.get(name):
             left[name] = list(rng.permutation(sum(call not in REMOVALS for call in end.calls)))
-        call, error, stays = left[name].pop() + 1, FULL[rng.integers(2)], rng.integers(2)
-        yield f"{name}:call={call}:{errno.errorcode[error]}:{('once', 'stays')[stays]}"
+        yield _case(name, left[name].pop() + 1, rng)
+
+
+def _every_case(ground: Ground, seed: int, count: int) -> Iterator[str]:
+    """Every call of every command once, in random order, up to a count; none at all without one."""
+    rng = np.random.default_rng(seed)
+    if not count:
+        return
+    calls = [
+        (name, call)
+        for name in WRITING
+        for call in range(1, 1 + sum(call not in REMOVALS for call in ground.whole(name)[1].calls))
+    ]
+    for k in rng.permutation(len(calls))[:count]:
+        name, call = calls[k]
+        yield _case(name, call, rng)
+
+
+def _case(name: str, call: int, rng: np.random.Generator) -> str:
+    error, stays = FULL[rng.integers(2)], rng.integers(2)
+    return f"{name}:call={call}:{errno.errorcode[error]}:{('once', 'stays')[stays]}"
 
 
 def _problems(field: Field, case: str) -> list[str]:
@@ -40,3 +59,6 @@ def _problems(field: Field, case: str) -> list[str]:
 
 
 FULL_DISK = Family("a full disk or quota at a write, then the same command again", 60, _cases, _problems)
+EVERY_WRITE = Family(
+    "a full disk at every write once, as many as --count says; 0 by default", 0, _every_case, _problems
+)
