@@ -65,7 +65,7 @@ def verify(order: "str | Path | WrittenOrder") -> VerificationReport:
 
 
 class FilesRead(NamedTuple):
-    """What was found in the mask files and models of a folder, and the digests that they had then."""
+    """Findings in the mask files and models of a folder, and the digests that they had then."""
 
     sha256: Mapping[str, str]
     checks: Sequence[Check]
