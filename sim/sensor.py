@@ -39,6 +39,9 @@ Interpolation = Literal["bilinear", "malvar2004", "menon2007"]
 _MOST_BITS = 24  # what single precision holds
 
 
+_USUAL_BLACK = 64  # raw numbers per one of the usual black level
+
+
 @dataclass(frozen=True)
 class Sensor:
     """A sensor, which turns light into numbers. Hashable: it may be a static argument of `jit`.
@@ -49,7 +52,8 @@ class Sensor:
         quantum_efficiency: electrons per photon, one for all colours or one per colour.
         read_noise_e: standard deviation of a reading, electrons.
         dark_e: mean number of electrons that heat sets free during the exposure.
-        black_level: raw number of a pixel without electrons; it keeps the negative half of the read noise.
+        black_level: raw number of a pixel without electrons; it keeps the negative half of the read noise. None is
+            what is usual: a 64th of all raw numbers (64 of 12 bits) where electrons have noise, and 0 elsewhere.
         bits: bits of a raw number; None for numbers between 0 and 1 that are not rounded.
         pattern: colours of the four upper left photosites of the picture, row by row, where the sensor has a Bayer
             mosaic; None for a sensor that sees every colour at every pixel.
@@ -61,7 +65,7 @@ class Sensor:
     quantum_efficiency: tuple[float, ...] = (0.6,)
     read_noise_e: float = 2.5
     dark_e: float = 0.0
-    black_level: float = 0.0
+    black_level: float | None = None
     bits: int | None = 12
     pattern: Pattern | None = None
     noise: NoiseModel = "physical"
@@ -78,7 +82,7 @@ class Sensor:
             raise ValueError(f"`quantum_efficiency` must lie between 0 and 1, but got {self.quantum_efficiency}")
         if self.bits is not None and not 1 <= self.bits <= _MOST_BITS:
             raise ValueError(f"`bits` must lie from 1 to {_MOST_BITS}, but got {self.bits}")
-        if not 0 <= self.black_level < self.top:
+        if not 0 <= self.zero_raw < self.top:
             raise ValueError(f"`black_level` must lie below {self.top:g}, but got {self.black_level}")
         for name, kind in (("noise", NoiseModel), ("pattern", Pattern)):
             value = getattr(self, name)
@@ -89,6 +93,15 @@ class Sensor:
     def top(self) -> float:
         """The largest raw number."""
         return 1.0 if self.bits is None else 2.0**self.bits - 1
+
+    @property
+    def zero_raw(self) -> float:
+        """Raw number of a pixel without electrons."""
+        if self.black_level is not None:
+            return self.black_level
+        every = 1.0 if self.bits is None else 2.0**self.bits
+        usual = every / _USUAL_BLACK if self.noise == "physical" else 0.0
+        return usual if self.bits is None else float(int(usual))
 
     @property
     def counts_photons(self) -> bool:
@@ -110,7 +123,7 @@ class Sensor:
 
     def white_raw(self, colours: int) -> Float[np.ndarray, "c 1 1"]:
         """Raw numbers of white above black, in every colour."""
-        steps = np.float32(self.top - self.black_level)
+        steps = np.float32(self.top - self.zero_raw)
         if not self.counts_photons:
             return np.full((colours, 1, 1), steps, np.float32)
         return self.white_e(colours) * (steps / np.float32(self.full_well_e))
@@ -123,7 +136,7 @@ class Sensor:
     def black_raw(self) -> float:
         """Mean raw number of a pixel without light."""
         dark = self.dark_e / self.full_well_e if self.counts_photons else 0.0
-        return self.black_level + dark * (self.top - self.black_level)
+        return self.zero_raw + dark * (self.top - self.zero_raw)
 
 
 @eqx.filter_jit
@@ -143,8 +156,8 @@ def expose(light: Float[Array, "*batch c y x"], sensor: Sensor, key: Key[Array, 
     # A photosite behind a filter draws its own noise, so the mosaic comes first.
     seen = mosaic(signal, sensor.pattern) if sensor.pattern else signal
     share = _noisy(seen, sensor, key)
-    steps = sensor.top - sensor.black_level
-    raw = clipped(sensor.black_level + share * steps, 0.0, sensor.top)
+    steps = sensor.top - sensor.zero_raw
+    raw = clipped(sensor.zero_raw + share * steps, 0.0, sensor.top)
     return raw if sensor.bits is None else rounded(raw)
 
 

@@ -88,7 +88,7 @@ class SensorSpec(SpecTable, frozen=True):
         quantum_efficiency: electrons per photon, one number or one per colour.
         read_noise_e: standard deviation of a reading, electrons.
         dark_e: mean number of electrons of dark current.
-        black_level: raw number of a pixel without electrons.
+        black_level: raw number of a pixel without electrons; a 64th of all raw numbers by default.
         bits: bits of a raw number.
         bayer: the four upper left photosites of a mosaic, row by row; every pixel sees every colour if left out.
         noise: noise model.

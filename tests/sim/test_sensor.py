@@ -38,7 +38,7 @@ def test_colours_differ_by_their_quantum_efficiency():
     assert sensor.white_photons == pytest.approx(1e5 * 0.5 / 0.6)
     assert sensor.white_e(3).ravel() == pytest.approx([25000, 50000, 100000 / 3])
     raw = np.asarray(expose(flat(1.0), sensor, KEY))
-    share = raw.mean(axis=(1, 2)) / np.asarray(sensor.white_raw(3)).ravel()
+    share = (raw.mean(axis=(1, 2)) - sensor.zero_raw) / np.asarray(sensor.white_raw(3)).ravel()
     assert share == pytest.approx([1, 1, 1], abs=5 / np.sqrt(25000) / 256)  # five standard errors of the dimmest
     light = np.asarray(developed(raw, sensor))
     assert light.std(axis=(1, 2)) == pytest.approx(1 / np.sqrt(sensor.white_e(3).ravel()), rel=0.02)
@@ -59,10 +59,32 @@ def test_saturation_and_bits():
 def test_the_black_level_keeps_what_the_read_noise_takes_below():
     light = flat(0.0)
     kept = np.asarray(developed(expose(light, Sensor(read_noise_e=8, black_level=64), KEY), Sensor(black_level=64)))
-    cut = np.asarray(developed(expose(light, Sensor(read_noise_e=8), KEY), Sensor()))
+    none = Sensor(read_noise_e=8, black_level=0)
+    cut = np.asarray(developed(expose(light, none, KEY), none))
     deviation = 8 / 8000
     assert abs(kept.mean()) < 5 * deviation / np.sqrt(kept.size)
     assert cut.mean() == pytest.approx(deviation / np.sqrt(2 * np.pi), rel=0.02)  # half a Gaussian
+
+
+def test_the_usual_black_level_leaves_darkness_and_its_noise_alone():
+    """Without one, noise of 2.5 electrons lifts darkness by a third of a raw number and hides 60 % of its variance."""
+    dark = {level: np.asarray(expose(flat(0.0), Sensor(black_level=level), KEY), np.float64) for level in (None, 0.0)}
+    noise = np.hypot(2.5 / (10000 / (4095 - 64)), np.sqrt(1 / 12))  # raw numbers, rounding included
+    assert dark[None].mean() == pytest.approx(64, abs=5 * noise / np.sqrt(dark[None].size))
+    assert dark[None].std() == pytest.approx(noise, rel=0.02)
+    assert dark[0.0].mean() == pytest.approx(0.31, abs=0.1)
+    assert dark[0.0].var() < 0.5 * dark[None].var()
+
+
+@pytest.mark.parametrize(
+    ("bits", "noise", "black"),
+    [(8, "physical", 4), (10, "physical", 16), (12, "physical", 64), (14, "physical", 256), (5, "physical", 0)]
+    + [(None, "physical", 1 / 64), (12, "none", 0), (12, "tseng", 0)],
+)
+def test_the_usual_black_level_is_a_64th_where_electrons_have_noise(bits: int | None, noise: Any, black: float):
+    sensor = Sensor(bits=bits, noise=noise)
+    assert sensor.zero_raw == black
+    assert dataclasses.replace(sensor, black_level=3 * black / 2).zero_raw == 3 * black / 2
 
 
 @pytest.mark.parametrize(
