@@ -123,6 +123,16 @@ def test_the_search_through_the_range_stays_within_two_standard_deviations():
     assert (farthest > 1.7).all()  # 60 points of a square: with odds of one in 1e4 none comes so near its edge
 
 
+def test_steps_go_on_until_the_images_are_explained():
+    """s bends: a step along its slope at zero ends at 2.3 instead of 3, and only a second one explains the images."""
+    words: list[str] = []
+    found = search(analytic_objective(np.array([3.0, 0.2]), waves=0.2), on_model=words.append)
+    assert posterior_of(found).values == pytest.approx([3.0, 0.2], abs=0.05)
+    first, *_, last = (float(word.partition(" ")[0]) for word in words if word != "derivatives")
+    assert first > 3
+    assert last < 1.2
+
+
 def test_what_is_explained_needs_no_search_through_the_range():
     words: list[str] = []
     search(analytic_objective(TRUTH), evaluations=60, on_model=words.append)

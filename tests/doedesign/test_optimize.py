@@ -82,6 +82,22 @@ def test_design_is_on_levels_and_radial_designs_are_radial() -> None:
     assert radial_profile(np.asarray(design.continuous_m), problem.camera.grid) is not None
 
 
+@pytest.mark.parametrize(
+    ("override", "moved"),
+    [
+        ("optimize.sampling=sparse", True),
+        ("optimize.sampling=exact", False),
+        ("optics.propagation=fresnel", False),
+        pytest.param("optimize.parametrization=radial", False, marks=pytest.mark.slow),
+    ],
+)
+def test_the_image_is_moved_between_sparse_samples_alone(override: str, moved: bool) -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, override])
+    _, scene = problem_of(spec, {})
+    assert scene.displacement_m == (spec.sensor.pixel_m / 2 if moved else 0)
+    assert (scene.look(0, 0).offset_m is not None) == moved
+
+
 def test_looks_see_every_depth_equally_often() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", SMALL)
     _, scene = problem_of(spec, {})

@@ -48,6 +48,7 @@ def test_annealing_blends_from_continuous_to_drawn() -> None:
     np.testing.assert_allclose(heights[0], SIXTEEN.continuous_m(radians), rtol=1e-6)
     np.testing.assert_allclose(heights[1], (heights[0] + heights[2]) / 2, atol=1e-12)
     assert softness_at("annealed", 0, 100) == 1.0
+    assert softness_at("annealed", 50, 100) == 0.5**3  # half of the way from a tenth to nine tenths of the steps
     assert softness_at("annealed", 90, 100) == 0.0
     assert softness_at("straight_through", 0, 100) == 0.0
     assert softness_at("none", 99, 100) == 1.0

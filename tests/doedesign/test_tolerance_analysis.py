@@ -1,6 +1,8 @@
 """Statistics, limits, yield, sensitivities and budgets against numbers that can be worked out by hand."""
 
 import dataclasses
+import functools
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
@@ -11,14 +13,16 @@ import numpy as np
 import pytest
 
 from doedesign.spec import LimitSpec
+from doedesign.tolerancing import result_files
 from doedesign.tolerancing.analysis import QUANTITIES, Sample, limit_from_text, limit_text, sample_of, yield_of
 from doedesign.tolerancing.budget import budget_of
 from doedesign.tolerancing.pool import DrawModel, OutOfModel, Rows
-from doedesign.tolerancing.results import tolerance
+from doedesign.tolerancing.results import ToleranceResult, tolerance
 from doedesign.tolerancing.sensitivity import source_shares
 from doedesign.tolerancing.studies import Study, study
 from fab.errors import InputError
 from fab.process import Normal, Process, Variation
+from tests.pictures import leave_out_pictures
 
 
 @pytest.fixture(scope="module")
@@ -260,15 +264,22 @@ def test_the_budget_for_overlay_agrees_with_the_one_worked_out(ask: Callable[...
     assert asked.budget("overlay_x[0]", 0.9, 100, (0.0, 0.5, 1.0)).sigmas.keys() == {"overlay_x_m[0]"}
 
 
-def test_a_result_holds_what_was_asked_for(fakes, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def toleranced(fakes, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ToleranceResult]:
+    """`tolerance` of four plates that are evaluated in this process."""
+
     def asked(design: Any, **settings: Any) -> Study:
         return dataclasses.replace(study(design, quiet=True, **settings), run=one_after_another)
 
     monkeypatch.setattr("doedesign.tolerancing.results.study", asked)
     settings = {"process": fakes.process(), "evaluate": fakes.rows, "limits": ["strehl >= 0.9"], "draws": 4}
-    few = tolerance(fakes.design(), sensitivity="none", **settings)
+    return functools.partial(tolerance, fakes.design(), **settings)
+
+
+def test_a_result_holds_what_was_asked_for(toleranced: Callable[..., ToleranceResult]):
+    few = toleranced(sensitivity="none")
     assert (few.effects, few.variance_shares, few.corners, few.budget) == (None, None, None, None)
-    more = tolerance(fakes.design(), sensitivity="sobol", sobol=4, corners=True, budget="overlay", **settings)
+    more = toleranced(sensitivity="sobol", sobol=4, corners=True, budget="overlay")
     assert (few.effects, more.effects) == (None, None)
     assert more.variance_shares
     assert more.corners is not None
@@ -277,7 +288,38 @@ def test_a_result_holds_what_was_asked_for(fakes, monkeypatch: pytest.MonkeyPatc
     assert more.budget.what == "overlay"
     assert {key.partition("/")[0] for key in few.keys} == {"nominal", "expected", "normal"}
     assert set(few.keys) < set(more.keys)
-    assert tolerance(fakes.design(), **settings).effects
+    assert toleranced().effects
+
+
+def test_results_take_the_place_of_older_ones_and_of_nothing_else(
+    toleranced: Callable[..., ToleranceResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    leave_out_pictures(monkeypatch, result_files)
+    monkeypatch.setattr(ToleranceResult, "plot", lambda _: None)
+    monkeypatch.setattr(result_files, "evaluate_here", lambda model, plates, workers: ((key, None) for key in plates))
+    out, letter = tmp_path / "out", tmp_path / "letter.txt"
+    toleranced(budget="overlay", out=out)
+    before = {path.name for path in out.iterdir()}
+    assert {"budget.png", "one_at_a_time.png", "yield.png"} < before
+    letter.write_text("mine")
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["results_sha256"]["../letter.txt"] = "0" * 64
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    toleranced(sensitivity="none", out=out)
+    assert {path.name for path in out.iterdir()} == before - {"budget.png", "one_at_a_time.png"}
+    assert letter.read_text() == "mine"
+
+
+def test_a_result_in_words_ends_with_the_sigmas_that_a_budget_allows(toleranced: Callable[..., ToleranceResult], fakes):
+    few = toleranced(sensitivity="none")
+
+    def words(*shares: float) -> str:
+        budget = budget_of(fakes.process(), "overlay", 0.9, (0, 1, 2), yields(*shares))
+        return str(dataclasses.replace(few, budget=budget)).rpartition("; ")[2]
+
+    assert words(1.0, 0.9, 0.2).endswith(" gives a yield of 90 %, sigma of overlay_x 500 nm")
+    assert words(1.0, 0.99, 0.95) == "overlay x 2 still gives a yield of 90 %, sigma of overlay_x 1 um"
+    assert words(0.7, 0.6, 0.5).endswith("no budget gives a yield of 90 %")
 
 
 def yields(*shares: float, plates: int = 100) -> list[Any]:

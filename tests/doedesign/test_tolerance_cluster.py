@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from doedesign.tolerancing.cluster import evaluate_there
 from doedesign.tolerancing.pool import DrawModel, Rows
 from doedesign.tolerancing.studies import Study, study
 from fab.draws import normal_keys
@@ -21,7 +22,6 @@ from fab.errors import InputError
 from fab.process import Variation, variation_of
 
 pytest.importorskip("distributed", reason="the cluster extra is not installed")
-pytestmark = pytest.mark.slow
 
 HERE = Path(__file__).parent
 # A test that fails must not leave processes behind: they end by themselves after this many seconds.
@@ -101,6 +101,7 @@ def right(fakes: ModuleType, asked: Study, count: int) -> dict[str, Any]:
     return json.loads(json.dumps(plates))
 
 
+@pytest.mark.slow
 def test_a_lost_worker_loses_no_plate(ask: Callable[..., Study], fakes: ModuleType, cluster: Cluster, tmp_path: Path):
     first, _ = cluster.staff(2)
     asked = ask(out=tmp_path / "out")
@@ -118,6 +119,7 @@ def test_a_lost_worker_loses_no_plate(ask: Callable[..., Study], fakes: ModuleTy
     assert sorted(kept) == sorted(normal_keys(60))
 
 
+@pytest.mark.slow
 def test_the_loss_of_the_only_worker_is_made_good_by_a_new_one(
     ask: Callable[..., Study], fakes: ModuleType, cluster: Cluster
 ):
@@ -135,6 +137,7 @@ def test_the_loss_of_the_only_worker_is_made_good_by_a_new_one(
     assert asked.journal.finished == right(fakes, asked, 30)
 
 
+@pytest.mark.slow
 def test_workers_are_set_up_and_mistakes_are_told(
     ask: Callable[..., Study], fakes: ModuleType, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ):
@@ -156,6 +159,7 @@ def test_workers_are_set_up_and_mistakes_are_told(
         ask().monte_carlo(1)
 
 
+@pytest.mark.slow
 def test_a_plate_that_kills_its_workers_is_named(
     ask: Callable[..., Study], fakes: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
@@ -170,6 +174,7 @@ def test_a_plate_that_kills_its_workers_is_named(
         strict.close()
 
 
+@pytest.mark.slow
 def test_nobody_there_is_told(ask: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr("doedesign.tolerancing.cluster._PATIENCE_S", 1.0)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9: a Dask scheduler must answer there.*dask scheduler"):
@@ -184,6 +189,21 @@ def test_nobody_there_is_told(ask: Callable[..., Study], monkeypatch: pytest.Mon
         idle.close()
 
 
+@pytest.mark.parametrize(
+    "refusal",
+    [TimeoutError("out of time"), ConnectionRefusedError("no"), ValueError("nonsense"), ImportError("ucx")],
+)
+def test_a_refusal_is_told_in_the_words_of_dask(refusal: Exception, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: Any, **__: Any) -> None:
+        raise refusal
+
+    monkeypatch.setattr("distributed.Client", refuse)
+    model: Any = None
+    with pytest.raises(InputError, match=rf'tcp://there:9: a Dask scheduler must answer there.*"{refusal}"'):
+        next(evaluate_there(model, {}, "tcp://there:9"))
+
+
+@pytest.mark.slow
 def test_without_dask_the_cure_is_told():
     script = f"""
 import sys
@@ -198,6 +218,7 @@ study(fakes.design(), process=fakes.process(), evaluate=fakes.rows, scheduler="t
     assert 'pip install "doedesign[cluster]"' in done.stderr
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_ends_keeps_what_was_finished(ask: Callable[..., Study], tmp_path: Path):
     short = Cluster(tmp_path)
     short.staff(1)

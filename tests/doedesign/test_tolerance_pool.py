@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from doedesign.tolerancing.pool import default_workers
+from doedesign.tolerancing.pool import DrawModel, default_workers
 from doedesign.tolerancing.studies import Study, study
 from fab.draws import normal_keys
 from fab.errors import InputError
@@ -288,6 +288,20 @@ def test_a_run_that_is_stopped_keeps_its_plates_and_its_workers_end(
     again.monte_carlo(20)
     assert {key: again.journal.finished[key] for key in normal_keys(20)} == {key: right[key] for key in normal_keys(20)}
     assert set(kept) <= set(again.journal.finished)
+
+
+def test_only_few_small_plates_in_memory_go_without_workers(
+    ask: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    asked: list[int] = []
+    monkeypatch.setattr("doedesign.tolerancing.studies.default_workers", lambda cells: 3)
+    monkeypatch.setattr("doedesign.tolerancing.studies.evaluate_here", lambda *given: asked.append(given[-1]))
+    model, plate = cast("DrawModel", None), variation_of(2, {})
+    for out in (None, tmp_path / "out"):
+        for count in (1, 50_000):  # plates of 64 cells
+            ask(workers=None, out=out).run(model, dict.fromkeys(normal_keys(count), plate))
+    # A study on disk has the same bytes whatever it is asked for next, so all of it comes from workers of one thread.
+    assert asked == [0, 3, 3, 3]
 
 
 def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest.MonkeyPatch):

@@ -2,20 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
 from doedesign.calibration.estimate import Calibration, calibrate
 from doedesign.calibration.explanations import Curve, Explanation, ExplanationSet, Targets
 from doedesign.calibration.plots import plot_check, plot_estimates, plot_explanations, plot_fitted_psfs
-from doedesign.report.labels import value_text
-from fab.figure import png_bytes
+from doedesign.calibration.uncertainty import left_out
+from doedesign.report.labels import error_label, value_text
+from fab.figure import SERIES, png_bytes
+from tests.doedesign.analytic_plate import SIGMA, analytic_calibration
 from tests.doedesign.calibration_fakes import light_of, photograph, plate_drawn, usual_process
-from tests.pictures import dots_of, require_place_of_axes, require_whole
-
-pytestmark = pytest.mark.slow
+from tests.pictures import dots_of, panel, require_place_of_axes, require_whole
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +29,13 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     lights = light_of(drawn, process, {"common_depth_scale": 0.03}, (6e-3, np.inf), margin=4)
     path = photograph(folder, lights, (6e-3, np.inf), exposures=(1.0,), electrons=3e6)
     return calibrate(drawn, path, process=process)
+
+
+@pytest.fixture(scope="module")
+def analytic() -> Calibration:
+    """Two errors found from two images that are known in closed form."""
+    found = analytic_calibration()
+    return replace(found, left_out=left_out(found.fit))
 
 
 def family() -> ExplanationSet:
@@ -46,6 +55,7 @@ def family() -> ExplanationSet:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plot", [plot_fitted_psfs, plot_estimates, plot_check])
 def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callable[..., Figure]):
     require_whole(plot(result))
@@ -53,6 +63,7 @@ def test_every_picture_is_whole_and_repeatable(result: Calibration, plot: Callab
     require_place_of_axes(lambda ax: plot(result, ax))
 
 
+@pytest.mark.slow
 def test_explanations_are_drawn_also_if_there_are_none():
     without = family()._replace(singles=[], pairs=[])
     for one in (family(), without):
@@ -61,6 +72,7 @@ def test_explanations_are_drawn_also_if_there_are_none():
     assert png_bytes(plot_explanations(family())) != png_bytes(plot_explanations(without))
 
 
+@pytest.mark.slow
 def test_a_difference_is_seen(result: Calibration):
     """A bright pixel that the model lacks makes a red dot."""
     at = result.fit.at
@@ -78,6 +90,40 @@ def test_a_difference_is_seen(result: Calibration):
     assert rows.max() < 0.5 * plain.shape[0]
     red, green, blue = dotted[changed].mean(axis=0)
     assert red > 2 * max(green, blue)
+
+
+def test_errors_are_drawn_in_standard_deviations_of_their_prior(analytic: Calibration):
+    drawn = panel(plot_estimates(analytic), "errors of the plate")
+    bars = [one for one in drawn.containers if isinstance(one, ErrorbarContainer)]
+    ends = np.array([bar.lines[2][0].get_segments()[0][:, 0] for bar in bars])
+    values, sigma = analytic.posterior.values, analytic.posterior.sigma
+    np.testing.assert_allclose(ends, np.array([values - sigma, values + sigma]).T / SIGMA[:, None], rtol=1e-9)
+    labels = [text.get_text() for text in drawn.get_yticklabels()]
+    assert labels == ["common depth scale", "common cd bias"]
+
+
+def test_the_fit_of_every_image_stands_beside_the_line_of_one(analytic: Calibration):
+    figure: Any = plot_check(analytic)
+    (images,) = (axes for axes in figure.axes if axes.get_xlabel() == "chi2 per pixel")
+    (line,) = images.lines
+    assert list(line.get_xdata()) == [1, 1]
+    fitted, predicted = ([bar.get_width() for bar in bars] for bars in images.containers)
+    assert fitted == [found.chi2_per_pixel for found in analytic.fit.at.matches]
+    assert predicted == analytic.left_out
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_curves_are_solid_until_their_colours_come_again(count: int):
+    found = family()
+    names = [f"{key}[{mask}]" for key in ("depth_scale", "overlay_x_m") for mask in range(4)][:count]
+    singles = [found.singles[0]._replace(values={name: 0.01}, scores={name: 1.0}) for name in names]
+    curves = dict.fromkeys(names, next(iter(found.curves.values())))
+    figure: Any = plot_explanations(found._replace(singles=singles, curves=curves))
+    *lines, measured = figure.axes[0].lines
+    assert [line.get_label() for line in lines] == list(map(error_label, names))
+    assert [line.get_linestyle() for line in lines] == (["-"] * len(SERIES) + [":"] * len(SERIES))[:count]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == count
+    assert list(measured.get_ydata()) == [found.targets.ring_to_disc] * 2
 
 
 def test_values_have_as_many_digits_as_mean_something():

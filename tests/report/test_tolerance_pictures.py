@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Rectangle
 
 from doedesign.report.labels import error_label
 from doedesign.spec import LimitSpec
@@ -18,7 +20,7 @@ from doedesign.tolerancing.sensitivity import Effect, SensitivityIndex, Variance
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
-from tests.pictures import dots_of, require_place_of_axes, require_whole
+from tests.pictures import dots_of, panel, require_place_of_axes, require_whole
 
 RGB = (Colour("656nm", (656e-9,), (1.0,)), Colour("589nm", (589e-9,), (1.0,)), Colour("486nm", (486e-9,), (1.0,)))
 CAMERA = Camera(Grid((64, 64), 1.85e-6), 116e-6, "fused_silica", RGB, 1e-3, 1.85e-6, 32)
@@ -149,14 +151,35 @@ def test_an_error_is_named_in_words():
 def test_a_yield_has_a_curve_per_place_and_a_share_is_in_per_cent():
     drawn = plot_yield(random_table(np.random.default_rng(5), LIMITS))
     assert isinstance(drawn, Figure)
-    for axes in drawn.axes:
-        if not axes.get_title():
-            continue
-        name = axes.get_title().rsplit(" at ", 1)[0]
+    panels = {axes.get_title(loc="left").rsplit(" at ", 1)[0]: axes for axes in drawn.axes}
+    assert set(panels) == {QUANTITIES[one.quantity].label for one in LIMITS}
+    for name, axes in panels.items():
         (quantity,) = [one for one in QUANTITIES.values() if one.label == name]
         places = {(one.colour, one.depth_m) for one in LIMITS if QUANTITIES[one.quantity].label == name}
         assert len([line for line in axes.lines if len(np.asarray(line.get_xdata())) > 2]) >= max(len(places), 1)
         assert axes.get_xlabel() == quantity.label + (" (%)" if quantity.share else "")
+
+
+def test_bars_of_shares_are_as_long_as_the_indices():
+    def index(value: float) -> SensitivityIndex:
+        return SensitivityIndex(value, value - 0.05, value + 0.1)
+
+    found = [
+        VarianceShare("overlay", "strehl", None, index(0.25), index(0.5)),
+        VarianceShare("overlay", "strehl", "656nm", index(0.3), index(0.7)),
+        VarianceShare("depth", "strehl", None, index(-0.01), index(0.4)),  # by chance below zero
+    ]
+    drawn: Any = plot_variance_shares(found, CAMERA)
+    axes = panel(drawn, QUANTITIES["strehl"].label)
+    rows = {text.get_text(): row for row, text in enumerate(axes.get_yticklabels())}
+    bars = [(bar.get_y() + bar.get_height() / 2, bar.get_width()) for bar in axes.patches if isinstance(bar, Rectangle)]
+    expected = [(rows[name], share) for name, share in (("overlay", 50), ("overlay", 25), ("depth", 40), ("depth", 0))]
+    np.testing.assert_allclose(bars, expected, atol=1e-9)
+    lines = [np.asarray(line.get_xdata()).tolist() for line in axes.lines]
+    np.testing.assert_allclose(np.concatenate(lines), [45, 60, 70, 35, 50])
+    # More sources take more room.
+    higher: Any = plot_variance_shares([*found, found[0]._replace(source="roughness")], CAMERA)
+    assert higher.get_figheight() > drawn.get_figheight()
 
 
 def test_a_budget_out_of_reach_says_what_the_yield_is_without_these_errors():
