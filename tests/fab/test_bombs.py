@@ -57,6 +57,12 @@ def test_an_oasis_file_that_unfolds_without_bounds_is_refused_by_the_library_s_c
         list(GdstkReader([], EDGES).oasis(path, [], most))
 
 
+def test_an_oasis_file_may_stand_for_a_hundred_million_shapes_and_no_more(tmp_path: Path):
+    # One record for 1.07e9 squares, so that a limit ten times as high refuses it too, and does not unfold it.
+    with pytest.raises(InputError, match="at most 100000000 shapes"):
+        list(GdstkReader([], EDGES).oasis(planted(tmp_path, "repeated_shapes", ".oas"), []))
+
+
 @pytest.mark.parametrize("name", ["many_cells", "repeated_shapes"])
 def test_an_altered_oasis_file_is_not_written_out(tmp_path: Path, name: str):
     with pytest.raises(InputError, match=SAYS[name]):

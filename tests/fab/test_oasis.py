@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fab.gds.oasis import write_oasis
 from fab.gds.plain import plain_cells
 from fab.gds.reader import read_gds
-from fab.gds.writer import oasis_to_gds
+from fab.gds.writer import oasis_to_gds, write_gds
 from fab.layout.geometry import Cell, Layer, Layout, Reference, Shapes
 from fab.manifest.cells import cell_entry
 from fab.units import NM
@@ -93,6 +93,16 @@ def test_both_libraries_read_the_unit(tmp_path, dbu_nm):
     layout.read(str(tmp_path / "a.oas"))
     assert layout.dbu == pytest.approx(dbu_nm / 1000, rel=1e-12)
     assert gdstk.read_oas(str(tmp_path / "a.oas")).precision == pytest.approx(dbu_nm * NM, rel=1e-12)
+
+
+def test_polygons_with_as_many_corners_are_read_in_one_piece(tmp_path):
+    # One by one they would take a hundred times as long; more of them than are looked at first.
+    triangle = np.array([[0, 0], [9, 0], [7, 5]], dtype=np.int32)
+    rects = [[3 * i, 0, 3 * i + 1, 1] for i in range(100)]
+    write_gds(tmp_path / "a.gds", Layout(NM, (Cell("TOP", {Layer(1): shapes_of(rects, [triangle])}),)))
+    (cell,) = plain_cells(tmp_path / "a.gds")
+    assert [part.shape for part in cell.polygons[Layer(1)]] == [(100, 4, 2), (1, 3, 2)]
+    assert cell.polygons[Layer(1)][0][:, 0, 0].tolist() == [rect[0] for rect in rects]
 
 
 def test_what_is_no_polygon_and_what_is_turned_is_told(tmp_path):

@@ -68,6 +68,14 @@ def test_a_request_comes_back_from_the_manifest(base):
         order_from(manifest.request, level[1:], "here")
 
 
+@pytest.mark.parametrize("length", ["pitch_m", "aperture_m"])
+def test_a_request_with_a_word_for_a_length_is_refused(base, length):
+    manifest = read_manifest(base)
+    drawn = {**manifest.request["level_map"], length: "wide"}
+    with pytest.raises(InputError, match=r"here: request: must be whole, but got ValueError: .*'wide'"):
+        order_from({**manifest.request, "level_map": drawn}, np.load(base / manifest.level_map_file), "here")
+
+
 def test_an_order_of_another_version_is_proved_as_far_as_it_can_be(order_folder):
     def older(manifest):
         return replace(manifest, conventions={"axes": "said otherwise"}, tools={**manifest.tools, "doedesign": "0.0"})

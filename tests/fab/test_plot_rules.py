@@ -9,7 +9,7 @@ from fab.levels import Levels
 from fab.plots import rules as picture
 from fab.rules.check import Rules, check
 from tests.fab.maps import level_map_from
-from tests.pictures import dots_of, require_whole
+from tests.pictures import dots_of, panel, require_whole
 
 UM = 1e-6
 SIXTEEN = Levels(16, 75e-9)
@@ -48,6 +48,18 @@ def test_every_kind_of_breach_has_its_colour():
         # In the overview, too, as large or a little smaller.
         overview, window = np.array_split(image, 2)
         assert 0.3 < dots(overview, colour) / dots(window, colour) < 1.5
+
+
+def test_a_kissing_corner_is_black_in_the_overview():
+    level = blank()
+    level[:32, :32] = level[32:, 32:] = 14
+    drawn = panel(plot(level), "mask 1")
+    black = [0x11 / 255] * 3
+    # The pixel below and left of the corner in the middle, and the ring about it.
+    image = np.asarray(drawn.images[0].get_array())
+    assert np.argwhere(np.abs(image - black).max(axis=2) < 0.01).tolist() == [[31, 31]]
+    (ring,) = drawn.collections
+    np.testing.assert_allclose(np.asarray(ring.get_edgecolor())[:, :3], [black])
 
 
 def test_one_broken_pixel_of_a_large_plate_is_ringed_in_the_overview():

@@ -110,3 +110,14 @@ def test_what_does_not_belong_in_an_oasis_file_is_told(tmp_path):
     assert not reading.winding.any()
     assert [any(word in problem for problem in again.problems) for word in ("labels", "9/0")] == [True] * 2
     assert [cell.name for cell in again.around] == ["OTHER"]
+
+
+def test_another_database_unit_is_told_and_places_are_compared_in_metres(tmp_path):
+    plane = np.array([[1, 0, 1], [0, 1, 1]], dtype=np.uint8)
+    edges = pixel_edges(Grid(plane.shape, UM))
+    shapes = Shapes(2 * rectangles(plane, edges.x, edges.y))
+    write_gds(tmp_path / "a.gds", Layout(0.5 * NM, (Cell("TOP", {Layer(1): shapes}),)))
+    again = GdstkReader(["TOP"], edges)
+    (reading,) = again.gds(tmp_path / "a.gds", {Layer(1): len(shapes)}, [])
+    assert again.problems == ["the database unit is 0.5 nm instead of 1 nm"]
+    assert np.array_equal(reading.winding, plane)

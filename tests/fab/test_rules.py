@@ -116,6 +116,36 @@ def test_words_of_64_pixels_leave_no_seam(size):
     assert found.density == pytest.approx(plane.mean())
 
 
+@pytest.mark.parametrize("outside", [bits.NONE, bits.ALL])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_erosion_keeps_the_pixels_that_begin_runs_of_any_length(axis, outside):
+    # Three words with runs of up to all of them; full rows beside others, whose pixels must not be taken for theirs.
+    plane = np.ones((192, 192), np.uint8)
+    gaps = np.random.default_rng(6).integers(0, 192, (2, 96))
+    plane[gaps[0], gaps[1]] = 0
+    plane[[0, 1, 100]] = 1
+    plane = plane if axis == 1 else np.ascontiguousarray(plane.T)
+    for length in (2, 3, 63, 64, 65, 127, 128, 129, 191, 192):
+        words = np.packbits(plane, axis=1, bitorder="little").view(np.uint64)
+        bits.erode(words, axis, length, outside)
+        beyond = [(0, length) if a == axis else (0, 0) for a in range(2)]
+        padded = np.pad(plane, beyond, constant_values=int(outside != bits.NONE))
+        runs = np.lib.stride_tricks.sliding_window_view(padded, length, axis)[:192, :192]
+        wanted = runs.min(axis=-1)
+        assert np.array_equal(np.unpackbits(words.view(np.uint8), axis=1, bitorder="little"), wanted), length
+
+
+def test_the_last_row_has_no_corners_whatever_the_array_held_before():
+    plane = np.zeros((4, 70), np.uint8)
+    plane[[1, 2, 2, 3], [5, 6, 64, 63]] = 1
+    words = bits.pack(1 - plane, 1)[0]
+    found = np.full_like(words, bits.ALL)
+    assert bits.corners(words, found) == 2
+    wanted = np.zeros((4, 128), np.uint8)
+    wanted[[1, 2], [5, 63]] = 1
+    assert np.array_equal(np.unpackbits(found.view(np.uint8), axis=1, bitorder="little"), wanted)
+
+
 def bar(width, length, size=(90, 90)):
     plane = np.zeros(size, np.uint8)
     plane[5 : 5 + length, 60 : 60 + width] = 1

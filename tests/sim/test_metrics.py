@@ -9,6 +9,7 @@ from bench.reference import make_camera, wrapped_map
 from sim.camera import Colour
 from sim.metrics import (
     MetricInputs,
+    _band_energy,
     airy_radius_m,
     disc_weights,
     encircled_energy,
@@ -109,6 +110,19 @@ def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np
     # White noise of one cell spreads as sinc² x sinc², of which the band |nu| < 1/2 holds (0.774)^2 = 0.599.
     if plate == "rough":
         assert budget.higher_orders == pytest.approx((1 - budget.reflected) * (1 - 0.599), rel=0.05)
+
+
+@pytest.mark.parametrize("prism", [-0.3, 0.0, 0.3])
+def test_the_energy_of_the_band_is_that_of_one_sum_per_cell(prism: float):
+    """Where the light of the plate's edge is a sixth of the band aslant; `prism` sends it off to one side."""
+    cells = 24
+    slope, x = 2 / 6 / cells, np.arange(cells) - (cells - 1) / 2
+    wave = np.exp(1j * np.pi * (slope * x**2 + 2 * prism * x))
+    nu = np.fft.fftfreq(cells)[:, None]
+    energy = np.sum(np.abs(np.sinc(nu - slope * x) * np.exp(-2j * np.pi * nu * x) @ wave) ** 2)
+    found = _band_energy(np.outer(wave, wave).astype(np.complex64), slope)
+    # As its docstring states.
+    assert found == pytest.approx(energy**2, rel=1e-3)
 
 
 def test_the_budget_of_a_colour_is_that_of_its_wavelengths():

@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -145,6 +147,44 @@ def test_unusual_banks_are_drawn(rng: np.random.Generator):
         require_whole(plot_encircled(bank, camera, depths[:-1], depths[-1:]))
     dark = PsfBank(np.zeros((3, 1, 8, 8), np.float32), ("656nm", "589nm", "486nm"), (1.0,), CAMERA.pixel_m)
     require_whole(plot_psfs(dark, CAMERA, (), (1.0,)))
+
+
+@pytest.mark.parametrize("name", ["mtf", "encircled"])
+def test_every_curve_and_mark_has_a_width(name: str):
+    figure: Any = plot(name)
+    panels = [axes for axes in figure.axes if axes.lines]
+    assert len(panels) == len(NEAR + FAR)
+    # Three colours of the DOE and of the lens, and the marks: one of the disc, or one far spot per colour.
+    marks = {"mtf": [0, 0, 0, 0], "encircled": [3, 3, 1, 1]}[name]
+    assert [len(axes.lines) for axes in panels] == [6 + more for more in marks]
+    drawn = [line for axes in panels for line in (*axes.lines, *axes.get_xgridlines())]
+    keys = [line for legend in figure.legends for line in legend.get_lines()]
+    assert len(keys) == 4
+    assert min(line.get_linewidth() for line in drawn + keys) > 0
+
+
+@pytest.mark.parametrize(
+    ("near", "far", "shown"), [(5, 1, (5, 1)), (3, 3, (3, 3)), (6, 0, (6, 0)), (6, 1, (3, 1)), (4, 4, (3, 3))]
+)
+def test_six_depths_are_shown_and_of_more_an_even_choice(rng: np.random.Generator, near: int, far: int, shown):
+    camera = dataclasses.replace(CAMERA, colours=RGB[:1], window=8)
+    depths = tuple(1e-3 * (1 + i) for i in range(near)), tuple(1.0 + i for i in range(far))
+    drawn: Any = plot_psfs(random_bank(rng, 8, camera, depths[0] + depths[1]), camera, *depths)
+    titles = [axes.get_title(loc="left") for axes in drawn.axes]
+    assert tuple(sum(title.startswith(f"{name}, ") for title in titles) for name in ("near", "far")) == shown
+
+
+def test_shares_of_the_light_are_told_for_each_colour_alone():
+    """Of near depths that of the window, of far ones also that of the spot; none where three colours lie together."""
+    drawn: Any = plot("psfs")
+    panels = [axes for axes in drawn.axes if axes.images and axes.get_subplotspec() is not None]
+    told = [[text.get_text() for text in axes.texts] for axes in panels]
+    assert len(told) == 4 * 4
+    of_colours, together = told[:12], told[12:]
+    assert together == [[]] * 4
+    words = [re.fullmatch(r"window [\d.]+ %(\nspot [\d.]+ %)?", text) for (text,) in of_colours]
+    assert [found is not None and bool(found[1]) for found in words] == [False, False, True, True] * 3
+    assert all(words)
 
 
 def test_labels():

@@ -272,6 +272,20 @@ def test_a_picture_that_decodes_to_gigabytes_is_refused_by_its_header(tmp_path: 
         read_picture(tmp_path / "a.exr")
 
 
+def test_more_values_are_read_from_a_file_that_is_large_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # Eight values per byte of the file: a few thousand for one of a few hundred bytes.
+    monkeypatch.setattr("sim.store._MOST_VALUES", 100)
+    write_picture(tmp_path / "a.exr", {"Y": np.zeros((50, 50), np.float32)})
+    write_picture(tmp_path / "b.exr", {"Y": np.zeros((150, 150), np.float32)})
+    small, large = (8 * (tmp_path / name).stat().st_size for name in ("a.exr", "b.exr"))
+    assert small / 8 < 50**2 < small
+    assert large < 150**2
+    channels, _ = read_picture(tmp_path / "a.exr")
+    np.testing.assert_array_equal(channels["Y"], np.zeros((50, 50)))
+    with pytest.raises(InputError, match=f"{large} values in all, but got 1 channels of 150 x 150"):
+        read_picture(tmp_path / "b.exr")
+
+
 def test_a_header_of_an_immense_picture_is_refused(tmp_path: Path):
     (tmp_path / "a.exr").write_bytes(bombs.exr_promise())
     with pytest.raises(InputError, match="whole OpenEXR picture"):

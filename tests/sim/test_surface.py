@@ -17,6 +17,7 @@ from sim.camera import Camera, Colour
 from sim.propagation.pupil import cis
 from sim.psf_bank import psf
 from sim.surface import FabricatedDoe, as_fabricated
+from sim.surface.relief import TilePlan, plan_of
 
 PITCH_M = 1.85e-6
 CELLS = 48
@@ -342,6 +343,20 @@ def test_errors_beyond_the_model_are_refused_by_name(level: np.ndarray, variatio
     with pytest.raises(InputError, match=rule) as refused:
         plate(level, variation)
     assert where in str(refused.value)
+
+
+def test_the_halo_of_unknown_errors_is_that_of_masks_off_by_less_than_a_cell():
+    """Under a derivative it is chosen before the errors are known; and such plates share one compiled program."""
+
+    def planned(overlay: float, traced: bool) -> TilePlan:
+        shifted = Variation(
+            overlay_y_m=(overlay * PITCH_M,) * 4, common_cd_bias_m=1e-8, corner_radius_m=1e-8, sidewall_rad=0.01
+        )
+        return plan_of(CAMERA, PROCESS, shifted, min(LINES_M), traced)
+
+    unknown = planned(0.0, True)
+    assert [planned(overlay, False) == unknown for overlay in (0.0, 0.5, -0.99, 1.01)] == [True, True, True, False]
+    assert planned(1.01, False).reach > unknown.reach
 
 
 def test_a_turned_mask_counts_where_it_lies(level: np.ndarray):

@@ -110,6 +110,45 @@ def test_a_wire_is_lit_as_a_cylinder():
     assert light[0, 100] == pytest.approx(0.25)
 
 
+def test_a_level_wire_is_lit_from_above_as_an_upright_one_from_the_side():
+    view = CameraView((96, 96), 12.9e-6, 50e-3)
+    plane, pixel_m = tilted_plane(view, 0.5, 0.0, 0.0), view.pixel_at_m(0.5)
+    light = {}
+    for name, at, level in (("level", plane.v, True), ("upright", plane.u, False)):
+        lamp = _Lamp(0.8, 0.0, 0.6, 0.9, 0.25) if level else _Lamp(0.0, 0.8, 0.6, 0.9, 0.25)
+        light[name] = seen(rods(at, 0.1, along_u=level), plane, 60 * pixel_m, lamp)[1]
+    np.testing.assert_allclose(light["level"], light["upright"].T, atol=2e-3)
+    # Lambert's law on a cylinder 30 pixels thick on either side, +y up; its rim aside.
+    across = (np.arange(24, 72) - 47.5) / 30
+    facing = np.maximum(0.8 * across + 0.6 * np.sqrt(1 - across**2), 0)
+    np.testing.assert_allclose(light["level"][24:72, 40], 0.9 * (0.25 + 0.75 * facing), atol=2e-3)
+
+
+def test_crossings_of_a_grid_lie_anywhere():
+    """A frame a third of a mesh high holds a level wire in one of three draws, and an upright one in all of them."""
+    small = CameraView((64, 64), 12.9e-6, 50e-3)
+    mesh_m = 192 * small.pixel_at_m(0.5)
+    fence = Fence(patterns=("grid",), depth_m=(0.5, 0.5), mesh_m=(mesh_m, mesh_m), wire_m=(1e-3, 1e-3), **PLAIN)
+    masks = [drawn_mask(fence, seed, small) for seed in range(40)]
+    assert all(mask.min(axis=0).max() > 0.9 for mask in masks)
+    # 40 throws, to three sigma.
+    assert np.mean([mask.min(axis=1).max() > 0.9 for mask in masks]) == pytest.approx(1 / 3, abs=0.22)
+
+
+def test_stains_are_no_finer_than_two_pixels():
+    """Two wires too thin for stains of their own size have the same ones."""
+    light = []
+    for share in (0.3, 0.6):
+        wire_m = share * VIEW.pixel_at_m(0.5)
+        lamp: dict[str, Any] = {"ambient": (1.0, 1.0), "light": (0.8, 0.8)}
+        fence = Fence(patterns=("bars",), depth_m=(0.5, 0.5), wire_m=(wire_m, wire_m), **lamp, **PLAIN)
+        drawn = fence.draw(np.random.default_rng(4), VIEW, GREY)
+        column = np.asarray(drawn.mask).min(axis=0).argmax()
+        light.append(np.asarray(drawn.radiance)[0, :, column])
+    np.testing.assert_allclose(light[0], light[1], rtol=1e-5)
+    assert np.ptp(light[0]) > 0.1 * light[0].mean()
+
+
 @pytest.mark.parametrize("pattern", ["chain_link", "bars", "grid"])
 def test_no_frame_falls_into_a_gap(pattern: Any):
     small = CameraView((64, 64), 12.9e-6, 50e-3)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from fab.errors import InputError
-from sim.light import srgb_from_linear
+from sim.imaging.scene import Obstruction
+from sim.light import linear_from_srgb, srgb_from_linear
 from sim.obstruction import CameraView, ReleaseDirt, ReleaseFence, ReleaseRaindrop
 
 AUTOMOTIVE = CameraView((512, 512), 3.7e-6, 8e-3)
@@ -66,6 +67,25 @@ def test_fences_have_wires_of_5_to_15_mm():
         ]
         # Meshes of 8 to 14 wires cover about 2/11 whatever the wire; frames narrower than a mesh scatter widely.
         assert 0.08 < np.mean(shares) < 0.4
+
+
+def test_the_contrast_of_a_fence_changes_about_its_mean(monkeypatch: pytest.MonkeyPatch):
+    """Display values on the wires keep their mean, and their distances from it change by one factor."""
+    mask = np.zeros((256, 256), np.float32)
+    mask[:, 100:140] = 1
+    display = np.broadcast_to(np.linspace(0.3, 0.6, 256, dtype=np.float32), (3, 256, 256))
+    plain = Obstruction(mask, linear_from_srgb(np.ascontiguousarray(display)), 0.6)
+    monkeypatch.setattr("sim.obstruction.release.Fence.draw", lambda *_: plain)
+    factors = []
+    for seed in range(8):
+        drawn = ReleaseFence().draw(np.random.default_rng(seed), DSLR, GREY[:, :256, :256])
+        before, after = (srgb_from_linear(np.asarray(one.radiance))[:, mask > 0] for one in (plain, drawn))
+        assert after.mean() == pytest.approx(before.mean(), abs=1e-4)
+        factor = after.std() / before.std()
+        np.testing.assert_allclose(after - after.mean(), factor * (before - before.mean()), atol=1e-4)
+        factors.append(float(factor))
+    assert 0.8 <= min(factors) < 0.95
+    assert 1.05 < max(factors) <= 1.2
 
 
 @pytest.mark.parametrize("kind", [ReleaseDirt, ReleaseRaindrop, ReleaseFence])
