@@ -78,8 +78,16 @@ def test_the_usual_black_level_leaves_darkness_and_its_noise_alone():
 
 @pytest.mark.parametrize(
     ("bits", "noise", "black"),
-    [(8, "physical", 4), (10, "physical", 16), (12, "physical", 64), (14, "physical", 256), (5, "physical", 0)]
-    + [(None, "physical", 1 / 64), (12, "none", 0), (12, "tseng", 0)],
+    [
+        (8, "physical", 4),
+        (10, "physical", 16),
+        (12, "physical", 64),
+        (14, "physical", 256),
+        (5, "physical", 0),
+        (None, "physical", 1 / 64),
+        (12, "none", 0),
+        (12, "tseng", 0),
+    ],
 )
 def test_the_usual_black_level_is_a_64th_where_electrons_have_noise(bits: int | None, noise: Any, black: float):
     sensor = Sensor(bits=bits, noise=noise)
