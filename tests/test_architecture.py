@@ -95,6 +95,24 @@ def test_a_class_is_named_once():
     assert {name for name, count in names.items() if count > 1} == set()
 
 
+# Those that change while they work: a tally counts, pictures are decoded when they are needed.
+GROWING = {"fab/layout/limits.py: Tally", "doedesign/capture/images.py: Pictures"}
+
+
+def test_a_dataclass_cannot_be_changed():
+    """Results are shared among caches, workers and notebooks; whoever wants another value makes another object."""
+    frozen, others = set(), set()
+    for path, tree in TREES.items():
+        for node in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+            for decorator in node.decorator_list:
+                call = decorator if isinstance(decorator, ast.Call) else ast.Call(decorator, [], [])
+                if ast.unparse(call.func).rpartition(".")[2] == "dataclass":
+                    given = {word.arg: ast.unparse(word.value) for word in call.keywords}
+                    (frozen if given.get("frozen") == "True" else others).add(f"{path}: {node.name}")
+    assert len(frozen) > 50
+    assert others == GROWING
+
+
 # Who may read or write a format: one room each. gdstk only reads, to prove what was written without it.
 IMPORTERS = {
     "OpenEXR": {"sim/store.py"},

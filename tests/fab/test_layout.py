@@ -13,6 +13,7 @@ from fab.layout.geometry import (
     Layer,
     Shapes,
     chrome_layer,
+    chrome_shapes,
     etch_layer,
     pixel_edges,
     require_name,
@@ -84,6 +85,16 @@ def test_rasters_that_cannot_be_drawn_are_refused(grid):
         pixel_edges(grid)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_edge_may_lie_on_the_last_32_bit_coordinate_and_no_further(axis):
+    last = 2_147_483_647
+    shape = [(2, 1), (1, 2)][axis]
+    edges = pixel_edges(Grid(shape, last * NM))
+    assert [edges.y, edges.x][axis].tolist() == [-last, 0, last]
+    with pytest.raises(InputError, match="the raster must fit 32-bit nanometres"):
+        pixel_edges(Grid(shape, (last + 1) * NM))
+
+
 @pytest.mark.parametrize("name", ["", "main", "MAIN", "DOE-1", "DOE 1", "Ä", "A" * 33, "doe"])
 def test_names_that_mask_shops_refuse_are_refused(name):
     with pytest.raises(InputError, match="mask name"):
@@ -125,6 +136,15 @@ def test_the_chrome_reaches_inside_the_aperture_and_past_the_corners(level_map, 
 def test_impossible_chrome_is_refused(level_map, levels, grid, chrome, rule):
     with pytest.raises(InputError, match=rule):
         mask_layout(replace(level_map, aperture_m=25 * UM), "DOE", chrome)
+
+
+def test_the_rim_of_the_chrome_may_lie_on_the_last_32_bit_coordinate_and_no_further(level_map):
+    last = 2_147_483_647
+    # One micrometre of chord error, so that few vertices are needed.
+    rim, beyond = (Chrome(outer_m=units * NM, chord_error_m=UM) for units in (last, last + 1))
+    assert chrome_shapes(level_map, NM, rim).box == (-last, -last, last, last)
+    with pytest.raises(InputError, match="chrome outer radius: must fit 32-bit coordinates"):
+        chrome_shapes(level_map, NM, beyond)
 
 
 def test_an_aperture_wider_than_the_raster_is_refused(level_map, levels, grid):

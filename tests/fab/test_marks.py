@@ -93,6 +93,80 @@ def test_boxes_have_the_same_exact_gap_on_all_sides(plates):
     assert [mark.gap_um for mark in BOXES] == [25, 10, 5, 3, 2]
 
 
+# Places in micrometres from the first of these marks, the same in the slot of every mask.
+SLOTS = {
+    "site": {
+        "box 25 um": (0, 0),
+        "box 10 um": (300, -85),
+        "box 5 um": (260, 95),
+        "box 3 um": (372, 73),
+        "box 2 um": (372, 160),
+        "finder": (100, 500),
+        "vernier x": (570, -85),
+        "vernier y": (560, 170),
+        "F": (440, 480),
+    },
+    "die": {
+        "box 5 um": (0, 0),
+        "box 3 um": (120, 0),
+        "box 2 um": (204, 0),
+        "vernier x": (62, -140),
+        "vernier y": (405, -100),
+        "F": (250, 0),
+    },
+}
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+@job
+def test_every_slot_has_its_marks_in_the_same_places(name, plates):
+    """A microscope that knows the places finds the marks of every mask."""
+    part = DRAWINGS[name](plates, NM)
+    origin = next(iter(SLOTS[name]))
+    for plate in plates[1:]:
+        x, y = part.places[f"{origin}, {plate.name}"]
+        places = {mark: part.places[f"{mark}, {plate.name}"] for mark in SLOTS[name]}
+        seen = {mark: ((at[0] - x) / UM, (at[1] - y) / UM) for mark, at in places.items()}
+        assert seen == {mark: pytest.approx(at, abs=1e-3) for mark, at in SLOTS[name].items()}
+
+
+@pytest.mark.parametrize("plates", [JOBS["deep first"], JOBS["clear field"]], ids=["dark field", "clear field"])
+def test_the_finder_is_a_cross_of_400_um_between_four_squares_with_80_um_free_around_it(plates):
+    from klayout import db
+
+    part = alignment_site(plates, NM)
+    arms, squares = db.Region(), db.Region()
+    for box in (db.Box(-200_000, -20_000, 200_000, 20_000), db.Box(-20_000, -200_000, 20_000, 200_000)):
+        arms.insert(box)
+    # Squares of 60 um, 20 um off the arms.
+    for x, y in itertools.product((-100_000, 40_000), repeat=2):
+        squares.insert(db.Box(x, y, x + 60_000, y + 60_000))
+    window = db.Region(db.Box(-280_000, -280_000, 280_000, 280_000))
+    for plate in plates[1:]:
+        wafer, drawn = (around(part, one, f"finder, {plate.name}", 290 * UM) for one in (plates[0], plate))
+        assert (wafer ^ arms).is_empty()
+        assert (drawn ^ (window - squares if plate.tone == "clear" else squares)).is_empty()
+
+
+@job
+def test_brackets_of_two_bars_of_400_um_by_60_um_stand_250_um_off_the_corners_of_the_site(plates):
+    from klayout import db
+
+    part = alignment_site(plates, NM)
+    x0, y0, x1, y1 = part.box
+    brackets = db.Region()
+    for x, inward in ((x0, 1), (x1, -1)):
+        for y, upward in ((y0, 1), (y1, -1)):
+            brackets.insert(db.Box(x, y, x + inward * 400_000, y + upward * 60_000))
+            brackets.insert(db.Box(x, y, x + inward * 60_000, y + upward * 400_000))
+    # The first mask draws them; whatever else any mask draws lies further inside.
+    drawn = {plate: region(part, *layers_of(part, plate.layer)).merged() for plate in plates}
+    assert (brackets - drawn[plates[0]]).is_empty()
+    drawn[plates[0]] -= brackets
+    inside = sum(drawn.values(), db.Region())
+    assert numbers_of(inside.bbox()) == (x0 + 250_000, y0 + 250_000, x1 - 250_000, y1 - 250_000)
+
+
 @drawing
 @job
 def test_the_operator_sees_the_wafers_marks(draw, plates):

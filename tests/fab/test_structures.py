@@ -169,6 +169,22 @@ def test_no_mask_etches_the_bars_and_pads_of_another():
     assert cells.count() == 13 * len(plates)
 
 
+def test_cells_of_the_masks_stand_in_rows_of_two_with_150_um_of_blank_glass_between_them():
+    levels, plates = job(64)
+    part = process_monitor(levels, plates, PITCH, NM, LINE)
+    places = [np.array(part.places[f"CD 1 um line, {plate.name}"]) / UM for plate in plates[:6]]
+    # A cell with its words is 2.15 mm wide and 0.876 mm high.
+    for number, place in enumerate(places):
+        right, down = number % 2, number // 2
+        assert place - places[0] == pytest.approx([2300 * right, -1026 * down], abs=1e-3)
+    # From the edge of the largest pad to the first word of the next mask in the row.
+    for one, other in zip(plates[0:6:2], plates[1:6:2], strict=True):
+        x, y = (round(v / NM) for v in part.places[f"depth pad 500 um, {one.name}"])
+        words = part.shapes[other.on(3)].rectangles
+        beside = words[np.abs(words[:, 1] - y) < 500_000]
+        assert beside[:, 0].min() - (x + 250_000) == 150_000
+
+
 @pytest.mark.parametrize("count", [2, 4, 8, 16, 32, 64])
 def test_one_scan_of_the_staircase_meets_every_level_once_in_order(count):
     levels, plates = job(count)

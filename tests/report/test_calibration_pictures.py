@@ -92,6 +92,25 @@ def test_a_difference_is_seen(result: Calibration):
     assert red > 2 * max(green, blue)
 
 
+def test_differences_have_colours_up_to_five_standard_deviations(analytic: Calibration):
+    """From there on all pixels have the colour of the scale's end."""
+    at = analytic.fit.at
+    pulls = np.zeros_like(at.matches[0].residual)
+    wanted = [-9.0, -5.0, -4.5, 0.0, 4.5, 5.0, 9.0]
+    pulls[3, : len(wanted)] = wanted
+    changed = at.matches[0]._replace(residual=pulls / np.sqrt(at.matches[0].weights))
+    at = at._replace(matches=(changed, *at.matches[1:]))
+    figure = plot_fitted_psfs(replace(analytic, fit=analytic.fit._replace(at=at)))
+    shown: Any = panel(figure, "difference").get_images()[0]
+    values = shown.get_array().data
+    np.testing.assert_allclose(values, pulls, rtol=1e-6, atol=1e-9)
+    colours = [tuple(colour) for colour in shown.to_rgba(values)[3, : len(wanted)]]
+    assert colours[0] == colours[1]
+    assert colours[-1] == colours[-2]
+    assert len(set(colours)) == 5
+    assert shown.get_clim() == (-5, 5)
+
+
 def test_errors_are_drawn_in_standard_deviations_of_their_prior(analytic: Calibration):
     drawn = panel(plot_estimates(analytic), "errors of the plate")
     bars = [one for one in drawn.containers if isinstance(one, ErrorbarContainer)]

@@ -106,6 +106,18 @@ def test_the_background_is_that_of_the_border(rng: np.random.Generator):
     assert abs(image.rate[:20].mean()) < 0.2
 
 
+@pytest.mark.parametrize(("off", "counted"), [(4, True), (5, False), (-4, True), (-5, False)])
+def test_a_border_pixel_beyond_three_spreads_is_not_of_the_background(off: int, counted: bool):
+    """Among 99, 100 and 101 the middle deviation is 1, a spread of 1.48: 4 is 2.7 spreads, and 5 is 3.4."""
+    rate = 99.0 + np.add.outer(np.arange(60), np.arange(60)) % 3
+    rate[3:-3, 3:-3] = 5000.0
+    spoilt = tuple(np.argwhere(rate == 100)[::12].T)  # 19 of the border's 684 pixels
+    rate[spoilt] += off
+    image = MeasuredPsf(rate, np.ones_like(rate), np.zeros_like(rate), np.ones(rate.shape, bool))
+    _, level = without_background(image)
+    assert level == pytest.approx(100 + (19 * off / 684 if counted else 0.0), rel=1e-12)
+
+
 @pytest.mark.parametrize(("shape", "centre"), [((240, 320), (113.0, 151.0)), ((1300, 1500), (700.0, 640.0))])
 def test_the_light_is_found(shape: tuple[int, int], centre: tuple[float, float], rng: np.random.Generator):
     image, _ = without_background(spot_image(centre, shape, rng))
