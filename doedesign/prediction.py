@@ -29,7 +29,7 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
     Raises:
         InputError: errors beyond what the model describes (`sim.surface.as_fabricated`).
     """
-    surface = as_fabricated(design.level_map.level, design.camera, process, variation)
+    surface = as_fabricated(design.level_map.level, design.camera, process, variation, depths_m=design.depths_m)
     bank = psf(surface, depths=design.depths_m)
     return Prediction(surface, bank, plate_rows(design, surface, bank))
 

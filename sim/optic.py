@@ -24,7 +24,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
-from sim.source import SeparableSource, SourceMap
+from sim.source import SeparableSource, SourceMap, ViewedSource
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
     from typing import ClassVar as AbstractVar
@@ -32,7 +32,7 @@ else:
     from equinox import AbstractVar
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
-CellSource = SourceMap | SeparableSource
+CellSource = SourceMap | SeparableSource | ViewedSource
 ON_AXIS = (0.0, 0.0)
 
 
@@ -118,7 +118,7 @@ class CellOptic(CameraOptic):
     means: AbstractVar[Complex[Array, "w y x"]]
 
     @abstractmethod
-    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
+    def cells(self, line: SpectralLine, source: CellSource) -> tuple[Array | None, Array | None]:
         """Height in metres and transmission besides it, both `[y, x]`; None where there is none."""
 
     def plan(
@@ -136,7 +136,7 @@ class CellOptic(CameraOptic):
     def rows(self, line: SpectralLine, source: CellSource) -> tuple[DoeRows, SourceColumns]:
         """The two arguments of `doe_field`."""
         rows, columns = source.over(self.camera.grid)
-        return DoeRows(self.coverage, *self.cells(line), rows), columns
+        return DoeRows(self.coverage, *self.cells(line, source), rows), columns
 
     def energy(self, line: SpectralLine, plan: FarField | DirectPath, source: CellSource) -> Float[Array, "v u"]:
         """Energy in every pixel."""
@@ -188,7 +188,7 @@ class HeightOptic(CellOptic):
             raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
         return cls(camera, jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)), height)
 
-    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
+    def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""
         return self.height_m, None if self.deviation is None else self.deviation[self.lines.index(line)]
 

@@ -12,12 +12,12 @@ k = 1 / c and direction sines s, is
 free of cancellation and small enough for single precision.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fab.grid import Grid
 from sim.camera import Camera, direction_sines, source_path_m, wrapped_waves
@@ -111,3 +111,14 @@ class SeparableSource(NamedTuple):
         y_m, x_m = (jnp.asarray(grid.axis_m(axis), jnp.float32) for axis in ("y", "x"))
         curvature, sines, waves_y, waves_x, *scales = (jnp.asarray(part) for part in self)
         return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)
+
+
+class ViewedSource(eqx.Module):
+    """A point source, and by its number how a DOE looks from there (`sim.surface.FabricatedDoe.views`)."""
+
+    path: SourceMap | SeparableSource
+    view: Int[Array, ""]
+
+    def over(self, grid: Grid) -> tuple[Any, Any]:
+        """The same as of its path."""
+        return self.path.over(grid)

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, UInt8
+from jaxtyping import Array, Complex, Float, Int, UInt8
 
 from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
@@ -31,9 +31,9 @@ Motion = Float[np.ndarray, "3"]  # of an image: shifts along y and x in pixels, 
 
 
 class VariedDoe(NamedTuple):
-    """Transmission of the cells at the probe's wavelength, and the open share of each."""
+    """Transmission of the cells at the probe's wavelength in every view, and the open share of each."""
 
-    transmission: Complex[Array, "y x"]
+    transmission: Complex[Array, "view y x"]
     coverage: Float[Array, "y x"]
 
 
@@ -60,8 +60,8 @@ class _Optic(eqx.Module):
 
 
 @eqx.filter_jit
-def _energy(optic: _Optic, plate: VariedDoe, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
-    rows = DoeRows(plate.coverage, None, plate.transmission, (optic.source_waves, optic.axis))
+def _energy(optic: _Optic, view: Int[Array, ""], plate: VariedDoe, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
+    rows = DoeRows(plate.coverage, None, plate.transmission[view], (optic.source_waves, optic.axis))
     return optic.factor * optic.plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion))
 
 
@@ -80,21 +80,24 @@ class ForwardModel:
         """The probe's."""
         return self.camera.colours[0].wavelengths_m[0]
 
-    def _surface(self, values: Any) -> tuple[VariedDoe, Grid]:
+    def _surface(self, values: Any) -> tuple[VariedDoe, tuple[Grid, tuple[int, ...]]]:
         process, variation = self.unknowns.process, self.unknowns.variation(values)
-        surface = as_fabricated(self.level, self.camera, process, variation, (self.wavelength_m,))
-        return VariedDoe(surface.transmission[0], surface.coverage), surface.grid
+        wavelength, depths = self.wavelength_m, self.depths_m
+        surface = as_fabricated(self.level, self.camera, process, variation, (wavelength,), depths_m=depths)
+        views = tuple(surface.view(wavelength, depth) for depth in depths)
+        return VariedDoe(surface.transmission, surface.coverage), (surface.grid, views)
 
     def plate(self, values: Float[np.ndarray, " p"]) -> "DoeImages":
         """The plate with some errors."""
-        return DoeImages(self, *self._surface([float(v) for v in values]))
+        plate, seen = self._surface([float(v) for v in values])
+        return DoeImages(self, plate, *seen)
 
     def plate_and_vjp(
         self, values: Float[np.ndarray, " p"]
     ) -> tuple["DoeImages", Callable[[VariedDoe], Float[np.ndarray, " p"]]]:
         """The plate, and the function that turns a gradient with respect to it into one with respect to the errors."""
-        plate, pull, grid = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
-        return DoeImages(self, plate, grid), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
+        plate, pull, seen = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
+        return DoeImages(self, plate, *seen), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
 
     def optic(self, index: int, grid: Grid) -> _Optic:
         """Plan and source of an image for a plate of some cells; made once."""
@@ -121,15 +124,16 @@ class DoeImages:
     model: ForwardModel
     plate: VariedDoe
     grid: Grid
+    views: tuple[int, ...]  # which of the plate's transmissions every image sees
 
     def image(self, index: int, motion: Motion) -> Image:
         """Energy in every pixel of an image, per unit power on the clear aperture, Fresnel loss included."""
-        optic = self.model.optic(index, self.grid)
-        return np.asarray(_energy(optic, self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
+        optic, view = self.model.optic(index, self.grid), jnp.int32(self.views[index])
+        return np.asarray(_energy(optic, view, self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
 
     def image_and_vjp(self, index: int, motion: Motion) -> tuple[Image, Callable[[Image], tuple[VariedDoe, Motion]]]:
         """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
-        energy = partial(_energy, self.model.optic(index, self.grid))
+        energy = partial(_energy, self.model.optic(index, self.grid), jnp.int32(self.views[index]))
         image, pull = jax.vjp(energy, self.plate, jnp.asarray(motion, jnp.float32))
 
         def back(gradient: Image) -> tuple[VariedDoe, Motion]:
@@ -140,6 +144,6 @@ class DoeImages:
 
     def zeroth_order(self) -> float:
         """Share of the light that passes as if the plate were flat."""
-        light = np.asarray(jnp.sum(self.plate.transmission * self.plate.coverage, axis=1), np.complex128).sum()
+        light = np.asarray(jnp.sum(self.plate.transmission[0] * self.plate.coverage, axis=1), np.complex128).sum()
         mean = complex(light) / (np.pi * (self.model.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
         return float(abs(mean) ** 2)

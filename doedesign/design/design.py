@@ -1,6 +1,6 @@
 """Design: a DOE as it is drawn, with the camera it is for."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,17 +138,23 @@ class Design:
         seed: int | None = None,
         draw: str = "normal/0",
         variation: "Variation | str | Path | None" = None,
+        depths: "str | float | Sequence[str | float] | None" = None,
     ) -> "FabricatedDoe":
         """Predict the DOE that a process (see `process`) makes of this design; see `plate_errors` for the others.
+
+        `depths` are the nearest and the farthest of the sources that it will be looked at from, in metres or with a
+        unit; those of the spec by default.
 
         Raises:
             InputError: a process that cannot be used, or errors beyond the model (`sim.surface.as_fabricated`).
         """
+        from sim.psf_bank import depths_from
         from sim.surface import as_fabricated
 
         made_by = self.process(process)
         errors, _ = self.plate_errors(made_by, variation, seed, draw)
-        return as_fabricated(self.level_map.level, self.camera, made_by, errors)
+        depths_m = self.depths_m if depths is None else depths_from(depths)
+        return as_fabricated(self.level_map.level, self.camera, made_by, errors, depths_m=depths_m)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the level map; on `ax`, or on a new figure. Returns what it drew on."""

@@ -132,14 +132,15 @@ def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, A
     if variation.nominal:
         expected = predict(design, process, variation)
         return expected.rows, expected
-    surface = as_fabricated(design.level_map.level, camera, process, variation)
+    surface = as_fabricated(design.level_map.level, camera, process, variation, depths_m=design.depths_m)
     bank, grid = psf(surface, depths=design.depths_m), surface.grid
     nominal = as_drawn(camera, design.level_map)
     # On the raster of the other, whose propagation is compiled already.
     parts = grid.shape[0] // nominal.grid.shape[0]
-    field = in_parts(nominal.transmission, parts)
+    field = in_parts(nominal.means, parts)
+    seen = field[np.array([surface.wavelengths_m.index(view.wavelength_m) for view in surface.views])]
     coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
-    alike = FabricatedDoe(surface.camera, coverage, field, field, nominal.wavelengths_m)
+    alike = FabricatedDoe(surface.camera, coverage, seen, surface.views, field, nominal.wavelengths_m)
     with ThreadPoolExecutor(1) as beside:
         rows = beside.submit(plate_rows, design, surface, bank)
         rows_as_drawn = plate_rows(design, alike, psf(alike, depths=design.depths_m))

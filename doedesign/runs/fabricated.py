@@ -90,7 +90,7 @@ def fabricated(
 
 def _computed(design: Design, process: Process, errors: Variation) -> FabricatedPsfs:
     camera, level = design.camera, design.level_map.level
-    surface = as_fabricated(level, camera, process, errors)
+    surface = as_fabricated(level, camera, process, errors, depths_m=design.depths_m)
     splits: dict[tuple[int, int], SplitPsf] = {}
     with meter("PSFs", len(design.depths_m) * len(camera.colours)) as progress:
         for d, depth in enumerate(design.depths_m):

@@ -1,6 +1,7 @@
 """Pupil -> pixel energies.
 
 pupil       the field behind the DOE, row block by row block
+oblique     wave numbers of light to the pixels and from near sources
 pixel       integration of a sampled intensity over square sensor pixels
 farfield    the default path (eqs. 7-9 of the paper)
 hankel      the same for rotationally symmetric pupils

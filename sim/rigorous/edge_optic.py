@@ -17,7 +17,7 @@ between TE and TM, which is left out, is 0.1 % of a PSF at most.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -32,6 +32,7 @@ from sim.aperture import circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.material import refractive_index
 from sim.optic import ON_AXIS, CellOptic, CellSource
+from sim.propagation.oblique import oblique_waves
 from sim.propagation.pupil import cis
 from sim.rigorous.edge_widths import edge_widths
 from sim.source import SourceMap
@@ -70,7 +71,7 @@ class EdgeOptic(CellOptic):
         """The transmission: weights of a line sum to its light."""
         return self.transmission
 
-    def cells(self, line: SpectralLine) -> tuple[None, Array]:
+    def cells(self, line: SpectralLine, source: CellSource) -> tuple[None, Array]:
         """Transmission at one wavelength."""
         return None, self.transmission[self.wavelengths_m.index(line.wavelength_m)]
 
@@ -133,33 +134,6 @@ def with_edges(
         found.append(_transmission(height, rate, *table, *weights, camera.grid.pitch_m))
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     return EdgeOptic(camera, coverage, jnp.stack(found), wavelengths, (min(depths_m), max(depths_m)))
-
-
-class ObliqueWaves(NamedTuple):
-    """Highest wave numbers of light, waves per DOE cell.
-
-    Attributes:
-        seen: of light to a pixel on the window's edge.
-        low: of the light of the farthest source on a cell on the aperture's rim, toward the rim.
-        high: the same of the nearest.
-    """
-
-    seen: float
-    low: float
-    high: float
-
-    def over(self, parts: int) -> "ObliqueWaves":
-        """The same in waves per part of a cell."""
-        return ObliqueWaves(self.seen / parts, self.low / parts, self.high / parts)
-
-
-def oblique_waves(camera: Camera, wavelength_m: float, depths_m: Sequence[float]) -> ObliqueWaves:
-    """Wave numbers of sources at some depths and of the window."""
-    seen = (camera.window / 2 + 1) * camera.pixel_m / camera.sensor_distance_m
-    defocus = 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
-    lit = [camera.aperture_m / 2 * (1 / depth_m + defocus) for depth_m in depths_m]
-    cells = camera.grid.pitch_m / wavelength_m
-    return ObliqueWaves(seen * cells, min(lit) * cells, max(lit) * cells)
 
 
 @lru_cache(maxsize=64)

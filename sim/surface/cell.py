@@ -5,24 +5,25 @@ along a few lines, the same ones in all cells of a small tile (`Cuts`). Between 
 depth of every piece of every cell is one matrix product of the masks' states with what each etch takes away
 (`piece_depths`), and its light needs one exponential.
 
-A lens does not see the pieces. It sees how much light a cell passes and, to its first and second moments, from where
-within the cell: exp(-2 pi i u x) over a cell is a short series of Legendre polynomials, sum (2q+1) (-i)^q j_q(pi u)
-P_q(2x), and of the plane waves that reach the sensor at most half a turn fits into a cell. The cell's mean alone is off
-by 15 % in the PSF of a plate with 0.5 um of overlay; with the moments up to second order it is 0.3 %. `moment_filter`
-turns moments into values of the neighbouring cells that have the same far field, so that the transform of one number
-per cell stays what it was.
+A lens does not see the pieces. It sees how much light a cell passes and, to its first three moments, from where within
+the cell: exp(-2 pi i u x) over a cell is a short series of Legendre polynomials, sum (2q+1) (-i)^q j_q(pi u) P_q(2x),
+and of the plane waves that reach the sensor little more than half a turn fits into a cell. The cell's mean alone is off
+by 15 % in the PSF of a plate with 0.5 um of overlay. `moment_weights` turns moments into values of the neighbouring
+cells that have the same far field, so that the transform of one number per cell stays what it was.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 from scipy.special import spherical_jn
 
-# Moments kept: degree along y and along x, up to a total of two.
-DEGREES = ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
-FILTER_REACH = 10  # cells to either side
+DEGREE = 3  # of the highest moments
+# Moments kept: degree along y and along x.
+DEGREES = tuple((y, x) for y in range(DEGREE + 1) for x in range(DEGREE + 1 - y))
+REACH = 14  # cells to either side of a moment's own
+_RIDGE = 1e-8  # keeps weights small where the band leaves them free
 
 
 class Cuts(NamedTuple):
@@ -75,22 +76,24 @@ def whole_cell(masks: int) -> Cuts:
 
 
 def axis_moments(edges: Float[Array, " edge"], parts: int) -> Float[Array, "part degree edge-1"]:
-    """Integral of the Legendre polynomials P0, P1, P2 over every segment, for each of `parts` equal parts of the cell.
+    """Integral of the Legendre polynomials P0 to P3 over every segment, for each of `parts` equal parts of the cell.
 
-    Over its own part a whole cell gives (1, 0, 0).
+    Over its own part a whole cell gives (1, 0, 0, 0).
     """
     start = jnp.arange(parts)[:, None] / parts
     x = jnp.clip((edges[None, :] - start) * parts, 0.0, 1.0)
-    powers = jnp.stack([x, x * (x - 1), x * (x - 1) * (2 * x - 1)], axis=1)
+    odd = x * (x - 1)
+    powers = jnp.stack([x, odd, odd * (2 * x - 1), odd * (5 * odd + 1)], axis=1)
     return jnp.diff(powers, axis=-1)
 
 
 def axis_values(points: Float[Array, " point"], parts: int) -> Float[Array, "part degree point"]:
-    """Legendre polynomials P0, P1, P2 at points of the cell, times the parts per length; zero outside each part."""
+    """Legendre polynomials P0 to P3 at points of the cell, times the parts per length; zero outside each part."""
     start = jnp.arange(parts)[:, None] / parts
     x = (points[None, :] - start) * parts
     inside = (x >= 0) & ((x < 1) | ((x <= 1) & (start + 1 / parts >= 1)))
-    values = jnp.stack([jnp.ones_like(x), 2 * x - 1, 6 * x * x - 6 * x + 1], axis=1)
+    z = 2 * x - 1
+    values = jnp.stack([jnp.ones_like(x), z, (3 * z * z - 1) / 2, z * (5 * z * z - 3) / 2], axis=1)
     return parts * jnp.where(inside[:, None, :], values, 0.0)
 
 
@@ -109,18 +112,26 @@ def point_moments(at_y: Float[Array, "part degree q"], at_x: Float[Array, "part 
     return jnp.stack(rows, axis=2).reshape(-1, at_y.shape[-1])
 
 
-def moment_filter(degree: int, band: float) -> Float[np.ndarray, " tap"]:
-    """Weights on the cells -10 ... 10 from a moment's own whose far field is that of the moment of degree 1 or 2.
+def moment_weights(
+    low: Float[np.ndarray, " band"], high: Float[np.ndarray, " band"], slope: float = 0.0
+) -> Complex[np.ndarray, "band higher tap"]:
+    """Weights on the cells -14 ... 14 from a moment's own whose far field is that of the moment of degree 1, 2 or 3.
 
-    Least squares for (2q+1) (-i)^q j_q(pi u) / j_0(pi u) up to `band` waves per cell, below 1/2. The weights are real,
-    odd or even like their degree, and have no effect on the axis, so that they leave the mean of a plate alone.
+    A cell's far field is sinc(u). The sum of weights times exp(-2 pi i u k) sinc(u) is fitted by least squares to
+    (2q+1) (-i)^q j_q(pi u), the far field of moment q, for wave numbers u from `low` to `high`, waves per cell: those
+    of light to a pixel less that of the light on the cell. Any band narrower than 1 can be fitted, wherever it lies.
+    `slope` is how much more obliquely each cell is lit than the one before, waves per cell.
+
+    The weights have no effect on the axis, so that they leave the mean of a plate alone; they are real for a band that
+    is symmetric about it.
     """
-    u = np.linspace(0, band, 400)
-    target = (2 * degree + 1) * spherical_jn(degree, np.pi * u) / spherical_jn(0, np.pi * u)
-    angle = 2 * np.pi * u[:, None] * np.arange(1, FILTER_REACH + 1)
-    if degree == 1:
-        # sum w_m exp(-2 pi i u m) of odd weights is -2 i sum w_m sin.
-        half = np.linalg.lstsq(2 * np.sin(angle), target, rcond=None)[0]
-        return np.concatenate([-half[::-1], [0.0], half])
-    half = np.linalg.lstsq(2 * np.cos(angle) - 2, -target, rcond=None)[0]
-    return np.concatenate([half[::-1], [-2 * half.sum()], half])
+    waves = (low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 200))[:, :, None]  # [band, node, place]
+    places = np.arange(-REACH, REACH + 1)
+    seen = np.exp(-2j * np.pi * waves * places + 1j * np.pi * slope * places**2) * np.sinc(waves - slope * places)
+    degrees = np.arange(1, DEGREE + 1)
+    wanted = (2 * degrees + 1) * (-1j) ** degrees * spherical_jn(degrees, np.pi * waves)
+    turned = seen.conj().swapaxes(1, 2) / waves.shape[1]
+    # As good as exact on the axis, and then exact.
+    matrix = turned @ seen + 1e3 * np.ones((len(places), len(places))) + _RIDGE * np.eye(len(places))
+    weights = np.linalg.solve(matrix, turned @ wanted).swapaxes(1, 2)
+    return weights - weights.mean(axis=2, keepdims=True)

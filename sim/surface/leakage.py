@@ -54,9 +54,15 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
     they fit (`SplitPsf.excess`) is a check, not an assumption.
     """
     chosen = np.array([doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m])
-    whole = doe.transmission[chosen]
+    seen = [doe.view(wavelength, depth_m) for wavelength in colour.wavelengths_m]
+    whole = doe.transmission[np.array(seen)]
     even = jnp.broadcast_to(jnp.asarray(mean_transmission(doe)[chosen], jnp.complex64)[:, None, None], whole.shape)
     one = replace(doe, camera=replace(doe.camera, colours=(colour,)))
-    other = {"means": doe.means[chosen], "wavelengths_m": colour.wavelengths_m, "height_m": None}
+    other = {
+        "views": tuple(doe.views[k] for k in seen),
+        "means": doe.means[chosen],
+        "wavelengths_m": colour.wavelengths_m,
+        "height_m": None,
+    }
     parts = (replace(one, transmission=part, **other) for part in (even, whole - even))
     return SplitPsf(*(psf(part, depths=depth_m).energy[0, 0] for part in (one, *parts)))

@@ -3,7 +3,9 @@
 # Abstract fields become fields, or properties, of subclasses.
 # pyright: reportIncompatibleVariableOverride=false
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,9 +18,10 @@ from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
-from sim.optic import CellOptic, height_transmission
-from sim.source import SourceMap
-from sim.surface.relief import plan_of, relief_of, require_possible
+from sim.optic import ON_AXIS, CellOptic, height_transmission
+from sim.source import SourceMap, ViewedSource
+from sim.surface.pieces import TILE
+from sim.surface.relief import View, plan_of, relief_of, require_possible, view_weights
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 from sim.tracing import is_traced, single
@@ -31,8 +34,10 @@ class FabricatedDoe(CellOptic):
         camera: lens, sensor and substrate. Its grid is that of the cells here: those of the DOE, or a whole number of
             parts of them where the sensor sees waves too oblique for moments.
         coverage: `[y, x]` open share of every cell.
-        transmission: `[wavelength, y, x]` transmission of every cell without the chrome; its far field is the DOE's
-            within `sim.surface.cell`'s accuracy.
+        transmission: `[view, y, x]` transmission of every cell without the chrome; its far field is the DOE's within
+            `sim.surface.cell`'s accuracy.
+        views: wavelength and depths of sources for which each transmission holds. Several for a wavelength whose light
+            on a near and on a far source's way takes too wide a band.
         means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other DOEs.
         wavelengths_m: vacuum wavelengths.
         height_m: `[y, x]` height of every cell of a DOE exactly as drawn, whose PSFs are those of its height map, bit
@@ -41,7 +46,8 @@ class FabricatedDoe(CellOptic):
 
     camera: Camera = eqx.field(static=True)
     coverage: Float[Array, "y x"]
-    transmission: Complex[Array, "w y x"]
+    transmission: Complex[Array, "view y x"]
+    views: tuple[View, ...] = eqx.field(static=True)
     means: Complex[Array, "w y x"]
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
     height_m: Float[Array, "y x"] | None = None
@@ -52,13 +58,36 @@ class FabricatedDoe(CellOptic):
         """The cells."""
         return self.camera.grid
 
-    def at(self, wavelength_m: float) -> Complex[Array, "y x"]:
-        """Transmission at one of the wavelengths."""
-        return self.transmission[self.wavelengths_m.index(wavelength_m)]
+    def view(self, wavelength_m: float, depth_m: float = np.inf) -> int:
+        """Which of the views holds for a wavelength and a source depth; a ValueError if none does."""
+        own = [(k, view) for k, view in enumerate(self.views) if view.wavelength_m == wavelength_m]
+        for k, view in own:
+            if view.nearest_m * (1 - 1e-6) <= depth_m <= view.farthest_m * (1 + 1e-6):
+                return k
+        if not own:
+            raise ValueError(f"`wavelength_m` must be one of {self.wavelengths_m}, but got {wavelength_m}")
+        nearest, farthest = min(view.nearest_m for _, view in own), max(view.farthest_m for _, view in own)
+        rule = f"`depth_m` must lie within {nearest:g} to {farthest:g} m, the `depths_m` given to `as_fabricated`"
+        raise ValueError(f"{rule}, but got {depth_m:g}")
 
-    def cells(self, line: SpectralLine) -> tuple[Array | None, Array | None]:
-        """Heights as drawn, or transmission."""
-        return (None, self.at(line.wavelength_m)) if self.height_m is None else (self.height_m, None)
+    def at(self, wavelength_m: float, depth_m: float = np.inf) -> Complex[Array, "y x"]:
+        """Transmission at one of the wavelengths for a source depth; a ValueError if it was not prepared for it."""
+        return self.transmission[self.view(wavelength_m, depth_m)]
+
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> ViewedSource:
+        """The path to every cell and the view from there; a ValueError for a depth that was not prepared for."""
+        view = jnp.int32(self.view(line.wavelength_m, depth_m))
+        return ViewedSource(self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad), view)
+
+    def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
+        """Heights as drawn, or transmission in the source's view."""
+        return (None, self.transmission[source.view]) if self.height_m is None else (self.height_m, None)
+
+    def with_camera(self, camera: Camera) -> "CellOptic":
+        """The same DOE before another lens or sensor; a ValueError if its cells were prepared for one."""
+        if any(view.nearest_m > 0 for view in self.views):
+            raise ValueError("`camera` must be given to `as_fabricated`, which prepares cells for lens and window")
+        return super().with_camera(camera)
 
 
 def as_fabricated(
@@ -67,15 +96,19 @@ def as_fabricated(
     process: Process,
     variation: Variation,
     wavelengths_m: tuple[float, ...] | None = None,
+    *,
+    depths_m: Sequence[float] = (np.inf,),
 ) -> FabricatedDoe:
     """Predict the plate that the masks of a level map and a process with given errors make.
 
     Args:
         level_map: `[y, x]` level numbers, the top level where the glass stays blank (`fab.level_map.LevelMap.level`).
-        camera: DOE grid, clear aperture and material; the sensor says how oblique the light is that matters.
+        camera: DOE grid, clear aperture and material; lens and sensor say how oblique the light is that matters.
         process: depths of the etches and where on the wafer the DOE lies.
         variation: the errors; `Variation()` gives the nominal plate bit for bit.
         wavelengths_m: vacuum wavelengths; all lines of the camera by default.
+        depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between. They say
+            how obliquely cells are lit, which matters where edges moved within them.
 
     Returns:
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.
@@ -93,10 +126,11 @@ def as_fabricated(
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return FabricatedDoe(camera, coverage, flat, flat, lines, height)
+        views = tuple(View(wavelength, 0.0, np.inf) for wavelength in lines)
+        return FabricatedDoe(camera, coverage, flat, views, flat, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
-    plan = plan_of(camera, process, variation, min(lines), traced)
+    plan, views = plan_of(camera, process, variation, lines, (min(depths_m), max(depths_m)), traced)
     etched = planes(level_map, levels)
     for particle in variation.particles:
         _keep_off(etched, particle, camera.grid)
@@ -113,11 +147,12 @@ def as_fabricated(
         rest = 1.0 - cell_share(variation.correlation_m / camera.grid.pitch_m)
         variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
         left = (jnp if traced else np).exp(single(-0.5 * variance))
-    transmission, means = transmission_of(packed, widths, relief, rates, left, plan)
+    weights = view_weights(camera, plan.parts, views, TILE)
+    transmission, means = transmission_of(packed, widths, relief, rates, left, weights, plan)
     (ny, nx), parts = camera.grid.shape, plan.parts
     grid = camera.grid if parts == 1 else Grid((ny * parts, nx * parts), camera.grid.pitch_m / parts)
     coverage = _coverage(grid, camera, variation, traced)
-    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, means, lines)
+    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
 
 
 def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: Grid) -> None:

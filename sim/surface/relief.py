@@ -1,18 +1,23 @@
 """A process and its errors as the numbers that all tiles of a plate share."""
 
+import itertools
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.interpolate import make_interp_spline
 
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
+from sim.propagation.oblique import ObliqueWaves, oblique_waves
+from sim.surface.cell import REACH, moment_weights
 from sim.tracing import single, stacked
 
 SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
@@ -20,7 +25,10 @@ jax.tree_util.register_dataclass(
     Variation, data_fields=[f.name for f in fields(Variation) if f.name not in SETTINGS], meta_fields=list(SETTINGS)
 )
 
-_BAND = 0.46  # waves per cell up to which second moments and their filters do
+# Widest band of wave numbers, in waves per cell, that the weights of moments serve; the widest that the window alone
+# may take, so that some is left for sources at different depths; and the highest wave number for which moments do.
+_WIDEST, _WIDEST_SEEN, _HIGHEST = 0.965, 0.93, 0.7
+_NODES = 65  # from rim to rim, for which weights are fitted
 
 
 class EtchParameters(NamedTuple):
@@ -48,7 +56,7 @@ class TilePlan(NamedTuple):
     die_m: tuple[float, float]
     parts: int
     reach: int
-    band: float
+    views: tuple[int, ...]  # wavelength of every view
     cut: bool
     corners: bool
     walls: bool
@@ -64,8 +72,27 @@ def effective_bias(relief: EtchParameters) -> Float[Array, " mask"]:
 _MOST, _USUAL_REACH = 8, 3
 
 
-def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: float, traced: bool) -> TilePlan:
-    """Plan the terms that these errors need; all of them, where the errors are not known yet (`traced`)."""
+class View(NamedTuple):
+    """One wavelength and a range of depths, metres, from which a plate looks like certain values of its cells."""
+
+    wavelength_m: float
+    nearest_m: float
+    farthest_m: float
+
+
+def plan_of(
+    camera: Camera,
+    process: Process,
+    variation: Variation,
+    wavelengths_m: tuple[float, ...],
+    depths_m: tuple[float, float],
+    traced: bool,
+) -> tuple[TilePlan, tuple[View, ...]]:
+    """Plan the terms that these errors need, all of them where the errors are not known yet (`traced`), and the views.
+
+    A near source lights cells obliquely. Where near and far sources together take too wide a band of wave numbers, the
+    depths (the nearest and the farthest) are parted.
+    """
     grid = camera.grid
     reach = _USUAL_REACH
     cut = corners = walls = True
@@ -79,12 +106,58 @@ def plan_of(camera: Camera, process: Process, variation: Variation, shortest_m: 
         if reach > _MOST + 2:
             rule = f"masks may lie off by at most {_MOST} cells, {format_length(_MOST * grid.pitch_m)}"
             raise InputError("variation.overlay", rule, format_length(float(shifts.max())), "Align better.")
-    # Highest wave number on the sensor, in waves per DOE cell, with a margin for its last pixels.
-    needed = (camera.window / 2 + 1) * camera.pixel_m * grid.pitch_m / (shortest_m * camera.sensor_distance_m)
-    parts = int(np.ceil(needed / _BAND - 1e-9)) if cut else 1
-    return TilePlan(
-        grid, process.masks, process.die_m, parts, reach, min(needed / parts, _BAND), cut, corners, walls
-    )  # fmt: skip
+    oblique = [oblique_waves(camera, wavelength, depths_m) for wavelength in wavelengths_m]
+    widest = max(2 * waves.seen / _WIDEST_SEEN for waves in oblique)
+    highest = max((waves.seen + max(-waves.low, waves.high, 0)) / _HIGHEST for waves in oblique)
+    # Light so oblique that halves of cells do not do is next to none: their sinc has fallen to a tenth.
+    parts = max(1, int(np.ceil(max(widest, min(highest, 2.0)) - 1e-9)))
+    # Plates whose edges did not move have the same views, so that all share their compiled programs.
+    views = tuple(
+        view
+        for wavelength, waves in zip(wavelengths_m, oblique, strict=True)
+        for view in _views(wavelength, waves.over(parts), depths_m)
+    )
+    numbers = tuple(wavelengths_m.index(view.wavelength_m) for view in views)
+    parts = parts if cut else 1
+    return TilePlan(grid, process.masks, process.die_m, parts, reach, numbers, cut, corners, walls), views
+
+
+def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, float]) -> list[View]:
+    """As many views as are needed, equally wide, the farthest first."""
+    count = max(1, int(np.ceil((waves.high - waves.low) / (_WIDEST - 2 * waves.seen) - 1e-9)))
+    nearest, farthest = depths_m
+    with np.errstate(divide="ignore"):  # of infinity
+        bounds = 1 / np.linspace(1 / farthest, 1 / nearest, count + 1)
+    bounds[[0, -1]] = farthest, nearest
+    return [View(wavelength_m, float(near), float(far)) for far, near in itertools.pairwise(bounds)]
+
+
+@lru_cache(maxsize=8)  # every draw of a study needs the same
+def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int) -> Float[np.ndarray, "..."]:
+    """Light that moments of a row of tiles add to cells: `[tile, view, 1 or 2, degree, cell, cell + 2 reach]`.
+
+    The same along both axes. A tile is `tile` DOE cells wide, each divided into `parts` along either axis. The third
+    axis holds real and imaginary parts, if there are any.
+    """
+    grid, size = camera.grid, tile * parts
+    count, radius = -(-grid.shape[0] // tile), camera.aperture_m / 2 / grid.pitch_m * parts
+    place = (np.arange(count * size) - (grid.shape[0] * parts - 1) / 2) / radius
+    nodes = np.linspace(-1, 1, _NODES)
+    found = []
+    for view in views:
+        waves = oblique_waves(camera, view.wavelength_m, (view.nearest_m, view.farthest_m)).over(parts)
+        lit = nodes * waves.low, nodes * waves.high
+        slope = (waves.low + waves.high) / 2 / radius
+        weights = moment_weights(-waves.seen - np.maximum(*lit), waves.seen - np.minimum(*lit), slope)
+        between = make_interp_spline(nodes, weights, k=1)
+        found.append(between(np.clip(place, -1, 1)))
+    weights = np.moveaxis(np.stack(found).reshape(len(views), count, size, *found[0].shape[1:]), 0, 1)
+    spread = np.zeros((count, len(views), weights.shape[3], size, size + 2 * REACH), complex)
+    for cell in range(size):
+        spread[..., cell, cell : cell + 2 * REACH + 1] = weights[:, :, cell]
+    real, imaginary = np.real(spread), np.imag(spread)
+    kinds = [real] if np.abs(imaginary).max() < 1e-6 else [real, imaginary]
+    return np.stack(kinds, 2).astype(np.float32)
 
 
 def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.ndarray:

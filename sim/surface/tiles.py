@@ -1,13 +1,12 @@
-"""The transmission of a whole plate, tile by tile: moments of every cell, and their filters across cells."""
+"""The transmission of a whole plate, tile by tile: moments of every cell, and what they add to the cells around."""
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float, UInt8
 
-from sim.surface.cell import DEGREES, FILTER_REACH, axis_moments, cuts, moment_filter, plane_moments, whole_cell
+from sim.surface.cell import DEGREE, DEGREES, REACH, axis_moments, cuts, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
@@ -20,12 +19,14 @@ def transmission_of(
     relief: EtchParameters,
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
+    weights: Float[Array, "tile view part higher s wide"],
     plan: TilePlan,
-) -> tuple[Complex[Array, "w v u"], Complex[Array, "w v u"]]:
-    """Transmission of every cell, tile by tile: with the far field of the whole plate within the band, and its mean.
+) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+    """Transmission of every cell, tile by tile: with the far field of the whole plate in every view, and its mean.
 
-    `left` is the amplitude that roughness finer than a cell leaves of each wavelength.
+    `left` is the amplitude that roughness finer than a cell leaves of each wavelength, `weights` are `view_weights`.
     """
+    reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
     missing = count_y * TILE - ny, count_x * TILE - nx
@@ -35,7 +36,7 @@ def transmission_of(
     widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))
     rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after) for after in missing])
 
-    def tile(start_y: Array, start_x: Array) -> Array:
+    def tile(start_y: Array, along_y: Array, start_x: Array, along_x: Array) -> tuple[Array, Array]:
         side = TILE + 2 * plan.reach + 1
         bits = jax.lax.dynamic_slice(etched, (start_y, start_x), (side, side))
         masks = (bits[None] >> jnp.arange(plan.masks, dtype=jnp.uint8)[:, None, None]) & 1
@@ -45,17 +46,21 @@ def transmission_of(
             lost = relief.lag * relief.depth_m[:, None, None] / (jnp.maximum(width, 1.0) * plan.grid.pitch_m)
             states = states * jnp.clip(1.0 - lost, 0.0, 1.0)
         bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
-        return _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
+        moments = _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
+        return _tile_values(moments * left[:, None, None], along_y, along_x, plan)
 
-    def strip(start_y: Array) -> tuple[Array, Array]:
-        starts = jnp.arange(count_x) * TILE
-        moments = jax.lax.map(jax.checkpoint(lambda start_x: tile(start_y, start_x)), starts)
-        return _strip_values(moments * left[:, None, None], plan)
+    def strip(start_y: Array, along_y: Array) -> tuple[Array, Array]:
+        each = jnp.arange(count_x) * TILE, weights
+        values = jax.checkpoint(lambda at: tile(start_y, along_y, *at))
+        found, means = jax.lax.map(values, each)
+        return _joined(found, 4, reach), _joined(means, 4, 0)
 
-    strips, means = jax.lax.map(strip, jnp.arange(count_y) * TILE)
-    means = jnp.moveaxis(means, 0, 1).reshape(rates.shape[0], -1, means.shape[3])
+    strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights))
     inside = (slice(None), slice(ny * plan.parts), slice(nx * plan.parts))
-    return _joined(strips)[inside], means[inside]
+    transmission, means = (
+        jax.lax.complex(part[:, 0], part[:, 1])[inside] for part in (_joined(strips, 3, reach), _joined(means, 3, 0))
+    )
+    return transmission, means
 
 
 def _tile_moments(
@@ -104,49 +109,60 @@ def _tile_moments(
     return moments.reshape(*moments.shape[:3], tile, tile)
 
 
-def _strip_values(
-    moments: Float[Array, "tile moment 2 w t t"], plan: TilePlan
-) -> tuple[Complex[Array, "w v u"], Complex[Array, "w y u"]]:
-    """One row of tiles as values of its cells, with what spills to `FILTER_REACH` cells above and below; and means."""
-    count, _, _, lines = moments.shape[:4]
-    parts, reach = plan.parts, FILTER_REACH
-    moments = moments.reshape(count, parts, parts, len(DEGREES), 2, lines, TILE, TILE)
-    # [degree, 2, w, (row, part), (tile, column, part)]
-    moments = jnp.transpose(moments, (3, 4, 5, 6, 1, 0, 7, 2))
-    values = moments.reshape(len(DEGREES), 2, lines, TILE * parts, count * TILE * parts)
-    values = values.reshape(len(DEGREES), 2 * lines, *values.shape[-2:])
-    spill = ((0, 0), (reach, reach), (0, 0))
+def _tile_values(
+    moments: Float[Array, "m 2 w t t"],
+    along_y: Float[Array, "view part higher s wide"],
+    along_x: Float[Array, "view part higher s wide"],
+    plan: TilePlan,
+) -> tuple[Float[Array, "view 2 v u"], Float[Array, "w 2 s s"]]:
+    """A tile as values of its cells, in every view, with what spills to `REACH` cells around it; and means."""
+    parts, lines = plan.parts, moments.shape[2]
+    moments = moments.reshape(parts, parts, len(DEGREES), 2, lines, TILE, TILE)
+    # [degree, w, 2, (row, part), (column, part)]
+    size = TILE * parts
+    values = jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(len(DEGREES), lines, 2, size, size)
     if not plan.cut:
-        total = jnp.pad(values[0], spill)
-    else:
-        first, second = (moment_filter(q, plan.band) for q in (1, 2))
-        of = dict(zip(DEGREES, values, strict=True))
-        even = of[0, 0] + _filtered(of[0, 1], first, 2) + _filtered(of[0, 2], second, 2)
-        odd = of[1, 0] + _filtered(of[1, 1], first, 2)
-        wide = _filtered(jnp.pad(odd, spill), first, 1) + _filtered(jnp.pad(of[2, 0], spill), second, 1)
-        total = jnp.pad(even, spill) + wide
-    filtered, means = (part.reshape(2, lines, *part.shape[1:]) for part in (total, values[0]))
-    return jax.lax.complex(*filtered), jax.lax.complex(*means)
+        return values[0][jnp.array(plan.views)], values[0]
+    spill = ((0, 0), (0, 0), (REACH, REACH))
+
+    def seen(number: int, toward_y: Array, toward_x: Array) -> Array:
+        of, rows = dict(zip(DEGREES, values[:, number], strict=True)), []
+        for degree in range(DEGREE + 1):
+            row, higher = jnp.pad(of[degree, 0], spill), [of[degree, x] for x in range(1, DEGREE + 1 - degree)]
+            rows.append((row + _applied(higher, toward_x) if higher else row).swapaxes(1, 2))
+        return (jnp.pad(rows[0], spill) + _applied(rows[1:], toward_y)).swapaxes(1, 2)
+
+    return jnp.stack([seen(k, along_y[v], along_x[v]) for v, k in enumerate(plan.views)]), values[0]
 
 
-def _filtered(values: Float[Array, "n v u"], weights: Float[np.ndarray, " tap"], axis: int) -> Float[Array, "n v u"]:
-    """Convolution along an axis; beyond the ends there is nothing."""
-    reach, size = len(weights) // 2, values.shape[axis]
-    padded = jnp.pad(values, [(reach, reach) if a == axis else (0, 0) for a in range(values.ndim)])
-    shifted = (
-        jax.lax.slice_in_dim(padded, 2 * reach - tap, 2 * reach - tap + size, axis=axis) * jnp.float32(weight)
-        for tap, weight in enumerate(weights)
-        if weight
-    )
-    return sum(shifted, jnp.zeros_like(values))
+def _applied(
+    degrees: list[Float[Array, "2 row s"]], weights: Float[Array, "part higher s wide"]
+) -> Float[Array, "2 row wide"]:
+    """Sum over the first degrees of complex values times their real or complex weights, along the last axis."""
+    rows = jnp.concatenate(degrees, axis=-1)
+    matrix = weights[:, : len(degrees)].reshape(weights.shape[0], -1, weights.shape[-1])
+    product = jnp.dot(rows, jnp.concatenate(list(matrix), axis=-1), precision=PRECISION)
+    if len(matrix) == 1:
+        return product
+    real, imaginary = jnp.split(product, 2, axis=-1)
+    return real + jnp.stack([-imaginary[1], imaginary[0]])
 
 
-def _joined(strips: Complex[Array, "strip w v u"]) -> Complex[Array, "w y u"]:
-    """Strips side by side, what spills from each added to its neighbours."""
-    reach = FILTER_REACH
-    main = strips[:, :, reach:-reach]
-    # Above the last strip and below the first one nothing is kept.
-    from_next = jnp.concatenate([strips[1:, :, :reach], jnp.zeros_like(strips[:1, :, :reach])])
-    from_last = jnp.concatenate([jnp.zeros_like(strips[:1, :, -reach:]), strips[:-1, :, -reach:]])
-    main = main.at[:, :, -reach:].add(from_next).at[:, :, :reach].add(from_last)
-    return jnp.moveaxis(main, 0, 1).reshape(strips.shape[1], -1, strips.shape[3])
+def _joined(parts: Float[Array, "part ..."], axis: int, reach: int) -> Float[Array, "..."]:
+    """Parts side by side along an axis of all of them; the first and last `reach` are added to the neighbours."""
+    size = parts.shape[axis] - 2 * reach
+
+    def cut(of: Array, start: int, stop: int) -> Array:
+        return jax.lax.slice_in_dim(of, start, stop, axis=axis)
+
+    main = cut(parts, reach, reach + size)
+    if reach:
+        # Beyond the first and the last part nothing is kept.
+        none = jnp.zeros_like(cut(parts[:1], 0, reach))
+        above = jnp.concatenate([cut(parts[1:], 0, reach), none])
+        below = jnp.concatenate([none, cut(parts[:-1], reach + size, size + 2 * reach)])
+        before, behind = [(0, 0)] * axis, [(0, 0)] * (main.ndim - axis - 1)
+        main = main + jnp.pad(above, [*before, (size - reach, 0), *behind])
+        main = main + jnp.pad(below, [*before, (0, size - reach), *behind])
+    moved = jnp.moveaxis(main, 0, axis - 1)
+    return moved.reshape(*moved.shape[: axis - 1], -1, *moved.shape[axis + 1 :])

@@ -33,8 +33,10 @@ RATE = CAMERA.waves_per_metre(YELLOW_M)
 WHOLE = camera(open_share=1.5)  # no chrome
 
 
-def made(level: np.ndarray, levels: Levels, variation: Variation, optics: Camera = WHOLE) -> FabricatedDoe:
-    return as_fabricated(level, optics, Process(levels), variation)
+def made(
+    level: np.ndarray, levels: Levels, variation: Variation, optics: Camera = WHOLE, depth_m: float = np.inf
+) -> FabricatedDoe:
+    return as_fabricated(level, optics, Process(levels), variation, depths_m=(depth_m,))
 
 
 def along_x(line: np.ndarray, cells: int = CELLS) -> np.ndarray:
@@ -259,7 +261,7 @@ def test_chrome_out_of_place_moves_and_changes_the_light_that_passes():
     flat = np.full((128, 128), 15, np.uint8)
     wide = 0.01 * optics.aperture_m
     drawn, grown, moved = (
-        psf(made(flat, STAIRS, error, optics), depths=[depth_m]).energy[0, 0].astype(float)
+        psf(made(flat, STAIRS, error, optics, depth_m), depths=[depth_m]).energy[0, 0].astype(float)
         for error in (
             Variation(common_depth_scale=1e-6),
             Variation(chrome_diameter_m=wide),
@@ -280,7 +282,7 @@ def test_chrome_out_of_place_moves_and_changes_the_light_that_passes():
 def test_the_mean_of_a_plate_is_that_of_its_heights_whatever_the_masks_do():
     """Moments are moved between cells but never made: the mean of the far field's values is that of the cells."""
     level = np.full((CELLS, CELLS), 15, np.uint8)
-    level[12:-12, 12:-12] = np.random.default_rng(2).integers(0, 16, (CELLS - 24, CELLS - 24))
+    level[16:-16, 16:-16] = np.random.default_rng(2).integers(0, 16, (CELLS - 32, CELLS - 32))
     errors = Variation(overlay_x_m=(0.3e-6, -0.5e-6, 0.1e-6, 0.7e-6), common_cd_bias_m=0.2e-6)
     surface = made(level, Levels(16, 75e-9), errors)
     seen = np.asarray(surface.transmission, complex).mean()

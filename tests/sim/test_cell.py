@@ -11,19 +11,20 @@ from numpy.polynomial.legendre import leggauss, legval
 from scipy.integrate import quad_vec
 
 from sim.surface.cell import (
+    DEGREE,
     DEGREES,
-    FILTER_REACH,
+    REACH,
     Cuts,
     axis_moments,
     axis_values,
     cuts,
-    moment_filter,
+    moment_weights,
     plane_moments,
     point_moments,
     whole_cell,
 )
 
-LEGENDRE = np.eye(3)  # coefficients of P0, P1, P2
+LEGENDRE = np.eye(DEGREE + 1)  # coefficients of P0, P1, ...
 # Multiples of 1/64 are exact in float32, so a point is never on the other side of a line by rounding.
 shifts = st.integers(-200, 200).map(lambda n: n / 64)
 biases = st.integers(-31, 31).map(lambda n: n / 64)
@@ -109,11 +110,11 @@ def test_moments_of_segments_are_integrals_of_legendre_polynomials(parts: int, r
             # The piece of the segment within the part, in the part's own coordinate from -1 to 1.
             low, high = (np.clip(2 * (x * parts - part) - 1, -1, 1) for x in (start, end))
             at = (low + high) / 2 + (high - low) / 2 * nodes
-            for degree in range(3):
+            for degree in range(DEGREE + 1):
                 # Half of it: the part's length counts as 1.
                 exact = (high - low) / 4 * np.sum(weights * legendre(degree, at))
                 assert got[part, degree, segment] == pytest.approx(exact, abs=1e-6)  # float32
-    np.testing.assert_allclose(got.sum(axis=2), np.tile([1.0, 0.0, 0.0], (parts, 1)), atol=1e-6)
+    np.testing.assert_allclose(got.sum(axis=2), np.tile([1.0, 0.0, 0.0, 0.0], (parts, 1)), atol=1e-6)
 
 
 @pytest.mark.parametrize("parts", [1, 2])
@@ -151,47 +152,51 @@ def test_moments_of_the_plane_are_products():
 # --- what moments look like from afar ---------------------------------------------------------------------------------
 
 
-def seen_from(u: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Far field of the taps as values of neighbouring cells, without the cell's own sinc."""
-    return np.exp(-2j * np.pi * u[:, None] * np.arange(-FILTER_REACH, FILTER_REACH + 1)) @ taps
+def seen_from(u: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Far field of the weights as values of neighbouring cells."""
+    return np.exp(-2j * np.pi * u[:, None] * np.arange(-REACH, REACH + 1)) @ weights * np.sinc(u)
 
 
 def of_a_cell(u: np.ndarray, degree: int) -> np.ndarray:
-    """Far field of (2q+1) P_q over a cell, over that of a cell that is evenly lit: integrals, no Bessel functions."""
+    """Far field of (2q+1) P_q over a cell: an integral, no Bessel functions."""
 
-    def integral(q: int) -> np.ndarray:
-        return quad_vec(lambda x: legendre(q, np.array(2 * x)) * np.exp(-2j * np.pi * u * x), -0.5, 0.5)[0]
+    def integrand(x: float) -> np.ndarray:
+        return legendre(degree, np.array(2 * x)) * np.exp(-2j * np.pi * u * x)
 
-    return (2 * degree + 1) * integral(degree) / integral(0)
+    return (2 * degree + 1) * quad_vec(integrand, -0.5, 0.5)[0]
+
+
+def weights_of(low: float, high: float) -> np.ndarray:
+    """Weights of one band, `[degree, tap]`."""
+    return moment_weights(np.array([low]), np.array([high]))[0]
 
 
 @pytest.mark.parametrize(
-    ("band", "first", "second"),
-    # Least squares with ten taps to either side leaves next to nothing of narrow bands. Beyond half a wave per cell the
-    # taps repeat with the other sign, so the first degree, 1.7 at 0.46 waves, would have to fall to nothing within 0.04
-    # more: there they miss a tenth of it.
-    [(0.1, 1e-9, 1e-9), (0.25, 1e-6, 1e-6), (0.4, 0.004, 1e-4), (0.46, 0.19, 0.005)],
+    ("low", "high", "limit"),
+    # Fourteen weights to either side leave next to nothing of narrow bands, wherever they lie. Weights repeat after a
+    # wave per cell: in bands almost as wide they have to come back to where they began, and miss the last of it.
+    [(-0.1, 0.1, 1e-4), (-0.4, 0.4, 2e-4), (-0.6, 0.2, 5e-4), (-0.46, 0.46, 0.01), (-0.6, 0.32, 0.012)],
 )
-def test_taps_look_like_the_moments_within_the_band(band: float, first: float, second: float):
-    u = np.linspace(-band, band, 201)
-    for degree, limit in ((1, first), (2, second)):
-        error = np.abs(seen_from(u, moment_filter(degree, band)) - of_a_cell(u, degree))
-        assert error.max() < limit
-        assert np.sqrt(np.mean(error**2)) < limit / 4  # it is at the band's edge
+def test_weights_look_like_the_moments_within_the_band(low: float, high: float, limit: float):
+    u = np.linspace(low, high, 201)
+    for degree, weights in enumerate(weights_of(low, high), start=1):
+        error = np.abs(seen_from(u, weights) - of_a_cell(u, degree))
+        assert np.sqrt(np.mean(error**2)) < limit  # of a cell's 1
 
 
-@pytest.mark.parametrize("band", [0.1, 0.3, 0.46])
-def test_taps_leave_the_mean_alone_and_have_the_degrees_parity(band: float):
-    first, second = (moment_filter(q, band) for q in (1, 2))
-    assert first.sum() == pytest.approx(0, abs=1e-12)
-    assert second.sum() == pytest.approx(0, abs=1e-12)
-    np.testing.assert_array_equal(first, -first[::-1])
-    np.testing.assert_array_equal(second, second[::-1])
+@pytest.mark.parametrize(("low", "high"), [(-0.1, 0.1), (-0.46, 0.46), (-0.6, 0.32)])
+def test_weights_leave_the_mean_alone_and_are_those_of_the_other_side_mirrored(low: float, high: float):
+    weights, others = weights_of(low, high), weights_of(-high, -low)
+    np.testing.assert_allclose(weights.sum(1), 0, atol=1e-5)
+    # Seen from the other side, a cell's upper half is its lower one.
+    parity = np.array([-1, 1, -1])[:, None]
+    # To what the least squares are conditioned to, 1e-8 of weights to 1e-3 of them.
+    np.testing.assert_allclose(others, parity * weights[:, ::-1], atol=1e-5)
+    np.testing.assert_allclose(others, weights.conj(), atol=1e-5)
     # Cells are numbered upward: light from the upper half of a cell looks like more light in the cell above.
-    assert first[FILTER_REACH + 1] > 0
-    # Bounded: a filter of large weights would amplify rounding, and light beyond the band.
-    assert np.abs(first).sum() < 4
-    assert np.abs(second).sum() < 4
+    assert weights[0, REACH + 1].real > 0
+    # Bounded: large weights would amplify rounding, and light beyond the band.
+    assert np.abs(weights).sum(1).max() < 5
 
 
 @pytest.mark.parametrize("parts", [1, 2])
@@ -208,8 +213,9 @@ def test_a_row_of_cut_cells_looks_the_same_as_its_filtered_values(parts: int, rn
     piece = width * np.sinc(u[:, None] * width) * np.exp(-2j * np.pi * u[:, None] * middle)
     exact = np.einsum("us,un,ns->u", piece, np.exp(-2j * np.pi * u[:, None] * np.arange(count)), light)
     moments = np.einsum("pqs,ns->qnp", np.asarray(axis_moments(jnp.asarray(edges, jnp.float32), parts)), light)
-    moments = moments.reshape(3, count * parts)
-    filtered = moments[0] + sum(np.convolve(moments[q], moment_filter(q, band), "same") for q in (1, 2))
+    moments = moments.reshape(DEGREE + 1, count * parts)
+    weights = weights_of(-band, band)
+    filtered = moments[0] + sum(np.convolve(moments[q], weights[q - 1], "same") for q in range(1, DEGREE + 1))
     places = (np.arange(count * parts) + 0.5) / parts
 
     def seen(values: np.ndarray) -> np.ndarray:

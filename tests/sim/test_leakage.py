@@ -40,7 +40,9 @@ def nominal(level: np.ndarray) -> FabricatedDoe:
 
 @pytest.fixture(scope="module")
 def plate(level: np.ndarray) -> FabricatedDoe:
-    return as_fabricated(level, CAMERA, Process(LEVELS), Variation(depth_scale=(0.02, -0.04, 0.03, 0.05)))
+    return as_fabricated(
+        level, CAMERA, Process(LEVELS), Variation(depth_scale=(0.02, -0.04, 0.03, 0.05)), depths_m=(DEPTH_M,)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -102,7 +102,7 @@ def test_a_doe_as_fabricated():
             "cd_bias_m[0]": 0.1e-6 + error_m / 2,
             "depth_scale[0]": 1e5 * error_m,
         }
-        doe = as_fabricated(LEVEL, ONE, process, variation_of(1, errors))
+        doe = as_fabricated(LEVEL, ONE, process, variation_of(1, errors), depths_m=(NEAR_M,))
         overlaps = jnp.concatenate([jnp.abs(mean_transmission(doe)), zeroth_order(doe), strehl(doe, nominal)])
         return jnp.concatenate([psf(doe, depths=NEAR_M).energy.ravel(), 0.1 * overlaps])
 
