@@ -12,13 +12,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from doedesign.build import with_edge_moves
 from doedesign.design.design import Design
-from doedesign.prediction import Prediction, as_drawn, plate_rows, predict
+from doedesign.prediction import Prediction, plate_rows, predict
 from doedesign.tolerancing.analysis import sample_of
 from doedesign.tolerancing.sensitivity import one_at_a_time
 from fab.draws import EXPECTED, one_at_a_time_keys, variation_at, varying
@@ -27,13 +26,12 @@ from fab.figure import png_bytes
 from fab.grid import Grid
 from fab.process import Normal, Process, Variation, deviation_of
 from fab.runsheet.tables import Grating, Importance, PredictedMetrics, Predictions, SheetPrediction
-from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.material import full_wave_wavelength_m, refractive_index
-from sim.metrics import in_parts, strehl, zeroth_order
+from sim.metrics import strehl, zeroth_order
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
-from sim.surface import FabricatedDoe, as_fabricated
+from sim.surface import as_fabricated, drawn_alike
 
 # A laser of the kind that most optics labs have, and that of the published prototype.
 PROBE_M = 520e-9
@@ -132,19 +130,15 @@ def _predictions(design: Design, process: Process) -> tuple[Sequence[dict[str, A
     if variation.nominal:
         expected = predict(design, process, variation)
         return expected.rows, expected
-    surface = as_fabricated(design.level_map.level, camera, process, variation, depths_m=design.depths_m)
-    bank, grid = psf(surface, depths=design.depths_m), surface.grid
-    nominal = as_drawn(camera, design.level_map)
-    # On the raster of the other, whose propagation is compiled already.
-    parts = grid.shape[0] // nominal.grid.shape[0]
-    field = in_parts(nominal.means, parts)
-    seen = field[np.array([surface.wavelengths_m.index(view.wavelength_m) for view in surface.views])]
-    coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
-    alike = FabricatedDoe(surface.camera, coverage, seen, surface.views, field, nominal.wavelengths_m)
+    asked = (design.level_map.level, camera, process, variation)
     with ThreadPoolExecutor(1) as beside:
-        rows = beside.submit(plate_rows, design, surface, bank)
+        made = beside.submit(as_fabricated, *asked, depths_m=design.depths_m)
+        # In cells and views like the other's, whose propagation is compiled by the time that it is there.
+        alike = drawn_alike(*asked, depths_m=design.depths_m)
         rows_as_drawn = plate_rows(design, alike, psf(alike, depths=design.depths_m))
-    return rows_as_drawn, Prediction(surface, bank, rows.result())
+        surface = made.result()
+    bank = psf(surface, depths=design.depths_m)
+    return rows_as_drawn, Prediction(surface, bank, plate_rows(design, surface, bank))
 
 
 def predict_sheet(

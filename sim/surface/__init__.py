@@ -24,6 +24,6 @@ numbers), `pieces` (what is open where, and its light), `edges` (walls and corne
 (the way in), `leakage` (where its light goes).
 """
 
-from sim.surface.plate import FabricatedDoe, as_fabricated
+from sim.surface.plate import FabricatedDoe, as_fabricated, drawn_alike
 
-__all__ = ["FabricatedDoe", "as_fabricated"]
+__all__ = ["FabricatedDoe", "as_fabricated", "drawn_alike"]

@@ -18,6 +18,7 @@ from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
+from sim.metrics import in_parts
 from sim.optic import ON_AXIS, CellOptic, height_transmission
 from sim.source import SourceMap, ViewedSource
 from sim.surface.pieces import TILE
@@ -149,10 +150,37 @@ def as_fabricated(
         left = (jnp if traced else np).exp(single(-0.5 * variance))
     weights = view_weights(camera, plan.parts, views, TILE)
     transmission, means = transmission_of(packed, widths, relief, rates, left, weights, plan)
-    (ny, nx), parts = camera.grid.shape, plan.parts
-    grid = camera.grid if parts == 1 else Grid((ny * parts, nx * parts), camera.grid.pitch_m / parts)
+    grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+
+
+def drawn_alike(
+    level_map: UInt8[np.ndarray, "y x"],
+    camera: Camera,
+    process: Process,
+    variation: Variation,
+    *,
+    depths_m: Sequence[float] = (np.inf,),
+) -> FabricatedDoe:
+    """The DOE as drawn, in cells and views as of one as fabricated: programs compiled for one serve the other.
+
+    Arguments as of `as_fabricated`. The heights are not kept, so PSFs are those of the heights to 1e-6.
+    """
+    drawn = as_fabricated(level_map, camera, process, Variation())
+    depths = min(depths_m), max(depths_m)
+    plan, views = plan_of(camera, process, variation, drawn.wavelengths_m, depths, traced=False)
+    means = jnp.asarray(in_parts(drawn.means, plan.parts))
+    grid = _parted(camera.grid, plan.parts)
+    coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
+    transmission = means[np.array([number for number, _ in plan.views])]
+    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, drawn.wavelengths_m)
+
+
+def _parted(grid: Grid, parts: int) -> Grid:
+    """The grid of `parts` by `parts` equal parts of every cell."""
+    ny, nx = grid.shape
+    return grid if parts == 1 else Grid((ny * parts, nx * parts), grid.pitch_m / parts)
 
 
 def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: Grid) -> None:

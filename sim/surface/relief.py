@@ -17,7 +17,7 @@ from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
 from sim.propagation.oblique import ObliqueWaves, oblique_waves
-from sim.surface.cell import REACH, moment_weights
+from sim.surface.cell import DEGREE, REACH, moment_weights
 from sim.tracing import single, stacked
 
 SETTINGS = ("repeats", "particles", "pinholes", "seed")  # what no derivative is taken of
@@ -26,8 +26,9 @@ jax.tree_util.register_dataclass(
 )
 
 # Widest band of wave numbers, in waves per cell, that the weights of moments serve; the widest that the window alone
-# may take, so that some is left for sources at different depths; and the highest wave number for which moments do.
-_WIDEST, _WIDEST_SEEN, _HIGHEST = 0.965, 0.93, 0.7
+# may take, so that some is left for sources at different depths; the highest wave number for which moments do, and that
+# for which second moments do.
+_WIDEST, _WIDEST_SEEN, _HIGHEST, _HIGHEST_SECOND = 0.965, 0.93, 0.7, 0.53
 _NODES = 65  # from rim to rim, for which weights are fitted
 
 
@@ -56,7 +57,7 @@ class TilePlan(NamedTuple):
     die_m: tuple[float, float]
     parts: int
     reach: int
-    views: tuple[int, ...]  # wavelength of every view
+    views: tuple[tuple[int, int], ...]  # wavelength of every view, and degree of the highest moments that it needs
     cut: bool
     corners: bool
     walls: bool
@@ -117,9 +118,14 @@ def plan_of(
         for wavelength, waves in zip(wavelengths_m, oblique, strict=True)
         for view in _views(wavelength, waves.over(parts), depths_m)
     )
-    numbers = tuple(wavelengths_m.index(view.wavelength_m) for view in views)
+    degrees = [
+        DEGREE if (waves.seen + max(-waves.low, waves.high, 0)) / parts > _HIGHEST_SECOND else DEGREE - 1
+        for waves in oblique
+    ]
+    numbers = [wavelengths_m.index(view.wavelength_m) for view in views]
+    needed = tuple((number, degrees[number]) for number in numbers)
     parts = parts if cut else 1
-    return TilePlan(grid, process.masks, process.die_m, parts, reach, numbers, cut, corners, walls), views
+    return TilePlan(grid, process.masks, process.die_m, parts, reach, needed, cut, corners, walls), views
 
 
 def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, float]) -> list[View]:

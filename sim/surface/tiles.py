@@ -1,6 +1,8 @@
 """The transmission of a whole plate, tile by tile: moments of every cell, and what they add to the cells around."""
 
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +12,9 @@ from sim.surface.cell import DEGREE, DEGREES, REACH, axis_moments, cuts, plane_m
 from sim.surface.edges import corners, walls
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
+from sim.tracing import in_jit, is_traced
 
 
-@partial(jax.jit, static_argnames=("plan",))
 def transmission_of(
     etched: UInt8[Array, "y x"],
     widths: UInt8[Array, "mask y x"] | None,
@@ -26,6 +28,19 @@ def transmission_of(
 
     `left` is the amplitude that roughness finer than a cell leaves of each wavelength, `weights` are `view_weights`.
     """
+    every = etched, widths, relief, rates, left, weights
+    return (_compiled if is_traced(*every) or in_jit() else _compiled_quickly())(*every, plan)
+
+
+def _transmission(
+    etched: UInt8[Array, "y x"],
+    widths: UInt8[Array, "mask y x"] | None,
+    relief: EtchParameters,
+    rates: Float[Array, " w"],
+    left: Float[Array, " w"],
+    weights: Float[Array, "tile view part higher s wide"],
+    plan: TilePlan,
+) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
     count_y, count_x = -(-ny // TILE), -(-nx // TILE)
@@ -36,7 +51,7 @@ def transmission_of(
     widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))
     rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after) for after in missing])
 
-    def tile(start_y: Array, along_y: Array, start_x: Array, along_x: Array) -> tuple[Array, Array]:
+    def tile(start_y: Array, start_x: Array, along_x: Array) -> tuple[Array, Array]:
         side = TILE + 2 * plan.reach + 1
         bits = jax.lax.dynamic_slice(etched, (start_y, start_x), (side, side))
         masks = (bits[None] >> jnp.arange(plan.masks, dtype=jnp.uint8)[:, None, None]) & 1
@@ -47,13 +62,16 @@ def transmission_of(
             states = states * jnp.clip(1.0 - lost, 0.0, 1.0)
         bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
         moments = _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
-        return _tile_values(moments * left[:, None, None], along_y, along_x, plan)
+        return _tile_rows(moments * left[:, None, None], along_x, plan)
 
     def strip(start_y: Array, along_y: Array) -> tuple[Array, Array]:
-        each = jnp.arange(count_x) * TILE, weights
-        values = jax.checkpoint(lambda at: tile(start_y, along_y, *at))
-        found, means = jax.lax.map(values, each)
-        return _joined(found, 4, reach), _joined(means, 4, 0)
+        values = jax.checkpoint(lambda at: tile(start_y, *at))
+        rows, means = jax.lax.map(values, (jnp.arange(count_x) * TILE, weights))
+        rows = _joined(rows, 5, reach)
+        if not plan.cut:
+            return rows[:, 0], _joined(means, 4, 0)
+        views = [_strip_values(rows[v, : most + 1], along_y[v, :, :most]) for v, (_, most) in enumerate(plan.views)]
+        return jnp.stack(views), _joined(means, 4, 0)
 
     strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights))
     inside = (slice(None), slice(ny * plan.parts), slice(nx * plan.parts))
@@ -61,6 +79,16 @@ def transmission_of(
         jax.lax.complex(part[:, 0], part[:, 1])[inside] for part in (_joined(strips, 3, reach), _joined(means, 3, 0))
     )
     return transmission, means
+
+
+_compiled = jax.jit(_transmission, static_argnames=("plan",))
+
+
+@lru_cache(maxsize=1)
+def _compiled_quickly() -> Callable[..., Any]:
+    """The same to the last bit but one, which a trace cannot hold: as fast, and compiled in two thirds of the time."""
+    options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else {}
+    return jax.jit(_transmission, static_argnames=("plan",), compiler_options=options)
 
 
 def _tile_moments(
@@ -109,43 +137,46 @@ def _tile_moments(
     return moments.reshape(*moments.shape[:3], tile, tile)
 
 
-def _tile_values(
-    moments: Float[Array, "m 2 w t t"],
-    along_y: Float[Array, "view part higher s wide"],
-    along_x: Float[Array, "view part higher s wide"],
-    plan: TilePlan,
-) -> tuple[Float[Array, "view 2 v u"], Float[Array, "w 2 s s"]]:
-    """A tile as values of its cells, in every view, with what spills to `REACH` cells around it; and means."""
+def _tile_rows(
+    moments: Float[Array, "m 2 w t t"], along_x: Float[Array, "view part higher s wide"], plan: TilePlan
+) -> tuple[Float[Array, "view degree 2 v u"], Float[Array, "w 2 s s"]]:
+    """Moments along y of a tile's rows in every view, with what spills to `REACH` cells at either end; and means."""
     parts, lines = plan.parts, moments.shape[2]
     moments = moments.reshape(parts, parts, len(DEGREES), 2, lines, TILE, TILE)
     # [degree, w, 2, (row, part), (column, part)]
     size = TILE * parts
     values = jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(len(DEGREES), lines, 2, size, size)
     if not plan.cut:
-        return values[0][jnp.array(plan.views)], values[0]
-    spill = ((0, 0), (0, 0), (REACH, REACH))
+        return values[:1, jnp.array([number for number, _ in plan.views])].swapaxes(0, 1), values[0]
 
-    def seen(number: int, toward_y: Array, toward_x: Array) -> Array:
+    def seen(number: int, most: int, weights: Array) -> Array:
         of, rows = dict(zip(DEGREES, values[:, number], strict=True)), []
         for degree in range(DEGREE + 1):
-            row, higher = jnp.pad(of[degree, 0], spill), [of[degree, x] for x in range(1, DEGREE + 1 - degree)]
-            rows.append((row + _applied(higher, toward_x) if higher else row).swapaxes(1, 2))
-        return (jnp.pad(rows[0], spill) + _applied(rows[1:], toward_y)).swapaxes(1, 2)
+            row = jnp.pad(of[degree, 0], ((0, 0), (0, 0), (REACH, REACH)))
+            higher = [of[degree, x] for x in range(1, most + 1 - degree)]
+            if higher:
+                matrix = weights[:, : len(higher)].reshape(weights.shape[0], -1, weights.shape[-1])
+                product = jnp.tensordot(jnp.concatenate(higher, axis=2), matrix, (2, 1), precision=PRECISION)
+                row = row + _complex_sum(jnp.moveaxis(product, 2, 0))
+            rows.append(row)
+        return jnp.stack(rows)
 
-    return jnp.stack([seen(k, along_y[v], along_x[v]) for v, k in enumerate(plan.views)]), values[0]
+    return jnp.stack([seen(*view, along_x[v]) for v, view in enumerate(plan.views)]), values[0]
 
 
-def _applied(
-    degrees: list[Float[Array, "2 row s"]], weights: Float[Array, "part higher s wide"]
-) -> Float[Array, "2 row wide"]:
-    """Sum over the first degrees of complex values times their real or complex weights, along the last axis."""
-    rows = jnp.concatenate(degrees, axis=-1)
-    matrix = weights[:, : len(degrees)].reshape(weights.shape[0], -1, weights.shape[-1])
-    product = jnp.dot(rows, jnp.concatenate(list(matrix), axis=-1), precision=PRECISION)
-    if len(matrix) == 1:
-        return product
-    real, imaginary = jnp.split(product, 2, axis=-1)
-    return real + jnp.stack([-imaginary[1], imaginary[0]])
+def _strip_values(
+    rows: Float[Array, "degree 2 s x"], weights: Float[Array, "part higher s wide"]
+) -> Float[Array, "2 wide x"]:
+    """One row of tiles as values of its cells in one view, with what spills to `REACH` cells above and below."""
+    product = jnp.tensordot(weights, rows[1:], ((1, 2), (0, 2)), precision=PRECISION)  # [part, wide, 2, x]
+    return jnp.pad(rows[0], ((0, 0), (REACH, REACH), (0, 0))) + _complex_sum(jnp.moveaxis(product, 2, 1))
+
+
+def _complex_sum(parts: Float[Array, "part 2 v u"]) -> Float[Array, "2 v u"]:
+    """The sum of real parts of the weights times values, and, if there are any, i times the imaginary ones."""
+    if len(parts) == 1:
+        return parts[0]
+    return parts[0] + jnp.stack([-parts[1, 1], parts[1, 0]])
 
 
 def _joined(parts: Float[Array, "part ..."], axis: int, reach: int) -> Float[Array, "..."]:
