@@ -149,7 +149,7 @@ def as_fabricated(
         variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
         left = (jnp if traced else np).exp(single(-0.5 * variance))
     weights = view_weights(camera, plan.parts, views, TILE)
-    transmission, means = transmission_of(packed, widths, relief, rates, left, weights, plan)
+    transmission, means = transmission_of(plan, packed, widths, relief, rates, left, weights)
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)

@@ -15,31 +15,24 @@ from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 from sim.tracing import in_jit, is_traced
 
 
-def transmission_of(
-    etched: UInt8[Array, "y x"],
-    widths: UInt8[Array, "mask y x"] | None,
-    relief: EtchParameters,
-    rates: Float[Array, " w"],
-    left: Float[Array, " w"],
-    weights: Float[Array, "tile view part higher s wide"],
-    plan: TilePlan,
-) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
+def transmission_of(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     """Transmission of every cell, tile by tile: with the far field of the whole plate in every view, and its mean.
 
-    `left` is the amplitude that roughness finer than a cell leaves of each wavelength, `weights` are `view_weights`.
+    The arrays, numpy's or jax's: etches of every cell, one bit each; widths of openings in cells, where etches lag;
+    `relief`; waves per metre of height of every wavelength; the amplitude that roughness finer than a cell leaves of
+    each; and the `view_weights`.
     """
-    every = etched, widths, relief, rates, left, weights
-    return (_compiled if is_traced(*every) or in_jit() else _compiled_quickly())(*every, plan)
+    return (_compiled if is_traced(*arrays) or in_jit() else _compiled_quickly())(plan, *arrays)
 
 
 def _transmission(
+    plan: TilePlan,
     etched: UInt8[Array, "y x"],
     widths: UInt8[Array, "mask y x"] | None,
     relief: EtchParameters,
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
     weights: Float[Array, "tile view part higher s wide"],
-    plan: TilePlan,
 ) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
