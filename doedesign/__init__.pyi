@@ -21,6 +21,8 @@ from .prediction import predict as predict
 from .recon.files import reconstruct_files as reconstruct_files
 from .recon.model import Model as Model
 from .recon.reconstruction import Reconstruction as Reconstruction
+from .runs.certificate import Certificate as Certificate
+from .runs.certificate import certify as certify
 from .runs.fabricated import FabricatedPsfs as FabricatedPsfs
 from .runs.fabricated import fabricated as fabricated
 from .runs.level_maps import open_design as open_design

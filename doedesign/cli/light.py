@@ -1,4 +1,4 @@
-"""PSFs and captures of a design: psf, simulate."""
+"""PSFs, certificate and captures of a design: psf, certify, simulate."""
 
 from pathlib import Path
 from typing import Annotated
@@ -63,6 +63,24 @@ def psf(
         raise InputError("--field-deg", "must lie within 60 degrees", field_deg, "A thin lens says nothing beyond.")
     folder = run / "psf"
     psfs(run, masks, depths_m, (radians(field_deg[0]), radians(field_deg[1])), folder)
+    print_results(folder, json_)
+
+
+def certify(run: Path, *, masks: Path | None = None, cells: int = 24, json_: AsJson = False) -> None:
+    """Prove what light does at the walls of a design: rows of it against Maxwell's equations.
+
+    Rows of cells are solved rigorously, in both polarisations, and compared with the design as a thin element and with
+    the light of its edges; the whole design is computed both ways.
+
+    Args:
+        run: Run folder.
+        masks: Its mask order; masks/NAME by default.
+        cells: Cells of a row, 4 to 64; time grows with their third power.
+    """
+    from doedesign.runs.certificate import certify as prove
+
+    folder = run / "certificate"
+    prove(run, masks, cells=cells, out=folder)
     print_results(folder, json_)
 
 

@@ -12,7 +12,7 @@
         history.jsonl           one line per step
         metrics.json            the table of `doedesign.design.metrics`
         *.png                   pictures
-        psf/, fabricated/, simulated/, trained/, tolerance/, calibrate/     results of later commands
+        psf/, fabricated/, certificate/, simulated/, trained/, tolerance/, calibrate/     results of later commands
 
 Every file is written under a temporary name and renamed. The manifest says "running" until everything else is on the
 disk, so a run that was killed at any moment is resumed from its last checkpoint and ends with the same bytes. Only one
@@ -53,7 +53,7 @@ _FIXED_SENSOR = ("pitch_m", "resolution", "binning", "window", "fill_factor", "d
 
 # Temporary names of `write_atomic` and `atomic_folder`, which stay behind where a process is killed while it writes.
 _UNFINISHED = re.compile(
-    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
+    r"\.([\w-]+\.(json|toml|npz|exr|jsonl|png)|(psf|fabricated|certificate|calibration|explanations|as-built)\.new)\.[a-z0-9_]{8}"
 )
 
 
