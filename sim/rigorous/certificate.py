@@ -72,8 +72,8 @@ def cut_rows(
             inside = np.hypot(along_m, across_m) <= aperture_m / 2
             part = np.asarray(line[start : start + cells], np.float64)[inside]
             if len(part) > 1 and np.ptp(part) > 0:
-                centre = float(along_m[inside].mean()), float(across_m)
-                found.append(Row(axis, centre if axis == "y" else centre[::-1], part))
+                own, other = float(along_m[inside].mean()), float(across_m)
+                found.append(Row(axis, (own, other) if axis == "y" else (other, own), part))
     return found
 
 

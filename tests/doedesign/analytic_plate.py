@@ -54,7 +54,7 @@ class AnalyticModel(ForwardModel):
         """The plate with some errors."""
         self.asked.append(np.array(values))
         nothing: Any = None
-        return AnalyticImages(self, nothing, nothing, np.array(values))
+        return AnalyticImages(self, nothing, nothing, (), np.array(values))
 
     def plate_and_vjp(self, values: Values) -> tuple["AnalyticImages", Any]:
         """The plate, and its derivative backwards: the gradient with respect to s and the second error comes in."""
