@@ -1,10 +1,14 @@
 """Certificate of a design: rows cut out of it, as thin elements, with edges, and by Maxwell's equations."""
 
+import itertools
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from fab.grid import Grid
 from sim.camera import Camera
@@ -88,13 +92,18 @@ def certify_rows(
         wavelengths_m: vacuum wavelengths.
         on_row: called after every one, for progress.
     """
-    found = []
-    for wavelength_m in wavelengths_m:
+
+    def solved(wavelength_m: float, row: Row) -> CertifiedRow:
         index = refractive_index(camera.material, wavelength_m)
-        for row in rows:
-            coarse, fine = (
-                compare_row(row.height_m, camera.grid.pitch_m, wavelength_m, index, waves=waves) for waves in _WAVES
-            )
-            found.append(CertifiedRow(row, wavelength_m, fine, fine.error(coarse.rigorous)))
+        coarse, fine = (
+            compare_row(row.height_m, camera.grid.pitch_m, wavelength_m, index, waves=waves) for waves in _WAVES
+        )
+        return CertifiedRow(row, wavelength_m, fine, fine.error(coarse.rigorous))
+
+    found = []
+    # Several threads make one of these matrices slower: twice with nothing else to do, and twenty times beside others.
+    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count()) as pool:
+        for one in pool.map(solved, *zip(*itertools.product(wavelengths_m, rows), strict=True)):
+            found.append(one)
             on_row()
     return tuple(found)
