@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from doedesign.capture.camera import CaptureModel
+from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import plain_parameters
 from doedesign.capture.image_files import read_image, write_image
 from doedesign.capture.images import Pictures, picture_files
@@ -133,7 +133,9 @@ def simulate_files(
     _log.info("%d items of %s, %s, %s; %s", count, size_words, settings["obstruction"], model.occlusion, words)
 
     drawn = partial(HeightOptic.of, model.camera, design.level_map.height_m)
-    make = partial(as_fabricated, design.level_map.level, model.camera, *plate[:2]) if plate else drawn
+    depths_m = (*depth_range_m(kind), *far_m)
+    made = partial(as_fabricated, design.level_map.level, model.camera, depths_m=depths_m)
+    make = partial(made, *plate[:2]) if plate else drawn
     psfs = psfs_by_depth(make, model.camera), flat_psfs(model.camera)
     names = _write_captures(folder, data, count, model, psfs, settings, png)
     if skips := pictures.skips():

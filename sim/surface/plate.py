@@ -60,35 +60,25 @@ class FabricatedDoe(CellOptic):
         return self.camera.grid
 
     def view(self, wavelength_m: float, depth_m: float = np.inf) -> int:
-        """Which of the views holds for a wavelength and a source depth; a ValueError if none does."""
-        own = [(k, view) for k, view in enumerate(self.views) if view.wavelength_m == wavelength_m]
-        for k, view in own:
-            if view.nearest_m * (1 - 1e-6) <= depth_m <= view.farthest_m * (1 + 1e-6):
-                return k
+        """Which of the views is that from a source depth, or the nearest to it; a ValueError for another wavelength."""
+        own = [k for k, view in enumerate(self.views) if view.wavelength_m == wavelength_m]
         if not own:
             raise ValueError(f"`wavelength_m` must be one of {self.wavelengths_m}, but got {wavelength_m}")
-        nearest, farthest = min(view.nearest_m for _, view in own), max(view.farthest_m for _, view in own)
-        rule = f"`depth_m` must lie within {nearest:g} to {farthest:g} m, the `depths_m` given to `as_fabricated`"
-        raise ValueError(f"{rule}, but got {depth_m:g}")
+        # The farthest comes first.
+        return next((k for k in own if depth_m >= self.views[k].nearest_m * (1 - 1e-6)), own[-1])
 
     def at(self, wavelength_m: float, depth_m: float = np.inf) -> Complex[Array, "y x"]:
-        """Transmission at one of the wavelengths for a source depth; a ValueError if it was not prepared for it."""
+        """Transmission at one of the wavelengths for a source depth; a ValueError for another wavelength."""
         return self.transmission[self.view(wavelength_m, depth_m)]
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> ViewedSource:
-        """The path to every cell and the view from there; a ValueError for a depth that was not prepared for."""
+        """The path to every cell, and the view from there or from the nearest depth that there is a view for."""
         view = jnp.int32(self.view(line.wavelength_m, depth_m))
         return ViewedSource(self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad), view)
 
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
         """Heights as drawn, or transmission in the source's view."""
         return (None, self.transmission[source.view]) if self.height_m is None else (self.height_m, None)
-
-    def with_camera(self, camera: Camera) -> "CellOptic":
-        """The same DOE before another lens or sensor; a ValueError if its cells were prepared for one."""
-        if any(view.nearest_m > 0 for view in self.views):
-            raise ValueError("`camera` must be given to `as_fabricated`, which prepares cells for lens and window")
-        return super().with_camera(camera)
 
 
 def as_fabricated(
@@ -109,7 +99,8 @@ def as_fabricated(
         variation: the errors; `Variation()` gives the nominal plate bit for bit.
         wavelengths_m: vacuum wavelengths; all lines of the camera by default.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between. They say
-            how obliquely cells are lit, which matters where edges moved within them.
+            how obliquely cells are lit, which matters where edges moved within them. From other depths the plate looks
+            as from the nearest of these; random plates with 0.5 um of overlay are then off by up to 7 %.
 
     Returns:
         the plate; a function of `variation` that `jax.grad` and `jax.jvp` accept.

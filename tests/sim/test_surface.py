@@ -410,14 +410,12 @@ def test_a_wavelength_has_as_many_views_as_its_band_is_too_wide(level: np.ndarra
     np.testing.assert_array_equal(still.transmission[1], still.transmission[3])
 
 
-def test_a_plate_is_seen_from_the_depths_that_it_was_made_for(level: np.ndarray):
-    moved = as_fabricated(level, WIDE, PROCESS, Variation(common_cd_bias_m=1e-7), depths_m=(2e-3, 5e-3))
-    for depth_m in (1.9e-3, 5.1e-3, np.inf):
-        with pytest.raises(ValueError, match=r"must lie within 0.002 to 0.005 m, the `depths_m` given to"):
-            psf(moved, depths=depth_m)
+def test_from_elsewhere_a_plate_looks_as_from_the_nearest_depth(level: np.ndarray):
+    moved = as_fabricated(level, WIDE, PROCESS, Variation(common_cd_bias_m=1e-7), depths_m=(1.5e-3, 6e-3))
+    blue = [view for view in moved.views if view.wavelength_m == 486e-9]
+    assert [view.farthest_m for view in blue] == pytest.approx([6e-3, 2.4e-3])
+    for depth_m, other_m in ((np.inf, 6e-3), (1e-3, 1.5e-3)):
+        np.testing.assert_array_equal(moved.at(486e-9, depth_m), moved.at(486e-9, other_m))
+    assert not np.array_equal(moved.at(486e-9, 6e-3), moved.at(486e-9, 1.5e-3))
     with pytest.raises(ValueError, match="`wavelength_m` must be one of"):
         moved.at(500e-9)
-    with pytest.raises(ValueError, match="must be given to `as_fabricated`"):
-        psf(moved, dataclasses.replace(WIDE, window=64), 3e-3)
-    drawn = as_fabricated(level, WIDE, PROCESS, Variation())
-    assert psf(drawn, dataclasses.replace(WIDE, window=64), 3e-3).energy.shape == (2, 1, 64, 64)
