@@ -156,7 +156,7 @@ def drawn_alike(
 ) -> FabricatedDoe:
     """The DOE as drawn, in cells and views as of one as fabricated: programs compiled for one serve the other.
 
-    Arguments as of `as_fabricated`. The heights are not kept, so PSFs are those of the heights to 1e-6.
+    Arguments as of `as_fabricated`. Its transmission is that of the heights, which are not kept.
     """
     drawn = as_fabricated(level_map, camera, process, Variation())
     depths = min(depths_m), max(depths_m)

@@ -10,6 +10,50 @@ import doedesign.optimization
 from doedesign.cli import main
 from tests.pictures import leave_out_pictures
 
+# Of a plate with errors, and a limit for it.
+SPEC = """
+name = "small"
+
+[optics]
+focal_length = "1 mm"
+wavelengths = ["550 nm"]
+design_wavelength = "550 nm"
+
+[doe]
+samples = 48
+pitch = "1.85 um"
+aperture = "88.8 um"
+material = "fused_silica"
+
+[process]
+levels = 4
+level_step = "300 nm"
+
+[process.errors]
+overlay_x = "0.4 um"
+common_depth_scale = 0.03
+
+[scene]
+near = ["6 mm"]
+far = ["inf"]
+
+[sensor]
+pitch = "1.85 um"
+resolution = [640, 480]
+window = 32
+
+[optimize]
+start = "ring"
+steps = 0
+
+[[objective]]
+name = "far_spot"
+
+[[limit]]
+quantity = "strehl"
+min = 0.9
+"""
+
 
 def call(*arguments: object) -> tuple[int, str, str]:
     """Call a command: its exit code, stdout and stderr."""

@@ -18,7 +18,7 @@ from sim.metrics import zeroth_order
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import with_edges
-from tests.doedesign.small_runs import call, finished_run
+from tests.doedesign.small_runs import SPEC, call, finished_run
 
 LEVELS = Levels(16, 75 * NM)
 COLOURS = (Colour("green", (550e-9,), (1.0,)), Colour("both", (550e-9, 650e-9), (0.5, 0.5)))
@@ -110,47 +110,6 @@ def test_bad_input(design: Design):
     flat = design.level_map.with_level(np.zeros_like(design.level_map.level))
     with pytest.raises(InputError, match="must not be flat where rows are cut out"):
         certify(Design(flat, CAMERA, DEPTHS_M[:1], DEPTHS_M[1:]))
-
-
-SPEC = """
-name = "small"
-
-[optics]
-focal_length = "1 mm"
-wavelengths = ["550 nm"]
-design_wavelength = "550 nm"
-
-[doe]
-samples = 48
-pitch = "1.85 um"
-aperture = "88.8 um"
-material = "fused_silica"
-
-[process]
-levels = 4
-level_step = "300 nm"
-
-[scene]
-near = ["5 mm"]
-far = ["inf"]
-
-[sensor]
-pitch = "3.7 um"
-resolution = [64, 64]
-window = 32
-
-[optimize]
-parametrization = "freeform"
-start = "random"
-steps = 2
-learning_rate = 0.2
-seed = 1
-quantisation = "straight_through"
-
-[[objective]]
-name = "far_spot"
-weight = 1.0
-"""
 
 
 def test_the_command_writes_into_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

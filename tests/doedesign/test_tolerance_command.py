@@ -14,51 +14,8 @@ from doedesign.spec import load_variation
 from doedesign.tolerancing.results import plain
 from doedesign.tolerancing.studies import study
 from fab.files import sha256_file
-from tests.doedesign.small_runs import call, finished_run
+from tests.doedesign.small_runs import SPEC, call, finished_run
 from tests.pictures import leave_out_pictures
-
-SPEC = """
-name = "small"
-
-[optics]
-focal_length = "1 mm"
-wavelengths = ["550 nm"]
-design_wavelength = "550 nm"
-
-[doe]
-samples = 48
-pitch = "1.85 um"
-aperture = "88.8 um"
-material = "fused_silica"
-
-[process]
-levels = 4
-level_step = "300 nm"
-
-[process.errors]
-overlay_x = "0.4 um"
-common_depth_scale = 0.03
-
-[scene]
-near = ["6 mm"]
-far = ["inf"]
-
-[sensor]
-pitch = "1.85 um"
-resolution = [640, 480]
-window = 32
-
-[optimize]
-start = "ring"
-steps = 0
-
-[[objective]]
-name = "far_spot"
-
-[[limit]]
-quantity = "strehl"
-min = 0.9
-"""
 
 
 @pytest.fixture(scope="module")
