@@ -7,13 +7,16 @@ out of focus leaves a quadratic remainder, which is added here.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from fab.grid import Grid
 from sim.material import fresnel_transmission, refractive_index
+
+Mapping = Literal["sine", "tangent"]
+_INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach double precision for 20 %
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,10 @@ class Camera:
             falls on the corner shared by the four middle pixels, for an odd one on the middle pixel's centre.
         fill: side of a pixel's light-sensitive square over `pixel_m`, 0-1.
         defocus_m: distance of the sensor beyond the focal plane.
+        mapping: how the lens images directions: at a height d sin(angle) from the axis on a sensor at distance d, or
+            at d tan(angle), as a lens without distortion does. The far field falls so by itself on a sphere ("sine").
+        distortion: (k1, k2), the relative change of that height r: light lands at r (1 + k1 (r/d)² + k2 (r/d)⁴) from
+            the axis. Negative numbers are a barrel, positive ones a pincushion.
     """
 
     grid: Grid
@@ -62,6 +69,13 @@ class Camera:
     window: int
     fill: float = 1.0
     defocus_m: float = 0.0
+    mapping: Mapping = "sine"
+    distortion: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def is_sine(self) -> bool:
+        """Whether places on the sensor are direction sines, times its distance."""
+        return self.mapping == "sine" and not any(self.distortion)
 
     @property
     def sensor_distance_m(self) -> float:
@@ -80,6 +94,35 @@ class Camera:
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""
         return Grid((self.window, self.window), self.pixel_m).axis_m("x")
+
+    def image_m(self, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
+        """Place (y, x) on the sensor of light with these direction sines, metres from the axis."""
+        scale = self.sensor_distance_m
+        if self.mapping == "tangent":
+            scale = scale * (1.0 - sine_y * sine_y - sine_x * sine_x) ** -0.5
+        y, x = sine_y * scale, sine_x * scale
+        k1, k2 = self.distortion
+        share = (y * y + x * x) / self.sensor_distance_m**2
+        grown = 1.0 + share * (k1 + k2 * share)
+        return y * grown, x * grown
+
+    def sines_of(self, y_m: Any, x_m: Any) -> tuple[Any, Any]:
+        """Direction sines (y, x) of the light that lands at a place on the sensor: the inverse of `image_m`.
+
+        Plain arithmetic, for numbers and arrays of numpy or jax. Meaningless where the distortion has folded the
+        image over (`farthest_image_m`).
+        """
+        y, x = y_m / self.sensor_distance_m, x_m / self.sensor_distance_m
+        (k1, k2), seen, shrunk = self.distortion, y * y + x * x, 1.0
+        for _ in range(_INVERSIONS if any(self.distortion) else 0):
+            share = seen * shrunk * shrunk
+            missed = shrunk * (1.0 + share * (k1 + k2 * share)) - 1.0
+            shrunk = shrunk - missed / (1.0 + share * (3.0 * k1 + 5.0 * k2 * share))
+        y, x = y * shrunk, x * shrunk
+        if self.mapping == "tangent":
+            scale = (1.0 + y * y + x * x) ** -0.5
+            y, x = y * scale, x * scale
+        return y, x
 
     def transmission(self, wavelength_m: float) -> float:
         """Power that passes both faces of the uncoated substrate."""

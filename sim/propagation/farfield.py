@@ -18,6 +18,10 @@ light leaves. 5 cm before the paper's plate that is up to a seventh of the band;
 from the blur disc and leave errors of 3-8 % in the image. The direction is linear in the cell's position, so the
 interpolation carries the factor: its weights become complex and nothing is transformed twice.
 
+Samples are equidistant in the direction sine, and so are the pixels of an ideal "sine" lens. Behind any other
+(`Camera.mapping`, `Camera.distortion`), and on a sensor that is turned or stretched, pixels lie elsewhere among the
+samples (`sim.propagation.places`) and are integrated there (`sim.propagation.mapped`).
+
 A plan (`plan_far_field`) is made once in float64 on the host and holds float32 operators. `FarField.energy` applies it
 to a pupil given as a function of blocks of rows (`sim.propagation.pupil`), so a phase-only pupil is never stored; its
 gradient is written out (one adjoint transform) and checked against finite differences.
@@ -39,7 +43,9 @@ from jaxtyping import Array, Complex, Float, Inexact, PyTree
 from scipy.fft import next_fast_len
 
 from sim.camera import Camera
+from sim.propagation.mapped import MappedPixels, plan_mapped_pixels
 from sim.propagation.pixel import Banded, PixelWeights, pixel_weights, sampling_for
+from sim.propagation.places import cubic_places, largest_reach, window_places
 from sim.propagation.pupil import PupilRows, block_size, cis, in_blocks
 
 TOLERANCE = 2e-3  # predicted relative L2 error of pixel energies, unless a plan says otherwise
@@ -52,8 +58,10 @@ _FLOOR = 1e-9  # keeps the interpolation's weights small where the band leaves t
 class FarField(eqx.Module):
     """Operators of one wavelength and depth."""
 
-    gather: Banded  # samples -> pixels along either axis, with all constant factors; `spread` is its transpose
-    spread: Banded
+    # Samples -> pixels: along either axis, with all constant factors (`spread` is its transpose), or at places of a map
+    gather: Banded | None
+    spread: Banded | None
+    pixels: MappedPixels | None
     # Samples of the field -> samples of the intensity along either axis, with the cell's sinc (real weights for a
     # distant source), or None if the samples are the same; `coarsen` is its transpose
     refine: Banded | None
@@ -65,6 +73,7 @@ class FarField(eqx.Module):
     kept: int = eqx.field(static=True)  # samples of the field kept around the axis
     blocks: tuple[int, int] = eqx.field(static=True)  # rows per block in the pupil and on the sensor
     spacing_m: float = eqx.field(static=True)  # distance of the field's samples on the sensor
+    sample_m: float = eqx.field(static=True)  # distance of the intensity's samples
     # No static field: it changes with depth, and every depth would be compiled anew.
     expected_error: float  # predicted relative L2 error of the pixel energies of a speckle-like image
 
@@ -81,14 +90,21 @@ class FarField(eqx.Module):
         Args:
             pupil: function (rows, shared) -> complex field `[row, x]` behind the DOE; zero rows must give a zero field.
             rows: pytree of arrays whose first axis is the grid's y; `pupil` receives blocks of them.
-            shared: pytree passed to every block unchanged. The result is differentiable in it and in `rows`.
+            shared: pytree passed to every block unchanged. The result is differentiable in it, `rows` and `pixels`.
         """
-        return _pixel_energy((rows, shared), pupil, self)
+        return _pixel_energy((rows, shared, self.pixels), pupil, _with_pixels(self, None))
 
 
 @lru_cache(maxsize=32)
 def plan_far_field(
-    camera: Camera, wavelength_m: float, *, depth_m: float = np.inf, sampling: float | None = None, cell: bool = True
+    camera: Camera,
+    wavelength_m: float,
+    *,
+    depth_m: float = np.inf,
+    sampling: float | None = None,
+    cell: bool = True,
+    field_rad: tuple[float, float] = (0.0, 0.0),
+    room: float = 0.0,
 ) -> FarField:
     """Prepare the transform of one wavelength and depth. Kept, for every DOE of a tolerance study needs the same few.
 
@@ -100,6 +116,8 @@ def plan_far_field(
         sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
             `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
+        field_rad: field angles (y, x); without influence if the lens has the mapping "sine" and no distortion.
+        room: by how much `bent` may turn, shear or stretch the image, a share; 0 is for a sensor that is perfect.
     """
     ny, nx = camera.grid.shape
     if ny != nx:
@@ -118,25 +136,35 @@ def plan_far_field(
     spacing = scale / (length * pitch)
     fine = spacing if bare else scale / (sampling * aperture)
     width = camera.pixel_m * camera.fill / fine
-    half = camera.window * camera.pixel_m / 2 / fine + width + 8
+    places = None if camera.is_sine and not room else window_places(camera, fine, field_rad)
+    reach = camera.window * camera.pixel_m / 2 / fine
+    if places is not None:
+        reach = largest_reach(places, camera.window) * (1 + 2 * room)
+    half = reach + width + 8
     samples = 64 * int(np.ceil(2 * half / 64))
     kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + _FIELD_TAPS + 2) / 64))
     positions = (np.arange(samples) - samples // 2) * fine
-    weights = _pixel_rule(camera, width, fine, aperture * fine / scale, samples)
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for fine².
     amount = pitch**2 / scale * fine / np.sqrt(np.pi * aperture**2 / 4)
     envelope = np.sinc(positions * pitch / scale) ** 2 if cell and bare else np.ones(samples)
-    matrix = weights.matrix * (amount * envelope)[:, None]
-    refine, missed = None, 0.0
+    cutoff, factor = aperture * fine / scale, amount * envelope
+    gather, spread, pixels, refine, missed = None, None, None, None, 0.0
+    # Bare transforms are those of long optimisations, compiled once.
+    banded = partial(Banded.from_dense, batched=not bare)
+    if places is None:
+        weights = _pixel_rule(camera, width, fine, cutoff, samples)
+        matrix, miscounted = weights.matrix * factor[:, None], np.sqrt(2) * weights.expected_error
+        gather, spread = banded(matrix), banded(matrix.T, 256)
+    else:
+        pixels, miscounted = plan_mapped_pixels(places, camera.window, camera.fill, cutoff, factor, room)
     if not bare:
         curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
         slope = curvature * pitch**2 / wavelength_m if cell else None
         refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope)
-    # Bare transforms are those of long optimisations, compiled once.
-    banded = partial(Banded.from_dense, batched=not bare)
     return FarField(
-        gather=banded(matrix),
-        spread=banded(matrix.T, 256),
+        gather=gather,
+        spread=spread,
+        pixels=pixels,
         refine=None if refine is None else banded(refine),
         coarsen=None if refine is None else banded(refine.T),
         tilt=None,
@@ -145,7 +173,8 @@ def plan_far_field(
         kept=kept,
         blocks=(block_size(nx), block_size(kept)),
         spacing_m=spacing,
-        expected_error=np.hypot(np.sqrt(2) * weights.expected_error, 2 * np.sqrt(2) * missed),
+        sample_m=fine,
+        expected_error=np.hypot(miscounted, 2 * np.sqrt(2) * missed),
     )
 
 
@@ -199,6 +228,24 @@ def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
     return eqx.tree_at(
         lambda p: p.tilt, plan, (cis(waves * offset_m[0]), cis(waves * offset_m[1])), is_leaf=lambda leaf: leaf is None
     )
+
+
+def bent(plan: FarField, camera: Camera, displacement_m: Float[Array, "2 term"]) -> FarField:
+    """The same plan with pixels displaced on the sensor by cubic polynomials of their place; differentiable in them.
+
+    Args:
+        plan: one that was made for this camera on the axis, with enough `room`; farther pixels are NaN.
+        camera: the camera.
+        displacement_m: coefficients (`sim.propagation.places.cubic_places`), metres.
+    """
+    if plan.pixels is None:
+        raise ValueError("`plan` must have been made with `room` for its pixels to move")
+    moved = plan.pixels.at(cubic_places(window_places(camera, plan.sample_m), camera, displacement_m))
+    return _with_pixels(plan, moved)
+
+
+def _with_pixels(plan: FarField, pixels: MappedPixels | None) -> FarField:
+    return eqx.tree_at(lambda p: p.pixels, plan, pixels, is_leaf=lambda leaf: leaf is None)
 
 
 def _transform(plan: FarField, field: Complex[Array, "row n"]) -> Complex[Array, "row length"]:
@@ -259,15 +306,19 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
             columns = columns * plan.tilt[0]
         return _central(_transform(plan, columns), plan.kept)
 
-    blocks, refine = jnp.arange(plan.kept // sensor_block), plan.refine
+    blocks, refine, pixels = jnp.arange(plan.kept // sensor_block), plan.refine, plan.pixels
+    gather = cast(Banded, plan.gather)  # used where there are no `pixels`
+    if refine is None and pixels is not None:
+        fields = jax.lax.map(along_y, blocks)
+        return pixels.energy(_intensity(plan, fields)), fields
     if refine is None:
         # The samples are those of the intensity: a block is integrated while it is in the cache.
         def integrated(block: Array) -> tuple[Array, Array]:
             field = along_y(block)
-            return plan.gather(field.real**2 + field.imag**2), field
+            return gather(field.real**2 + field.imag**2), field
 
         columns, fields = jax.lax.map(integrated, blocks)
-        return plan.gather(columns.reshape(plan.kept, -1).T), fields
+        return gather(columns.reshape(plan.kept, -1).T), fields
 
     def refined(block: Array) -> Array:
         field = along_y(block)
@@ -276,51 +327,78 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
     parts = jax.lax.map(refined, blocks)  # [block, part, x, y]
     parts = jnp.transpose(parts, (1, 3, 0, 2)).reshape(2, parts.shape[3], plan.kept)
     parts = refine.of_complex(parts)
-    columns = plan.gather(parts[0] ** 2 + parts[1] ** 2)
-    return plan.gather(columns.T).T, parts
+    if pixels is not None:
+        return pixels.energy(_intensity(plan, parts)), parts
+    columns = gather(parts[0] ** 2 + parts[1] ** 2)
+    return gather(columns.T).T, parts
+
+
+def _intensity(plan: FarField, parts: Array) -> Float[Array, "y x"]:
+    """Intensity of a field as `_forward` leaves it."""
+    if plan.refine is None:
+        return (parts.real**2 + parts.imag**2).reshape(plan.kept, -1).T
+    return parts[0] ** 2 + parts[1] ** 2
+
+
+Operands = tuple[PyTree, PyTree, MappedPixels | None]
 
 
 @eqx.filter_custom_vjp
-def _pixel_energy(operands: tuple[PyTree, PyTree], pupil: PupilRows, plan: FarField) -> Array:
-    return _forward(plan, pupil, *operands)[0]
+def _pixel_energy(operands: Operands, pupil: PupilRows, plan: FarField) -> Array:
+    return _images(operands, pupil, plan)[0]
 
 
 @_pixel_energy.def_fwd
-def _save_field(_perturbed: PyTree, operands: tuple[PyTree, PyTree], pupil: PupilRows, plan: FarField) -> Any:
-    return _forward(plan, pupil, *operands)
+def _save_field(_perturbed: PyTree, operands: Operands, pupil: PupilRows, plan: FarField) -> Any:
+    return _images(operands, pupil, plan)
+
+
+def _images(operands: Operands, pupil: PupilRows, plan: FarField) -> tuple[Array, Array]:
+    rows, shared, pixels = operands
+    return _forward(_with_pixels(plan, pixels), pupil, rows, shared)
 
 
 @_pixel_energy.def_bwd
 def _adjoint(
     parts: Array,
     cotangent: Array,
-    perturbed: tuple[PyTree, PyTree],
-    operands: tuple[PyTree, PyTree],
+    perturbed: tuple[PyTree, PyTree, PyTree],
+    operands: Operands,
     pupil: PupilRows,
     plan: FarField,
-) -> tuple[PyTree, PyTree]:
+) -> tuple[PyTree, PyTree, PyTree]:
     """Transposed operators: pixels -> samples -> pupil -> whatever made the pupil.
 
     With L = sum cotangent * energy, dL/dU = 2 conj(U) * (spread cotangent) in JAX's convention for complex
     cotangents, and the transpose of a Fourier transform is itself.
     """
-    (rows, shared), (constant_rows, constant_shared) = eqx.partition(operands, perturbed)
-    (pupil_block, sensor_block), coarsen = plan.blocks, plan.coarsen
+    (rows, shared, pixels), (constant_rows, constant_shared, constant_pixels) = eqx.partition(operands, perturbed)
+    (pupil_block, sensor_block), coarsen, spread = plan.blocks, plan.coarsen, plan.spread
+    to_pixels: Any = None
 
     def along_y(samples: Array) -> Array:
         columns = _untransform(plan, _uncentral(samples, plan.length))
         return columns if plan.tilt is None else columns * plan.tilt[0]
 
+    if spread is None:
+
+        def energy_of(intensity: Array, pixels: MappedPixels) -> Array:
+            return eqx.combine(pixels, constant_pixels).energy(intensity)
+
+        weights, to_pixels = eqx.filter_vjp(energy_of, _intensity(plan, parts), pixels)[1](cotangent)
+    else:
+        weights = spread(cotangent).T  # the other axis is left to blocks where there is no other pass
+        weights = weights if coarsen is None else spread(weights).T
     if coarsen is None:
-        half_spread = plan.spread(cotangent).T.reshape(-1, sensor_block, cotangent.shape[0])
+        by_column = weights.T if spread is None else weights
 
         def spread_block(block: tuple[Array, Array]) -> Array:
             weights, field = block
-            return along_y(2.0 * plan.spread(weights) * jnp.conj(field))
+            weights = weights if spread is None else spread(weights)
+            return along_y(2.0 * weights * jnp.conj(field))
 
-        half_done = jax.lax.map(spread_block, (half_spread, parts))
+        half_done = jax.lax.map(spread_block, (by_column.reshape(-1, sensor_block, by_column.shape[1]), parts))
     else:
-        weights = plan.spread(plan.spread(cotangent).T).T
         back = jnp.stack([2.0 * weights * parts[0], -2.0 * weights * parts[1]])
         back = coarsen.of_complex(back)
         back = jnp.transpose(back.reshape(2, back.shape[1], -1, sensor_block), (2, 0, 3, 1))
@@ -350,4 +428,4 @@ def _adjoint(
     blocks = (jnp.arange(count), *(in_blocks(r, pupil_block) for r in (rows, constant_rows)))
     shared_part, row_parts = jax.lax.scan(along_x, jax.tree.map(jnp.zeros_like, shared), blocks)
     row_parts = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: plan.cells], row_parts)
-    return row_parts, shared_part
+    return row_parts, shared_part, to_pixels

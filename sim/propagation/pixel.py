@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Inexact
 _FREQUENCIES = 513
 # Weight of the mean intensity against all speckle together: large enough that a pixel's weights sum to
 # its area to about 1e-5.
-_MEAN_WEIGHT = 1e3
+MEAN_WEIGHT = 1e3
 # Out-of-band frequencies are free, so the normal equations are near-singular; this floor keeps the weights
 # small there (rounding of float32 samples is then not amplified) and costs less than 1e-4 in accuracy.
 _FLOOR = 3e-7
@@ -47,7 +47,7 @@ def disc_autocorrelation(frequency: Float[np.ndarray, "*s"]) -> Float[np.ndarray
     return 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v * v))
 
 
-def _speckle_spectrum(cutoff: float, width: float) -> tuple[np.ndarray, np.ndarray]:
+def speckle_spectrum(cutoff: float, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (cycles per sample) and the power of speckle, already integrated along the other axis."""
     nu = np.linspace(-cutoff, cutoff, _FREQUENCIES)
     other = np.linspace(0.0, cutoff, _FREQUENCIES)
@@ -67,14 +67,14 @@ def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: fl
     first = np.floor(centres - (taps - 1) / 2 + 0.5).astype(np.int64)
     if first.min() < 0 or first.max() + taps > samples:
         raise ValueError(f"pixels need samples {first.min()}..{first.max() + taps - 1}, but there are {samples}")
-    nu, spectrum = _speckle_spectrum(cutoff, width)
+    nu, spectrum = speckle_spectrum(cutoff, width)
     lags = np.arange(taps)
-    gram_row = (spectrum * np.cos(2 * np.pi * np.outer(lags, nu))).sum(axis=1) + _MEAN_WEIGHT
+    gram_row = (spectrum * np.cos(2 * np.pi * np.outer(lags, nu))).sum(axis=1) + MEAN_WEIGHT
     gram = gram_row[np.abs(lags[:, None] - lags[None, :])] + _FLOOR * np.eye(taps)
     offsets = first[:, None] + lags[None, :] - centres[:, None]
     target = width * np.sinc(width * nu)
     phases = np.cos(2 * np.pi * offsets[:, :, None] * nu)
-    right = (phases * (spectrum * target)).sum(axis=2) + _MEAN_WEIGHT * width
+    right = (phases * (spectrum * target)).sum(axis=2) + MEAN_WEIGHT * width
     weights = np.linalg.solve(gram, right.T).T
     response = np.einsum("pt,ptf->pf", weights, np.exp(2j * np.pi * offsets[:, :, None] * nu))
     error = np.sqrt((np.abs(response - target) ** 2 @ spectrum).mean() / (target**2 @ spectrum))

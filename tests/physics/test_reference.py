@@ -26,7 +26,7 @@ def test_wrapped_sixteen_level_plate(wavelength_m: float, pixel_m: float, fill: 
     got = psf(height, camera, [np.inf]).energy[0, 0] / camera.transmission(wavelength_m)
     wanted = oversampled_psf(camera, wavelength_m, field64(camera, height, np.inf, wavelength_m))
     assert relative_error(got, wanted) < 3e-3  # the project's target
-    # The reference's own sum is off by up to 1e-4; the rule weights the mean most (`_MEAN_WEIGHT`).
+    # The reference's own sum is off by up to 1e-4; the rule weights the mean most (`MEAN_WEIGHT`).
     assert got.sum() == pytest.approx(wanted.sum(), rel=5e-4)
 
 

@@ -22,7 +22,7 @@ def test_disc_autocorrelation_by_counting():
 def test_weights_sum_to_the_pixel(width: float):
     centres = 40 + np.linspace(-20, 20, 17)
     weights = pixel_weights(centres, width, 0.48, 81)
-    # The weight of the mean against speckle is set for 1e-5; see `_MEAN_WEIGHT`.
+    # The weight of the mean against speckle is set for 1e-5; see `MEAN_WEIGHT`.
     np.testing.assert_allclose(weights.matrix.sum(axis=0), width, rtol=3e-5)
 
 
