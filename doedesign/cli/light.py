@@ -66,21 +66,31 @@ def psf(
     print_results(folder, json_)
 
 
-def certify(run: Path, *, masks: Path | None = None, cells: int = 24, json_: AsJson = False) -> None:
-    """Prove what light does at the walls of a design: rows of it against Maxwell's equations.
+def certify(
+    run: Path,
+    *,
+    masks: Path | None = None,
+    cells: int = 24,
+    pieces: int | None = None,
+    side: int = 2,
+    json_: AsJson = False,
+) -> None:
+    """Prove what light does at the walls of a design: parts of it against Maxwell's equations.
 
-    Rows of cells are solved rigorously, in both polarisations, and compared with the design as a thin element and with
-    the light of its edges; the whole design is computed both ways.
+    Rows of cells and small squares are solved rigorously, in both polarisations, and compared with the design as a thin
+    element and with the light of its edges; the whole design is computed both ways.
 
     Args:
         run: Run folder.
         masks: Its mask order; masks/NAME by default.
         cells: Cells of a row, 4 to 64; time grows with their third power.
+        pieces: Number of squares, 0 to 13; 3 by default, 0 where the extra "rigorous" is not installed.
+        side: Cells of a square's side, 2 to 4; time grows with their sixth power.
     """
     from doedesign.runs.certificate import certify as prove
 
     folder = run / "certificate"
-    prove(run, masks, cells=cells, out=folder)
+    prove(run, masks, cells=cells, pieces=pieces, side=side, out=folder)
     print_results(folder, json_)
 
 

@@ -62,7 +62,7 @@ COMMANDS = {
         ("run", "order", "process.toml", "variation.toml"),
         "run/fabricated",
     ),
-    "certify": Command(("certify", "run", "--cells", 4), ("run", "order"), "run/certificate"),
+    "certify": Command(("certify", "run", "--cells", 4, "--pieces", 0), ("run", "order"), "run/certificate"),
     "tolerance": Command(
         ("tolerance", "run", *QUICK, "--draws", 2, "--sensitivity", "none", "--workers", 1, "--out", "out"),
         ("run", "order"),

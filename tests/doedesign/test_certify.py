@@ -1,6 +1,7 @@
 """The certificate of a design: in memory, on disk, and its words."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from sim.camera import Camera, Colour
 from sim.metrics import zeroth_order
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
+from sim.rigorous.crossed import has_crossed_solver
 from sim.rigorous.edge_optic import with_edges
 from tests.doedesign.small_runs import SPEC, call, finished_run
 
@@ -40,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(design: Design, folder: Path) -> Certificate:
-    return certify(design, cells=4, out=folder)
+    return certify(design, cells=4, pieces=0, out=folder)
 
 
 def test_the_whole_is_told_both_ways(design: Design, found: Certificate):
@@ -103,10 +105,74 @@ def test_words_say_what_to_believe(found: Certificate):
     assert last.startswith("PSFs with edges differ from scalar ones by")
 
 
+@pytest.fixture(scope="module")
+def fine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Certificate, dict]:
+    """Of a design with cells of a wavelength, whose squares have few terms."""
+    pytest.importorskip("fmmax")
+    grid, folder = Grid((24, 24), 0.5 * UM), tmp_path_factory.mktemp("fine") / "certificate"
+    camera = Camera(grid, 24 * 0.5 * UM, "fused_silica", COLOURS[:1], 1e-3, 3.7 * UM, 48)
+    level = np.random.default_rng(0).integers(0, 4, (24, 24)).astype(np.uint8)
+    level_map = LevelMap(level, Levels(4, 150 * NM), grid, camera.aperture_m, "fine")
+    found = certify(Design(level_map, camera, (), (np.inf,)), cells=4, pieces=2, out=folder)
+    return found, json.loads((folder / "certificate.json").read_text())
+
+
+def test_squares_are_recorded_beside_rows(fine: tuple[Certificate, dict]):
+    found, record = fine
+    assert len(found.pieces) == 2
+    assert len(record["pieces"]) == 4
+    along_x, along_y = record["pieces"][:2]
+    one = found.pieces[0]
+    assert (along_x["polarisation"], along_y["polarisation"]) == ("x", "y")
+    np.testing.assert_allclose(along_y["rigorous"], one.orders.rigorous[1])
+    np.testing.assert_allclose(along_x["edges"], one.orders.edges[0])
+    np.testing.assert_allclose(along_x["scalar"], one.orders.scalar)
+    np.testing.assert_allclose(along_x["height_m"], one.piece.height_m)
+    assert along_y["error_scalar"] == pytest.approx(one.orders.error(one.orders.scalar)[1])
+    assert along_y["unsettled"] == pytest.approx(one.unsettled[1])
+    assert along_x["energy"] == pytest.approx(one.orders.energy[0])
+    (whole,) = record["whole"]
+    assert whole["rows"] == found.cut_orders(550e-9)
+    means = {kind: np.mean([o.orders.zeroth(getattr(o.orders, kind)).mean() for o in found.pieces])
+             for kind in ("scalar", "edges", "rigorous")}  # fmt: skip
+    assert whole["pieces"] == pytest.approx(means)
+    assert found.cut_orders(650e-9, "pieces") is None
+
+
+def test_words_speak_of_squares_where_there_are_some(fine: tuple[Certificate, dict], found: Certificate):
+    words = in_words(fine[0])
+    thin, edges = (100 * fine[0].worst(kind, "pieces") for kind in ("scalar", "edges"))
+    assert words[1].startswith(f"squares of 2 x 2 cells against Maxwell's equations: thin off by up to {thin:.1f} %")
+    assert f"with edges {edges:.2f} % (rigorous orders settled to" in words[1]
+    means = fine[0].cut_orders(550e-9, "pieces")
+    assert means is not None
+    assert words[2].endswith(
+        f"; on the squares scalar {100 * means['scalar']:.2f} %, with edges {100 * means['edges']:.2f} %, "
+        f"rigorous {100 * means['rigorous']:.2f} %"
+    )
+    assert not any("squares" in line for line in in_words(found))
+
+
+def test_squares_need_their_package(design: Design, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "fmmax", None)
+    with pytest.raises(InputError, match=r"solutions in two dimensions need fmmax.*doedesign\[rigorous\]"):
+        certify(design, cells=4, pieces=1)
+    assert has_crossed_solver() is False
+
+
 def test_bad_input(design: Design):
     for cells in (3, 65):
         with pytest.raises(InputError, match=r"cells: must lie from 4 to 64"):
             certify(design, cells=cells)
+    for pieces in (-1, 14):
+        with pytest.raises(InputError, match=r"pieces: must lie from 0 to 13"):
+            certify(design, pieces=pieces)
+    for side in (1, 5):
+        with pytest.raises(InputError, match=r"side: must lie from 2 to 4"):
+            certify(design, pieces=1, side=side)
+    small = LevelMap(np.eye(3, dtype=np.uint8), LEVELS, Grid((3, 3), UM), 3 * UM, "small")
+    with pytest.raises(InputError, match=r"side: squares must fit into the design of 3 cells, but got 4"):
+        certify(Design(small, CAMERA, (), (np.inf,)), pieces=1, side=4)
     flat = design.level_map.with_level(np.zeros_like(design.level_map.level))
     with pytest.raises(InputError, match="must not be flat where rows are cut out"):
         certify(Design(flat, CAMERA, DEPTHS_M[:1], DEPTHS_M[1:]))
@@ -115,7 +181,7 @@ def test_bad_input(design: Design):
 def test_the_command_writes_into_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     run = finished_run(tmp_path, SPEC)
-    code, printed, said = call("certify", run, "--cells", 4)
+    code, printed, said = call("certify", run, "--cells", 4, "--pieces", 0)
     assert code == 0, said
     assert f"{run}/certificate/certificate.png" in printed
     assert "rows against Maxwell's equations" in said

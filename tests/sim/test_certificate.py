@@ -1,4 +1,4 @@
-"""Rows that are cut out of a design and solved."""
+"""Rows and squares that are cut out of a design and solved."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,11 @@ import pytest
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
+from sim.material import refractive_index
 from sim.plots.orders import plot_certificate
-from sim.rigorous import certify_rows, compare_row, cut_rows
-from sim.rigorous.certificate import CertifiedRow
+from sim.rigorous import certify_pieces, certify_rows, compare_piece, compare_row, cut_pieces, cut_rows
+from sim.rigorous.certificate import CertifiedPiece, CertifiedRow
+from sim.rigorous.crossed import travelling_terms
 
 PITCH_M = 1.85e-6
 GRID = Grid((100, 100), PITCH_M)
@@ -86,3 +88,77 @@ def test_a_picture_has_a_panel_for_errors_and_one_for_each_of_two_wavelengths(
 def test_a_picture_of_nothing_is_refused():
     with pytest.raises(ValueError, match="`rows` must not be empty"):
         plot_certificate([])
+
+
+def test_squares_lie_where_rows_do_and_have_the_highest_walls():
+    """Along the row of a place, within its reach; the outermost place first."""
+    height = np.zeros((100, 100))
+    height[45, 60], height[60, 45] = 5e-7, 6e-7  # near the axes, 11 cells from the middle
+    found = cut_pieces(height, GRID, APERTURE_M, 2, 4, cells=8, shares=(0.0, 0.25))
+    assert found == []
+    height[49, 60], height[60, 50] = 5e-7, 6e-7
+    squares = cut_pieces(height, GRID, APERTURE_M, 2, 3, cells=8, shares=(0.0, 0.25))
+    # Of the three out of four places the diagonal one is flat, and so is the middle.
+    assert [np.max(square.height_m) for square in squares] == [6e-7]
+    squares = cut_pieces(height, GRID, APERTURE_M, 2, 4, cells=8, shares=(0.0, 0.25))
+    assert [np.max(square.height_m) for square in squares] == [6e-7, 5e-7]
+    # Of squares as high as each other, the first: the cell is the last of its square.
+    np.testing.assert_array_equal(squares[1].height_m, [[0, 5e-7], [0, 0]])
+    assert squares[1].centre_m == pytest.approx((0.0 * PITCH_M, 10.0 * PITCH_M))
+
+
+def test_squares_stay_within_the_aperture_and_the_grid():
+    height = np.random.default_rng(1).integers(0, 16, (100, 100)) * 75e-9
+    for side in (2, 3, 4):
+        squares = cut_pieces(height, GRID, APERTURE_M, side, 13, cells=24)
+        assert len(squares) == 13
+        for square in squares:
+            assert square.height_m.shape == (side, side)
+            y, x = (np.array(square.centre_m) / PITCH_M + 50 - side / 2).round().astype(int)
+            np.testing.assert_array_equal(square.height_m, height[y : y + side, x : x + side])
+            corner = np.abs(square.centre_m) + (side - 1) / 2 * PITCH_M
+            assert np.hypot(*corner) <= APERTURE_M / 2
+    assert cut_pieces(height[:3, :3], Grid((3, 3), PITCH_M), 3 * PITCH_M, 4, 2, cells=24) == []
+    assert cut_pieces(height, GRID, APERTURE_M, 2, 0, cells=24) == []
+
+
+@pytest.fixture(scope="module")
+def certified_pieces() -> tuple[CertifiedPiece, ...]:
+    """Cells of a wavelength: coarse physics, and few terms."""
+    pytest.importorskip("fmmax")
+    height = np.random.default_rng(0).integers(0, 3, (100, 100)) * 150e-9
+    grid = Grid((100, 100), 0.5e-6)
+    squares = cut_pieces(height, grid, 50e-6, 2, 2, cells=4)
+    return certify_pieces(squares, Camera(grid, 50e-6, "fused_silica", (GREEN,), 8e-3, 3.7e-6, 64), (552e-9,))
+
+
+def test_the_finer_solution_of_a_square_is_the_one_that_is_told(certified_pieces: tuple[CertifiedPiece, ...]):
+    assert len(certified_pieces) == 2
+    one, index = certified_pieces[0], refractive_index("fused_silica", 552e-9)
+    given = (0.5e-6, 552e-9, index)
+    coarse, finer = (
+        compare_piece(one.piece.height_m, *given, travelling_terms((2, 2), *given, waves)) for waves in (1.1, 1.25)
+    )
+    np.testing.assert_allclose(one.orders.rigorous, finer.rigorous, atol=1e-9)
+    assert one.unsettled == pytest.approx(finer.error(coarse.rigorous), rel=1e-6)
+    # Two dozen terms: some per cent.
+    assert 0 < one.unsettled.max() < 0.1
+    # The directions of walls make matrices that are not Hermitian, so energy is kept up to terms that are missing.
+    assert one.orders.energy == pytest.approx([1, 1], abs=0.01)
+
+
+def test_a_picture_has_squares_beside_rows(
+    certified: tuple[CertifiedRow, ...], certified_pieces: tuple[CertifiedPiece, ...]
+):
+    figure = plot_certificate(certified[:2], "name", pieces=certified_pieces)
+    _, errors, orders, squares = figure.axes  # type: ignore[union-attr]
+    points = errors.get_lines()[1].get_ydata()
+    wanted = [100 * one.orders.error(one.orders.edges).mean() for one in certified_pieces]
+    np.testing.assert_allclose(points, wanted)
+    worst = max(certified_pieces, key=lambda one: one.orders.error(one.orders.scalar).max())
+    bars = [bar.get_height() for bar in squares.patches]
+    np.testing.assert_allclose(bars, 100 * worst.orders.rigorous.mean(0).ravel())
+    np.testing.assert_allclose(squares.get_lines()[0].get_ydata(), 100 * worst.orders.scalar.ravel())
+    assert len(orders.patches) == 9
+    assert errors.get_title(loc="left") == "squares of 2 x 2 cells"
+    assert png_bytes(figure)[:4] == b"\x89PNG"
