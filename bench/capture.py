@@ -94,16 +94,18 @@ def report_capture() -> None:
     disc = fast_length(PIXELS + shadow_px(scene, optics) - 1)
     print(f"Capture of {PIXELS} x {PIXELS} pixels, {COLOURS} colours, PSFs of {WINDOW} x {WINDOW} at two depths, noise")
     for what, given, learned in (
-        ("PSFs at rest", optics.prepared(shape), False),
+        ("PSFs at rest", optics.prepared(shape, depths_m=(np.inf, 0.05)), False),
         ("PSFs being learned", optics, True),
     ):
         for model in MODELS:
-            # Forward and back at full size; and those of the shadow disc, which is smaller.
-            kernels, there, again, smaller = {
-                "radiometric": (2, 6, 3, (2, 1, disc)),
-                "reciprocal": (4, 12, 3, (8, 7, disc)),
-            }.get(model, (2, 7, 9, None))
-            floor = bare(there + learned * kernels * COLOURS, again, smaller)
+            # Forward and back at full size; those of the shadow disc, which is smaller; and what PSFs need besides:
+            # forward for every layer, and forward and back for the common part.
+            kernels, common, there, again, smaller = {
+                "radiometric": (2, 0, 6, 3, (2, 1, disc)),
+                "reciprocal": (4, COLOURS, 12, 3, (8, 7, disc)),
+            }.get(model, (2, 0, 7, 9, None))
+            more = learned * (kernels * COLOURS + 2 * common), learned * common
+            floor = bare(there + more[0], again + more[1], smaller)
             seconds = time_rounds({"floor": floor, "capture": noisy(scene, given, model)}, ROUNDS)
             ratios = seconds["capture"] / seconds["floor"]
             met = "" if model != "radiometric" else "   " + verdict(float(np.median(ratios)), TARGET_RATIO)

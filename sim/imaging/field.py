@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from fab.grid import Grid
 from sim.camera import Camera
+from sim.imaging.common import with_common
 from sim.imaging.convolve import (
     Border,
     Otf,
@@ -33,7 +34,7 @@ from sim.imaging.convolve import (
     tiles,
 )
 from sim.imaging.formation import Optics, check_layers, shadow_discs, shadow_px
-from sim.imaging.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light, with_spot
+from sim.imaging.occlusion import Layers, Light, Model, Outside, check_names, compose, follows_light
 from sim.imaging.scene import Scene
 from sim.psf_bank import PsfBank
 
@@ -118,7 +119,7 @@ def capture_frame(
 
     frame = np.empty(scene.background.shape, np.float32)
     for colour in range(len(frame)):
-        imaging = _FramePlan.of(optics, colour, shape, border, length, spot=model == "reciprocal")
+        imaging = _FramePlan.of(optics, colour, shape, border, length, discs if model == "reciprocal" else ())
         radiances = tuple(np.asarray(near.radiance[colour]) for near in scene.obstructions)
         layers = Layers(np.asarray(scene.background[colour]), masks, radiances)
         frame[colour] = compose(layers, kept, shaded, imaging, model, outside)
@@ -136,10 +137,18 @@ class _FramePlan(NamedTuple):
 
     @classmethod
     def of(
-        cls, optics: FieldOptics, colour: int, shape: Window, border: Border, length: Window | None, spot: bool
+        cls,
+        optics: FieldOptics,
+        colour: int,
+        shape: Window,
+        border: Border,
+        length: Window | None,
+        discs: Sequence[np.ndarray],
     ) -> "_FramePlan":
-        """Transform the PSFs of one colour, with the layers of `with_spot` where they are wanted."""
-        psf = np.asarray(with_spot(optics.psf[:, :, :, colour]) if spot else optics.psf[:, :, :, colour])
+        """Transform the PSFs of one colour, with the layers of `with_common` where shadow discs are given."""
+        psf = optics.psf[:, :, :, colour]
+        if discs:
+            psf = np.stack([[np.asarray(with_common(node, discs)) for node in row] for row in psf])
         window = (psf.shape[-2], psf.shape[-1])
         pieces = tuple(tiles(shape, window, border, length or tile_length(shape, window, border)))
         needed = (len(pieces[0].rows), len(pieces[0].columns))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim.camera import Camera
+from sim.imaging.common import with_common
 from sim.imaging.convolve import Border, Otf, Window, convolve, plan_otf, superpose
 from sim.imaging.disc import disc_window, shadow_disc
 from sim.imaging.occlusion import (
@@ -24,7 +25,6 @@ from sim.imaging.occlusion import (
     compose,
     eq_10_alpha,
     follows_light,
-    with_spot,
 )
 from sim.imaging.scene import Depth, Scene
 from sim.psf_bank import PsfBank
@@ -42,7 +42,8 @@ class Optics(eqx.Module):
         pixel_m: pixel pitch, metres.
         shadow_px: pixels of the odd window that holds every shadow disc, where depths are traced; otherwise the depths
             say it. A traced depth whose disc does not fit gives NaN, never a smaller shadow.
-        otf: transforms of the PSFs, with the layers of `with_spot`, once they are `prepared`.
+        otf: transforms of the PSFs, once they are `prepared`.
+        otf_depths_m: depths of all layers for which `reciprocal` is prepared, the background's first, metres; or empty.
     """
 
     psf: Float[Array, "layer c ky kx"] | Float[np.ndarray, "layer c ky kx"]
@@ -51,6 +52,7 @@ class Optics(eqx.Module):
     pixel_m: float = eqx.field(static=True)
     shadow_px: int | None = eqx.field(static=True, default=None)
     otf: Otf | None = None
+    otf_depths_m: tuple[float, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(cls, bank: PsfBank, camera: Camera, depths_m: Sequence[float]) -> "Optics":
@@ -67,15 +69,19 @@ class Optics(eqx.Module):
             raise ValueError(f"an obstruction must be nearer than what it covers, but got {near} m before {far} m")
         return width * (1 / near - 1 / far)
 
-    def prepared(self, shape: Window, border: Border = "reflect") -> "Optics":
+    def prepared(self, shape: Window, border: Border = "reflect", depths_m: Sequence[float] = ()) -> "Optics":
         """The same optics with the PSFs' transforms, for many scenes of one shape.
 
         Args:
             shape: pixels (y, x) of the scenes; with their own margin and a model that follows the light, less the
                 margin that the shadow discs take (`capture`).
             border: what lies beyond a scene.
+            depths_m: depths of all layers of the scenes, the background's first, metres. `reciprocal` needs them.
         """
-        return replace(self, otf=plan_otf(with_spot(self.psf.swapaxes(0, 1)), shape, border))
+        kernels = jnp.swapaxes(jnp.asarray(self.psf), 0, 1)
+        if depths_m:
+            kernels = with_common(kernels, _discs(depths_m, self, self.shadow_px or _disc_px(depths_m, self)))
+        return replace(self, otf=plan_otf(kernels, shape, border), otf_depths_m=tuple(map(float, depths_m)))
 
 
 def _known(depth_m: Depth) -> float | None:
@@ -118,11 +124,16 @@ def capture(
     if optics.otf is not None and (optics.otf.shape, optics.otf.border) != (lit, border):
         wanted, got = f"{lit} and {border!r}", f"{optics.otf.shape} and {optics.otf.border!r}"
         raise ValueError(f"`optics` must be prepared for the shape and border {wanted}, but got {got}")
+    if optics.otf is not None and model == "reciprocal":
+        depths = tuple(_known(depth) for depth in _depths(scene))
+        if depths != optics.otf_depths_m:
+            wanted, got = f"the depths {depths}", f"{optics.otf_depths_m}"
+            raise ValueError(f"`optics` must be prepared for {wanted} of the scene, but got {got}")
     discs = shadow_discs(scene, optics, window) if follows_light(model) else ()
     kernels = optics.otf
     if kernels is None:
         kernels = jnp.swapaxes(jnp.asarray(optics.psf), 0, 1)
-        kernels = jnp.asarray(with_spot(kernels)) if model == "reciprocal" else kernels
+        kernels = with_common(kernels, discs) if model == "reciprocal" else kernels
     layers = Layers(
         scene.background, tuple(o.mask for o in scene.obstructions), tuple(o.radiance for o in scene.obstructions)
     )
@@ -216,9 +227,18 @@ def shadow_px(scene: Scene, optics: Optics) -> int:
     """
     if optics.shadow_px is not None:
         return optics.shadow_px
-    depths = [scene.background_depth_m, *(near.depth_m for near in scene.obstructions)]
+    depths = _depths(scene)
     if any(_known(depth) is None for depth in depths):
         raise ValueError("`Optics.shadow_px` must be given where depths are traced, but got None")
+    return _disc_px(depths, optics)
+
+
+def _depths(scene: Scene) -> list[Depth]:
+    """Depths of all layers, the background first."""
+    return [scene.background_depth_m, *(near.depth_m for near in scene.obstructions)]
+
+
+def _disc_px(depths: Sequence[Depth], optics: Optics) -> int:
     widths = [optics.disc_px(near, behind) for k, near in enumerate(depths) for behind in depths[:k]]
     largest = max((disc_window(float(width)) for width in widths), default=1)
     return 16 * ((largest + 14) // 16) + 1
@@ -226,10 +246,13 @@ def shadow_px(scene: Scene, optics: Optics) -> int:
 
 def shadow_discs(scene: Scene, optics: Optics, window: int) -> tuple[Array, ...]:
     """For every obstruction, the shadow disc `[behind, y, x]` of points of each layer behind it."""
-    depths = [scene.background_depth_m, *(near.depth_m for near in scene.obstructions)]
+    return _discs(_depths(scene), optics, window)
+
+
+def _discs(depths: Sequence[Depth], optics: Optics, window: int) -> tuple[Array, ...]:
     return tuple(
-        jnp.stack([jnp.asarray(shadow_disc(optics.disc_px(near.depth_m, behind), window)) for behind in depths[:count]])
-        for count, near in enumerate(scene.obstructions, start=1)
+        jnp.stack([jnp.asarray(shadow_disc(optics.disc_px(near, behind), window)) for behind in depths[:count]])
+        for count, near in enumerate(depths[1:], start=1)
     )
 
 

@@ -12,17 +12,16 @@ multiplied, as if shadows in one bundle were independent: exact where they do no
 second approximation is that a partly blocked pupil has the PSF of the open one, only weaker. So a uniform world stays
 uniform where p_near = p_far ∗ d, as for a lens alone or a plate of straight lines; with others its *energy* does.
 
-`reciprocal` needs no such thing for the wide part of the PSF. In even light the picture is known exactly, by
-reciprocity: what a dark bar takes is what a bright one would send, p_near ∗ M. The sharp spot of the far PSF comes from
-every part of the aperture alike, so it dims by the shadow of each single point. Every part of the obstruction stands
-before a disc of the background, d ∗ I_far in the mean, so that it takes T = M · (d ∗ I_far), and
+`reciprocal` lets a shadow change the shape of the PSF, as far as both PSFs tell how. In even light the picture is known
+exactly, by reciprocity: what a dark bar takes is what a bright one would send, p_near ∗ M. Every part of the
+obstruction stands before a disc of the background, d ∗ I_far in the mean, so that it takes T = M · (d ∗ I_far), and
 
-    I = p_far ∗ I_far + p_near ∗ (M · I_obs - T) + p_spot ∗ (d ∗ T - (d ∗ M) · I_far),
+    I = p_far ∗ I_far + p_near ∗ (M · I_obs - T) + p_common ∗ (d ∗ T - (d ∗ M) · I_far),
 
-where p_spot is the middle of p_far. As much light is lost as in `radiometric`, and for a lens alone the two are equal;
-a uniform world stays uniform for every plate. T lands scaled to the energy of p_far in its window, so that an even
-light behind a cover is gone. What is taken from a bright point's halo is taken a little aside of where it lands, which
-may leave light slightly below zero.
+where p_common is the part of p_far that every part of the aperture sends alike (`sim.imaging.common`): all of it for a
+lens, a straight grating or a diffuser, for which the model is `radiometric` again. As much light is lost as there; a
+uniform world stays uniform for every plate, and hidden points leave next to nothing. T lands scaled to the energy of
+p_far in its window, so that an even light behind a cover is gone. Light may fall slightly below zero.
 
 `paper` is eq. 10 as printed, with α = p_obs ∗ M for every colour:
 
@@ -36,25 +35,25 @@ hidden. In even light it is exact, too.
 
 Under both, `outside` says what I_obs holds where there is no obstruction, which eq. 10 leaves open: the scene behind
 (the public code for dirt and fences) or nothing (for raindrops). Several obstructions are laid over each other from the
-farthest to the nearest. `sim.imaging.shadow` judges all models, and examples/compare_occlusion.py shows by how much
-each is off for a plate. Say which one was used wherever a result is shown; none is a default.
+farthest to the nearest. Say which model was used wherever a result is shown; none is a default.
+
+examples/occlusion_table.py judges them by wave optics, for six kinds of plates and four obstructions, and
+examples/compare_occlusion.py for the plate of a run. What none of them knows is the changed interference of a partly
+shaded aperture, whose spots are wider: it matters for single bright points.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol, get_args, runtime_checkable
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 Model = Literal["paper", "paper_release", "radiometric", "reciprocal"]
 Outside = Literal["scene", "nothing"]
 Light = Array | np.ndarray
 
 _RELEASE_GAIN = 1.5  # of alpha, in the public code
-# What counts as the sharp spot of a far PSF: wide enough for an Airy disc of a slow lens, narrow against any halo.
-_SPOT_PX = 6
 
 
 class Layers(eqx.Module):
@@ -93,7 +92,7 @@ def radiometric(layers: Layers, kept: Sequence[Light], imaging: Imaging) -> Ligh
 
 
 def reciprocal(layers: Layers, kept: Sequence[Light], shaded: Callable[[int, Light], Light], imaging: Imaging) -> Light:
-    """Light on the sensor by the model `reciprocal`; `imaging` has the layers of `with_spot`.
+    """Light on the sensor by the model `reciprocal`; `imaging` has the layers of `sim.imaging.common.with_common`.
 
     Among each other obstructions take light as in `radiometric`; what several of them take from the background is
     counted once, for the farthest. `shaded` blurs the background's light by the shadow disc of the obstruction of that
@@ -110,15 +109,16 @@ def reciprocal(layers: Layers, kept: Sequence[Light], shaded: Callable[[int, Lig
         return _cut(light, back[0].shape) if back else light
 
     background, passed = cut(layers.background), 1.0
-    own = []
+    own, moved = [], []
     for number, (mask, radiance) in enumerate(zip(layers.masks, layers.radiances, strict=True)):
         light = cut(mask * radiance)
         for nearer in kept[number + 1 :]:
             light = cut(nearer[number + 1]) * light
         own.append(light)
-        passed = passed * cut(kept[number][0])
-    spot = sum(back, (passed - 1) * background)
-    return imaging.total([background, *own, spot, *(-cut(light) for light in taken)])
+        left = passed * cut(kept[number][0])
+        moved.append(back[number] + (left - passed) * background)
+        passed = left
+    return imaging.total([background, *own, *moved, *(-cut(light) for light in taken)])
 
 
 def eq_10(layers: Layers, imaging: Imaging, release: bool, outside: Outside) -> Light:
@@ -158,16 +158,6 @@ def compose(
 def follows_light(model: Model) -> bool:
     """Whether a model knows shadow discs."""
     return model in ("radiometric", "reciprocal")
-
-
-def with_spot(psf: Float[Array, "*k layer y x"] | Float[np.ndarray, "*k layer y x"]) -> Light:
-    """PSFs of all layers, the sharp spot of the first (the background's), and every other one scaled to its energy."""
-    y, x = (np.arange(n) - (n - 1) / 2 for n in psf.shape[-2:])
-    inside = (np.hypot(y[:, None], x) <= _SPOT_PX).astype(np.float32)
-    energy = psf.sum(axis=(-2, -1), keepdims=True)
-    library = np if isinstance(psf, np.ndarray) else jnp
-    scaled = psf[..., 1:, :, :] * energy[..., :1, :, :] / library.maximum(energy[..., 1:, :, :], 1e-12)
-    return library.concatenate([psf, psf[..., :1, :, :] * inside, scaled], axis=-3)
 
 
 def check_names(model: str, outside: str) -> None:

@@ -145,8 +145,8 @@ def test_a_lens_alone_is_the_same_to_both_models_that_follow_light(rng: np.rando
     np.testing.assert_allclose(one, other, atol=3e-6)
 
 
-def test_a_hidden_point_leaves_no_spot_and_no_light_in_all():
-    """A point in full shadow keeps no spot, and as much is taken from the halo as the point would have sent."""
+def test_a_hidden_point_leaves_no_light():
+    """A point in full shadow sends nothing, whatever the plate: half of it to a spot, half to a ring, as here."""
     far = 0.5 * spot(1.0) + 0.5 * ring(1.0)
     near = 0.5 * fftconvolve(spot(1.0), shadow_disc(25.6, 27), mode="same") + 0.5 * ring(1.0)
     mask = np.zeros((96, 100), np.float32)
@@ -155,9 +155,9 @@ def test_a_hidden_point_leaves_no_spot_and_no_light_in_all():
     point[:, 48, 50] = 1.0
     scene = Scene(point, np.inf, (Obstruction(mask, even(0.0), DEPTH_M),))
     image = np.asarray(capture(scene, optics_of(far, near), "reciprocal"))
-    # Where the point was there is nothing; its halo is known only as a whole, so there the sum alone is nothing.
-    np.testing.assert_allclose(image[0, 48, 50], 0.0, atol=1e-3)
-    np.testing.assert_allclose(image.sum(axis=(1, 2)), 0.0, atol=1e-3)
+    # Float32 transforms; and of single pixels, what counts as common because it is slow: 1.1e-4 of a point of 1.
+    np.testing.assert_allclose(image.sum(axis=(1, 2)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(image, 0.0, atol=2e-4)
 
 
 @pytest.mark.parametrize("model", ["paper", "paper_release", "radiometric", "reciprocal"])

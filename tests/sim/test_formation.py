@@ -94,7 +94,8 @@ def test_eq_10_term_by_term(rng):
 @pytest.mark.parametrize("model", MODELS)
 def test_prepared_optics_give_the_same(rng, model: Model):
     scene, optics = scene_of(rng), optics_of(blurs(rng))
-    np.testing.assert_allclose(capture(scene, optics.prepared(SHAPE), model), capture(scene, optics, model), atol=1e-6)
+    prepared = optics.prepared(SHAPE, depths_m=(np.inf, 0.1))
+    np.testing.assert_allclose(capture(scene, prepared, model), capture(scene, optics, model), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -151,7 +152,7 @@ def test_a_scene_with_its_own_margin(rng, model: Model):
     assert own.shape == (3, 60 - lost, 70 - lost)
     half = lost // 2
     np.testing.assert_allclose(own, whole[:, half:-half, half:-half], atol=3e-6)
-    prepared = optics.prepared((60 - lost + 6, 70 - lost + 6), "own")
+    prepared = optics.prepared((60 - lost + 6, 70 - lost + 6), "own", (np.inf, 0.1))
     np.testing.assert_allclose(capture(scene, prepared, model, border="own"), own, atol=1e-6)
 
 
@@ -202,6 +203,9 @@ def test_what_does_not_fit_is_refused(rng):
         capture(eqx.tree_at(lambda s: s.background_depth_m, scene, 0.1), optics, "radiometric")
     with pytest.raises(ValueError, match="must be prepared for the shape"):
         capture(scene, optics.prepared((24, 31)), "paper")
+    for depths in ((), (np.inf, 0.2)):
+        with pytest.raises(ValueError, match=r"must be prepared for the depths \(inf, 0\.1\)"):
+            capture(scene, optics.prepared(SHAPE, depths_m=depths), "reciprocal")
     odd = eqx.tree_at(lambda s: s.obstructions[0].mask, scene, np.zeros((24, 31), np.float32))
     with pytest.raises(ValueError, match="must have the background's shape"):
         capture(odd, optics, "paper")

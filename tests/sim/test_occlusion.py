@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim.imaging.occlusion import Layers, eq_10, eq_10_alpha, follows_light, radiometric, reciprocal, with_spot
+from sim.imaging.occlusion import Layers, eq_10, eq_10_alpha, follows_light, radiometric, reciprocal
 from sim.imaging.occlusion import check_names as check
 
 SHAPE = (3, 4)
-SPOT, GAIN = 6, 1.5  # pixels of the sharp spot; what the public code multiplies alpha with
+GAIN = 1.5  # what the public code multiplies alpha with
 
 
 class Plain:
@@ -39,31 +39,6 @@ def mean(light) -> float:
 LAYERS = Layers(flat(0.8), (flat(0.5), flat(0.25)), (flat(0.2), flat(0.4)))
 
 
-@pytest.mark.parametrize("shape", [(21, 24), (24, 21)])
-@pytest.mark.parametrize("library", [np, jnp])
-def test_the_spot_is_the_middle_of_the_background_and_layers_have_its_energy(shape: tuple[int, int], library):
-    psf = np.random.default_rng(0).uniform(0.5, 1.5, (2, 3, *shape)).astype(np.float32)
-    found = np.asarray(with_spot(library.asarray(psf)))
-    assert found.shape == (2, 6, *shape)
-    np.testing.assert_array_equal(found[:, :3], psf)
-    kept = found[:, 3] != 0
-    # A disc about the middle, between four pixels where there is an even number.
-    y, x = np.indices(shape)
-    distance = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2)
-    np.testing.assert_array_equal(kept, np.broadcast_to(distance <= SPOT, kept.shape))
-    np.testing.assert_array_equal(found[:, 3][kept], psf[:, 0][kept])
-    # Sums of 500 pixels in single precision.
-    np.testing.assert_allclose(found[:, 4:].sum((2, 3)), psf[:, :1].sum((2, 3)) * [1, 1], rtol=1e-5)
-    ratio = found[:, 4:] / psf[:, 1:]
-    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[..., :1, :1], ratio.shape), rtol=1e-5)
-
-
-def test_a_layer_without_light_stays_dark():
-    psf = np.ones((2, 5, 5), np.float32)
-    psf[1] = 0
-    assert not with_spot(psf)[3].any()
-
-
 def test_radiometric_light_is_what_every_layer_sends_and_nearer_ones_let_through():
     # The far obstruction lets 0.6 of the background pass; the near one 0.7 of it and 0.9 of the far one's own light.
     kept = [jnp.stack([flat(0.6)]), jnp.stack([flat(0.7), flat(0.9)])]
@@ -74,12 +49,12 @@ def test_radiometric_light_is_what_every_layer_sends_and_nearer_ones_let_through
 
 
 def test_reciprocal_light_by_hand():
-    """What each obstruction takes from the background, counted once, is missing from the spot and from the halo."""
+    """What each obstruction takes from the background, counted once, is missing; the common part lands elsewhere."""
     kept = [jnp.stack([flat(0.6)]), jnp.stack([flat(0.7), flat(0.9)])]
-    energies = (0.9, 0.8, 0.7, 0.3, 0.5, 0.4)
+    energies = (0.9, 0.8, 0.7, 0.3, 0.2, 0.5, 0.4)
     far, near = 0.5 * 0.8, 0.25 * 0.5 * 0.8  # taken by the far obstruction, and by the near one of what is left
-    spot = far + near + (0.6 * 0.7 - 1) * 0.8
-    wanted = 0.9 * 0.8 + 0.8 * 0.5 * 0.2 * 0.9 + 0.7 * 0.25 * 0.4 + 0.3 * spot - 0.5 * far - 0.4 * near
+    moved = 0.3 * (far - 0.4 * 0.8) + 0.2 * (near - 0.6 * 0.3 * 0.8)
+    wanted = 0.9 * 0.8 + 0.8 * 0.5 * 0.2 * 0.9 + 0.7 * 0.25 * 0.4 + moved - 0.5 * far - 0.4 * near
     found = reciprocal(LAYERS, kept, lambda _, light: light, Plain(*energies))
     assert mean(found) == pytest.approx(wanted, rel=1e-6)
 
