@@ -8,6 +8,7 @@ Reading order:
 
     measurement     the TOML file of a measurement and its images
     unknowns        which errors are looked for, and their prior
+    geometry        how the camera stood, which is looked for with them
     forward_model   the model: from errors to images, and gradients back
     target          one measured image beside its model
     objective       all of it as one least-squares objective, with derivatives

@@ -15,6 +15,7 @@ from doedesign.build import with_edge_moves
 from doedesign.calibration.files import write_calibration
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import ForwardModel
+from doedesign.calibration.geometry import QUANTITIES, geometry_label, geometry_text
 from doedesign.calibration.measurement import Measurement, read_measurement
 from doedesign.calibration.objective import FitObjective, Linearization, OnModel
 from doedesign.calibration.plots import plot_fitted_psfs
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("doedesign")
 
 _EXPLAINED = 1.5  # chi2 per pixel up to which images count as explained
+_SURPRISING = 3.0  # standard deviations of the prior, of the camera's geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +89,26 @@ class Calibration:
         values = zip(self.objective.unknowns.names, self.posterior.values, self.posterior.sigma, strict=True)
         return {name: value_text(name, float(value), float(sigma)) for name, value, sigma in values}
 
+    @property
+    def camera(self) -> dict[str, str]:
+        """Everything that was looked for of the camera, in words, with its standard deviation: "1.002 ± 0.004 °"."""
+        values, sigmas = self.posterior.geometry, self.posterior.geometry_sigma
+        unknown = self.objective.model.geometry.unknown
+        return {QUANTITIES[k]: geometry_text(QUANTITIES[k], float(values[k]), float(sigmas[k])) for k in unknown}
+
+    @property
+    def rows(self) -> dict[str, str]:
+        """Errors and camera in words, by their labels."""
+        errors = {error_label(name): text for name, text in self.estimates.items()}
+        return errors | {geometry_label(name): text for name, text in self.camera.items()}
+
     def __str__(self) -> str:
-        """The estimates, a line per error."""
-        labels = {error_label(name): name for name in self.estimates}
-        wide = max(map(len, labels))
+        """The estimates, a line per error and per unknown of the camera."""
+        wide = max(map(len, self.rows))
         lines = [f"{self.posterior.chi2_per_pixel:.4g} chi2 per pixel after {self.models} plates"]
-        for label, name in labels.items():
-            note = "" if self.determined[name] else "  (not determined)"
-            lines.append(f"{label:<{wide}}  {self.estimates[name]}{note}")
+        loose = {error_label(name) for name, determined in self.determined.items() if not determined}
+        for label, text in self.rows.items():
+            lines.append(f"{label:<{wide}}  {text}{'  (not determined)' if label in loose else ''}")
         order = next(r for r in self.readings if r.quantity == "zeroth_order").predicted
         lines.append(f"zeroth order {100 * order[0]:.3g} ± {100 * order[1]:.2g} %")
         return "\n".join([*lines, *self.remarks])
@@ -104,9 +118,8 @@ class Calibration:
         return plot_fitted_psfs(self, ax)
 
     def _repr_html_(self) -> str:
-        rows = {error_label(name): text for name, text in self.estimates.items()}
         title = f"{self.process.name}: {self.posterior.chi2_per_pixel:.3g} chi2 per pixel"
-        return html_of(title, {**rows, "remarks": " ".join(self.remarks)}, self.plot())
+        return html_of(title, {**self.rows, "remarks": " ".join(self.remarks)}, self.plot())
 
 
 def calibrate(
@@ -172,9 +185,10 @@ def _calibrated(
     fill = design.camera.fill if spec.fill_factor is None else spec.fill_factor
     probe = (Colour("probe", (spec.probe_m,), (1.0,)),)
     camera = replace(design.camera, colours=probe, pixel_m=spec.pixel_m, window=measurement.window, fill=fill)
-    model = ForwardModel(design.level_map.level, camera, unknowns, tuple(image.depth_m for image in images))
+    depths, geometry = tuple(image.depth_m for image in images), spec.camera.prior
+    model = ForwardModel(design.level_map.level, camera, unknowns, depths, geometry)
     nominal = model.plate(unknowns.start)
-    expected = [nominal.image(i, np.zeros(3)) for i in range(len(images))]
+    expected = [nominal.image(i, np.array([0.0, 0.0, 0.0, *geometry.mean])) for i in range(len(images))]
     targets = (target_of(image, measurement.window, like) for image, like in zip(images, expected, strict=True))
     objective = FitObjective(model, tuple(targets))
     fit = search(objective, evaluations=evaluations, polish=polish, seed=seed, on_model=counted)
@@ -243,6 +257,12 @@ def remarks_on(result: Calibration, expected: Float[np.ndarray, "y x"]) -> Itera
     if at_end.any():
         names = [name for name, ends in zip(unknowns.names, at_end, strict=True) if ends]
         yield f"At the end of the range that was looked at: {', '.join(names)}."
+    prior = result.objective.model.geometry
+    for kind in prior.unknown:
+        away = (posterior.geometry[kind] - prior.mean[kind]) / prior.sigma[kind]
+        if abs(away) > _SURPRISING:
+            found = f"The {geometry_label(QUANTITIES[kind])}, {result.camera[QUANTITIES[kind]]}, is {abs(away):.2g}"
+            yield f"{found} standard deviations from what was expected: check the bench and the measurement's [camera]."
     if result.rises and not all(0.5 < rise < 2 for rise in result.rises):
         text = ", ".join(f"{rise:.2g}" for rise in result.rises)
         yield f"The posterior is not normal where it is widest: the cost rises by {text} instead of 1."

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from doedesign.build import is_process_file, spec_from_process
+from doedesign.calibration.geometry import QUANTITIES
 from doedesign.calibration.plots import plot_check, plot_estimates, plot_explanations, plot_fitted_psfs
 from doedesign.design.design import Design
 from doedesign.spec import load_process, process_to_toml, variation_to_toml
@@ -53,7 +54,7 @@ def write_calibration(
 
 
 def _record(result: "Calibration") -> dict[str, Any]:
-    """A calibration as plain values, SI units."""
+    """A calibration as plain values, SI units; errors come before the camera in correlations."""
     unknowns, posterior, at = result.objective.unknowns, result.posterior, result.fit.at
     images = []
     for i, found in enumerate(at.matches):
@@ -83,6 +84,16 @@ def _record(result: "Calibration") -> dict[str, Any]:
                 "determined": result.determined[name],
             }
             for i, name in enumerate(unknowns.names)
+        ],
+        "camera": [
+            {
+                "name": name,
+                "value": float(posterior.geometry[kind]),
+                "sigma": float(posterior.geometry_sigma[kind]),
+                "prior_mean": result.objective.model.geometry.mean[kind],
+                "prior_sigma": result.objective.model.geometry.sigma[kind],
+            }
+            for kind, name in enumerate(QUANTITIES)
         ],
         "correlation": np.round(posterior.correlation, 6).tolist(),
         "chi2_per_pixel": posterior.chi2_per_pixel,

@@ -2,8 +2,10 @@
 
 1. `scipy.optimize.least_squares` (dogbox: Gauss-Newton within a trust region and the errors' range) follows the model's
    differences from the prior means.
-2. If that leaves the images unexplained, NLopt's controlled random search (CRS2) looks through the whole range with a
-   bounded number of models, and the steps begin again at the best of them.
+2. If that explains hardly more than the design does, the same begins again with all images a pixel elsewhere: found by
+   their likeness to a plate that is quite different, they may lie off by more than a grain of the light.
+   If the images stay unexplained, NLopt's controlled random search (CRS2) looks through the whole range with a bounded
+   number of models, and the steps begin again at the best of them.
 3. On request `scipy.optimize.minimize` (SLSQP) follows the exact gradient, taken backwards through light and DOE.
 
 Weights come from the measurement at first and from the model as soon as that explains the images.
@@ -19,6 +21,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.optimize import LinearConstraint, least_squares, minimize
 
+from doedesign.calibration.geometry import REACH
 from doedesign.calibration.objective import WIDEST_STEP, Evaluation, FitObjective, Jacobian, Linearization, OnModel
 from doedesign.calibration.target import measured_weights, weights_at
 
@@ -29,6 +32,9 @@ _FINEST = 1e-6  # relative; such steps are lost in the single precision of the l
 _SETTLED = 0.1  # standard deviations of the result that a last step may still move
 # Relative error of the DOE's light that the model expects of itself (`sim.surface`), beside the transform's.
 _DOE_ERROR = 4e-3
+# Pixels (y, x) by which images may lie off where they look most like the design, beside a fraction of one.
+_SHIFTS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_ASTRAY = 0.05  # of the chi2 of the plate that the search begins with: where more is left, it went astray
 _EXPLAINED = 3.0  # chi2 per pixel below which the model knows the noise better than the pixels do
 
 
@@ -44,7 +50,7 @@ def search(
 
     Args:
         objective: images and model.
-        evaluations: models that the global search may compute; 0 to leave it out.
+        evaluations: models that the global search may compute; 0 to leave it and the shifted starts out.
         polish: steps along the exact gradient at the end; 0 to leave it out.
         seed: seed of the global search.
         on_model: called after every model (a central difference counts as one) from several threads, with words on how
@@ -58,9 +64,14 @@ def search(
     transforms = (model.optic(i, nominal.grid).plan for i in range(len(targets)))
     errors = [float(np.hypot(plan.expected_error, _DOE_ERROR)) for plan in transforms]
     measured = tuple(map(measured_weights, targets, errors))
-    scores = np.concatenate([unknowns.scores(unknowns.start), np.zeros(len(objective.motions))])
+    scores = np.concatenate([unknowns.scores(unknowns.start), np.zeros(objective.scores - objective.errors)])
     start = objective.evaluate(measured, scores, nominal)
     found = _local(start, errors, on_model)
+    for shift in _SHIFTS if evaluations else ():
+        if found.at.chi2 <= max(_ASTRAY * start.chi2, _EXPLAINED * objective.pixels):
+            break
+        other = _local(_shifted(start, shift), errors, on_model)
+        found = min(found, other, key=lambda one: one.at.reweighted(measured).cost)
     if evaluations and found.at.chi2 > _EXPLAINED * objective.pixels:
         other = _local(_global(start, evaluations, seed, on_model), errors, on_model)
         # Compared under the weights that know nothing of either.
@@ -70,6 +81,15 @@ def search(
         if after is not found.at:
             found = after.linearised(after.difference_jacobian(found.steps, on_model))
     return found
+
+
+def _shifted(start: Evaluation, shift: tuple[int, int]) -> Evaluation:
+    """The same model with all images moved by some pixels."""
+    objective, scores = start.objective, start.scores.copy()
+    for i in range(len(objective.targets)):
+        for place, (kind, unit) in objective.motion_units(i).items():
+            scores[place] += shift[kind] / unit if kind < len(shift) else 0.0
+    return objective.evaluate(start.weights, scores, start.doe)
 
 
 def _global(start: Evaluation, evaluations: int, seed: int, on_model: OnModel) -> Evaluation:
@@ -139,11 +159,14 @@ class _LeastSquares:
     def __init__(self, start: Linearization, explained: bool, on_model: OnModel) -> None:
         self.found, self.best, self.explained, self.on_model = start, start.at, explained, on_model
         self.objective = start.at.objective
-        unknowns, motions = self.objective.unknowns, len(self.objective.motions)
+        unknowns, motions = self.objective.unknowns, self.objective.scores - self.objective.errors
         errors = np.linalg.solve(unknowns.root, np.diag(unknowns.sigma))
         self.scores_per_x = np.asarray(block_diag(errors, np.eye(motions)), np.float64)
         ends = [(end - unknowns.mean) / unknowns.sigma for end in (unknowns.low, unknowns.high)]
-        free, start_x = np.full(motions, np.inf), np.linalg.solve(self.scores_per_x, start.at.scores)
+        start_x = np.linalg.solve(self.scores_per_x, start.at.scores)
+        # Images may move anywhere, the camera only as far as the model follows it.
+        free = np.full(motions, np.inf)
+        free[: self.objective.shared - self.objective.errors] = REACH
         self.origin = np.clip(start_x, [*ends[0], *-free], [*ends[1], *free]) - _TRUSTED
         self.bounds = ([*ends[0], *-free] - self.origin, [*ends[1], *free] - self.origin)
 

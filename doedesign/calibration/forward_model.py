@@ -19,15 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 
+from doedesign.calibration.geometry import UPRIGHT, GeometryPrior, displacement_m, room_of
 from doedesign.calibration.target import Image
 from doedesign.calibration.unknowns import Unknowns
 from fab.grid import Grid
 from sim.camera import Camera, source_path_m, wrapped_waves
-from sim.propagation.farfield import FarField, plan_far_field
+from sim.propagation.farfield import FarField, bent, plan_far_field
 from sim.propagation.pupil import DoeRows, doe_field
 from sim.surface import as_fabricated
 
-Motion = Float[np.ndarray, "3"]  # of an image: shifts along y and x in pixels, defocus in 1/m
+# Of an image: shifts along y and x in pixels, defocus in 1/m, and the camera's geometry (`QUANTITIES`).
+Motion = Float[np.ndarray, "7"]
 
 
 class VariedDoe(NamedTuple):
@@ -56,13 +58,17 @@ class _Optic(eqx.Module):
     source_waves: Float[Array, "y x"]
     axis: Float[Array, " x"]  # cells from the middle
     rates: Float[Array, "3"]  # waves per cell and unit of motion (twice) and per cell² (defocus)
+    camera: Camera | None = eqx.field(static=True)  # where pixels may lie elsewhere, or None
     factor: float = eqx.field(static=True)  # Fresnel transmission
 
 
 @eqx.filter_jit
-def _energy(optic: _Optic, view: Int[Array, ""], plate: VariedDoe, motion: Float[Array, "3"]) -> Float[Array, "v u"]:
+def _energy(optic: _Optic, view: Int[Array, ""], plate: VariedDoe, motion: Float[Array, "7"]) -> Float[Array, "v u"]:
+    plan = optic.plan
+    if optic.camera:
+        plan = bent(plan, optic.camera, displacement_m(optic.camera, motion[3:], motion[:2]))
     rows = DoeRows(plate.coverage, None, plate.transmission[view], (optic.source_waves, optic.axis))
-    return optic.factor * optic.plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion))
+    return optic.factor * plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +79,7 @@ class ForwardModel:
     camera: Camera
     unknowns: Unknowns
     depths_m: tuple[float, ...]
+    geometry: GeometryPrior = UPRIGHT
     _optics: dict[Any, _Optic] = field(default_factory=dict)
 
     @property
@@ -99,6 +106,14 @@ class ForwardModel:
         plate, pull, seen = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
         return DoeImages(self, plate, *seen), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
 
+    def finer(self, parts: int) -> "ForwardModel":
+        """The same plate, every cell drawn as `parts` by `parts` cells."""
+        grid = self.camera.grid
+        ny, nx = grid.shape
+        camera = replace(self.camera, grid=Grid((ny * parts, nx * parts), grid.pitch_m / parts))
+        level = np.kron(self.level, np.ones((parts, parts), np.uint8))
+        return replace(self, level=level, camera=camera, _optics={})
+
     def optic(self, index: int, grid: Grid) -> _Optic:
         """Plan and source of an image for a plate of some cells; made once."""
         depth_m = self.depths_m[index]
@@ -108,10 +123,11 @@ class ForwardModel:
             scale = grid.pitch_m / wavelength
             shift = scale * camera.pixel_m / camera.sensor_distance_m
             self._optics[key] = _Optic(
-                plan_far_field(camera, wavelength, depth_m=depth_m),
+                plan_far_field(camera, wavelength, depth_m=depth_m, room=room_of(camera, self.geometry)),
                 jnp.asarray(wrapped_waves(source_path_m(camera, depth_m), wavelength)),
                 jnp.asarray(grid.axis_m("x") / grid.pitch_m, jnp.float32),
                 jnp.asarray([shift, shift, scale * grid.pitch_m / 2], jnp.float32),
+                None if self.geometry.upright else camera,
                 camera.transmission(wavelength),
             )
         return self._optics[key]
@@ -125,6 +141,11 @@ class DoeImages:
     plate: VariedDoe
     grid: Grid
     views: tuple[int, ...]  # which of the plate's transmissions every image sees
+
+    @property
+    def parts(self) -> int:
+        """Cells of the plate along either side of a cell of the drawing."""
+        return self.grid.shape[0] // len(self.model.level)
 
     def image(self, index: int, motion: Motion) -> Image:
         """Energy in every pixel of an image, per unit power on the clear aperture, Fresnel loss included."""

@@ -29,11 +29,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from doedesign.calibration.geometry import USUAL_SIGMA, GeometryPrior
 from doedesign.calibration.target import MeasuredImage
 from doedesign.spec import read_toml, spec_error
 from doedesign.spec.errors import validated
 from doedesign.spec.table import SpecTable
-from doedesign.spec.values import FarDepth, Pitch, Positive, Wavelength, broken, length
+from doedesign.spec.values import FarDepth, Pitch, Positive, Wavelength, bounded, broken, length, share
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.units import MM
@@ -97,6 +98,42 @@ class ImageSpec(SpecTable, frozen=True):
         return self.name or Path(self.files[0]).stem
 
 
+_TURNED, _STRETCHED, _BENT = math.radians(10), 0.1, 2.0  # the most that a camera is looked for to be off by
+
+
+class CameraSpec(SpecTable, frozen=True):
+    """How the camera stood, as far as it is known (`doedesign.calibration.geometry`): `[camera]`.
+
+    What has a standard deviation is looked for; one of 0 says that the value is known. All zeros are an exact bench,
+    which costs least.
+
+    Attributes:
+        rotation_rad: angle by which the camera is turned from the plate's +x toward its +y.
+        rotation_sigma_rad: its standard deviation.
+        scale_y: share by which more of the light falls on a pixel's height than pixel pitch and focal length say.
+        scale_x: the same for its width.
+        scale_sigma: standard deviation of both.
+        distortion: k where light that belongs r from the chief ray lies at r (1 + k r²/d²), d being the lens's distance
+            from the sensor; beside the distortion of the design's lens.
+        distortion_sigma: its standard deviation.
+    """
+
+    rotation_rad: Annotated[float, bounded("rad", -_TURNED, _TURNED)] = 0.0
+    rotation_sigma_rad: Annotated[float, bounded("rad", 0.0, _TURNED)] = USUAL_SIGMA[0]
+    scale_y: Annotated[float, share(-_STRETCHED, _STRETCHED)] = 0.0
+    scale_x: Annotated[float, share(-_STRETCHED, _STRETCHED)] = 0.0
+    scale_sigma: Annotated[float, share(0.0, _STRETCHED)] = USUAL_SIGMA[1]
+    distortion: Annotated[float, share(-_BENT, _BENT)] = 0.0
+    distortion_sigma: Annotated[float, share(0.0, _BENT)] = USUAL_SIGMA[3]
+
+    @property
+    def prior(self) -> GeometryPrior:
+        """The same as values."""
+        mean = (self.rotation_rad, self.scale_y, self.scale_x, self.distortion)
+        sigma = (self.rotation_sigma_rad, self.scale_sigma, self.scale_sigma, self.distortion_sigma)
+        return GeometryPrior(mean, sigma)
+
+
 class MeasurementSpec(SpecTable, frozen=True):
     """How images were taken.
 
@@ -115,6 +152,7 @@ class MeasurementSpec(SpecTable, frozen=True):
             seen along the light.
         mirrored: whether it has to be mirrored left to right before that.
         defocus_sigma_m: how well the sensor's distance is known.
+        camera: how the camera stood.
     """
 
     probe_m: Wavelength = Field(examples=['"520 nm"'])
@@ -130,6 +168,7 @@ class MeasurementSpec(SpecTable, frozen=True):
     quarter_turns: Literal[0, 1, 2, 3] = 0
     mirrored: bool = False
     defocus_sigma_m: Annotated[float, length(0.0, 10 * MM)] = 0.0
+    camera: CameraSpec = CameraSpec()
 
 
 class Measurement(NamedTuple):

@@ -1,6 +1,6 @@
 """Least-squares objective of a calibration: measured images, the model that should explain them, and how well it does.
 
-Errors and motions are scores, in standard deviations of their prior, so the objective is
+Errors, the camera's geometry and motions are scores, in standard deviations of their prior, so the objective is
 
     chi2 + prior  =  sum over images of sum of weight * residual²  +  sum of score²
 
@@ -46,12 +46,17 @@ class FitObjective:
 
     @property
     def errors(self) -> int:
-        """Number of errors; the scores after them are motions."""
+        """Number of errors, whose scores come first."""
         return len(self.unknowns.names)
 
     @property
+    def shared(self) -> int:
+        """Number of scores that all images share: errors, then the camera's geometry; motions come after them."""
+        return self.errors + len(self.model.geometry.unknown)
+
+    @property
     def motions(self) -> tuple[tuple[int, int], ...]:
-        """Image and kind (0 y, 1 x, 2 defocus) of every score after the errors."""
+        """Image and kind (0 y, 1 x, 2 defocus) of every score after the shared ones."""
         return tuple(
             (i, kind) for i, t in enumerate(self.targets) for kind in range(3) if kind < 2 or t.image.defocus_sigma > 0
         )
@@ -67,16 +72,24 @@ class FitObjective:
         return np.clip(unknowns.values(scores[: self.errors]), unknowns.low, unknowns.high)
 
     def motion(self, scores: Scores, image: int) -> Motion:
-        """Motion of an image."""
-        out = np.array([*self.targets[image].shift_px, 0.0])
+        """Motion of an image, the camera's geometry included."""
+        out = np.array([*self.targets[image].shift_px, 0.0, *self.model.geometry.mean])
         for place, (kind, unit) in self.motion_units(image).items():
             out[kind] += unit * scores[place]
         return out
 
     def motion_units(self, image: int) -> dict[int, tuple[int, float]]:
-        """Kind and unit of every motion of an image, by its position among the scores."""
-        units = (_SHIFT_SIGMA, _SHIFT_SIGMA, self.targets[image].image.defocus_sigma)
-        return {self.errors + k: (kind, units[kind]) for k, (index, kind) in enumerate(self.motions) if index == image}
+        """Place in an image's motion and unit of every score that moves it, by its position among the scores."""
+        units = (_SHIFT_SIGMA, _SHIFT_SIGMA, self.targets[image].image.defocus_sigma, *self.model.geometry.sigma)
+        common = (3 + kind for kind in self.model.geometry.unknown)
+        kinds = dict(enumerate(common, self.errors))
+        kinds |= {self.shared + k: kind for k, (index, kind) in enumerate(self.motions) if index == image}
+        return {place: (kind, units[kind]) for place, kind in kinds.items()}
+
+    @property
+    def scores(self) -> int:
+        """Number of all scores."""
+        return self.shared + len(self.motions)
 
     def evaluate(self, weights: Weights, scores: Scores, doe: DoeImages | None = None) -> "Evaluation":
         """The model at some scores; `doe` is the fabricated DOE there where it is known already."""
@@ -102,7 +115,7 @@ class FitObjective:
 
 
 class Evaluation(NamedTuple):
-    """The model at some scores (errors, then motions) beside the measurement."""
+    """The model at some scores (errors, geometry, then motions) beside the measurement."""
 
     objective: FitObjective
     scores: Scores

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from doedesign.calibration.uncertainty import DETERMINED
 from doedesign.report.labels import error_label, value_text
 from fab.figure import (
     DPI,
@@ -90,9 +91,17 @@ def _draw_image(figure: "FigureBase", row: Sequence["Axes"], result: "Calibratio
 
 
 def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBase":
-    """Draw every error with its uncertainty against its prior, and the correlation of errors."""
-    unknowns, posterior = result.objective.unknowns, result.posterior
-    count = len(unknowns.names)
+    """Draw every error and unknown of the camera with its uncertainty against its prior, and their correlation."""
+    unknowns, posterior, known = result.objective.unknowns, result.posterior, result.objective.model.geometry
+    kinds = list(known.unknown)
+    count = len(unknowns.names) + len(kinds)
+    both = (
+        (unknowns.mean, known.mean),
+        (unknowns.sigma, known.sigma),
+        (posterior.values, posterior.geometry),
+        (posterior.sigma, posterior.geometry_sigma),
+    )
+    mean, prior, values, sigma = (np.append(errors, np.array(camera)[kinds]) for errors, camera in both)
     height = max(_ROW * count, 1.4)
     words = (
         "grey: prior, one standard deviation; bar: posterior, one standard deviation; hollow: not determined by the "
@@ -100,18 +109,18 @@ def plot_estimates(result: "Calibration", ax: "Axes | None" = None) -> "FigureBa
     )
     with panels(ax, (7.8 + height, height + 1.2), note=words) as figure:
         errors, correlation = figure.subplots(1, 2, width_ratios=(3.6, height))
-        rows = _name_rows(errors, map(error_label, unknowns.names))
-        centre = (posterior.values - unknowns.mean) / unknowns.sigma
-        spread = posterior.sigma / unknowns.sigma
+        rows = _name_rows(errors, result.rows)
+        centre, spread = (values - mean) / prior, sigma / prior
         errors.barh(rows, 2, 0.75, left=-1, color=FAINT, alpha=0.35, lw=0)
         errors.axvline(0, color=FAINT, lw=0.8)
-        for i, (row, name) in enumerate(zip(rows, unknowns.names, strict=True)):
+        for i, (row, text) in enumerate(zip(rows, result.rows.values(), strict=True)):
             style: dict[str, Any] = {"color": LINE, "mec": LINE, "capsize": 3, "lw": 1.6, "ms": 5}
-            fill = LINE if result.determined[name] else "white"
+            fill = LINE if spread[i] < DETERMINED else "white"
             errors.errorbar(centre[i], row, xerr=spread[i], fmt="o", mfc=fill, **style)
-            errors.annotate(result.estimates[name], (1.03, row), **_BESIDE)
+            errors.annotate(text, (1.03, row), **_BESIDE)
         reach = max(1.3, float(np.max(np.abs(centre) + spread)) * 1.1)
-        title = f"errors of the plate, {posterior.chi2_per_pixel:.3g} chi2 per pixel"
+        whose = "plate and camera" if kinds else "the plate"
+        title = f"errors of {whose}, {posterior.chi2_per_pixel:.3g} chi2 per pixel"
         xlabel = "distance from the prior's mean, in its standard deviations"
         errors.set(xlim=(-reach, reach), xlabel=xlabel, title=title)
         shown = correlation.imshow(posterior.correlation, cmap="RdBu_r", vmin=-1, vmax=1, origin="upper", aspect="auto")

@@ -8,23 +8,28 @@ of the prior. Nothing more is claimed than the images bear out:
 * What differs from one part of an image to another without the noise explaining it (a model that is a little wrong)
   shows in the gradients of the parts: their scatter over blocks of pixels gives a second covariance, and of the two the
   larger variance of every error counts (the "sandwich" of P. Huber, with blocks as clusters).
-* What the model gets wrong alike everywhere (`sim.surface`: some thousandths of the light) is in neither. On DOEs
-  computed with finer cells than those of the fit it moved overlay by up to 30 nm, line width by 7 nm, depth by 0.1 %.
+* What the model gets wrong alike everywhere (`sim.surface`: some thousandths of the light) is in neither. The same
+  DOE, computed once more with cells half as wide, says where the fit would then have ended, and that counts as one more
+  standard deviation.
 * An error counts as determined where its standard deviation is less than half of that of the prior.
 """
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
-from doedesign.calibration.objective import Linearization, Scores
+from doedesign.calibration.forward_model import DoeImages
+from doedesign.calibration.objective import Evaluation, Linearization, Scores
 from doedesign.calibration.target import Image, match
+from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.metrics import spot_radius_m
 
-_DETERMINED = 0.5  # of the prior's standard deviation
+DETERMINED = 0.5  # of the prior's standard deviation
 _DIRECTIONS = 2  # least known ones that are looked at
 _BLOCKS = 6  # per side of an image
 
@@ -34,8 +39,10 @@ class Posterior(NamedTuple):
 
     Attributes:
         covariance: of all scores, errors first.
-        values: best values of the errors, SI units; `sigma` and `correlation` are those of the errors.
-        ratio: standard deviation over that of the prior.
+        values: best values of the errors, SI units, and `sigma` their standard deviations.
+        geometry: values of the camera's `QUANTITIES`, and `geometry_sigma` their standard deviations, 0 where known.
+        correlation: of the errors and of what is unknown of the camera, in this order.
+        ratio: standard deviation of every error over that of the prior.
         chi2_per_pixel: of all images; 1 where noise alone is left.
         inflation: factor on the standard deviation of what the images determine.
     """
@@ -43,7 +50,9 @@ class Posterior(NamedTuple):
     covariance: Float[np.ndarray, "s s"]
     values: Float[np.ndarray, " p"]
     sigma: Float[np.ndarray, " p"]
-    correlation: Float[np.ndarray, "p p"]
+    geometry: Float[np.ndarray, "4"]
+    geometry_sigma: Float[np.ndarray, "4"]
+    correlation: Float[np.ndarray, "q q"]
     ratio: Float[np.ndarray, " p"]
     chi2_per_pixel: float
     inflation: float
@@ -51,7 +60,7 @@ class Posterior(NamedTuple):
     @property
     def determined(self) -> list[bool]:
         """Whether the images, and not the prior, say what an error is."""
-        return (self.ratio < _DETERMINED).tolist()
+        return (self.ratio < DETERMINED).tolist()
 
     def spread(self, gradient: Scores) -> float:
         """Standard deviation of a number with this gradient with respect to the scores."""
@@ -61,10 +70,10 @@ class Posterior(NamedTuple):
 def posterior_of(fit: Linearization) -> Posterior:
     """Covariance of the scores and the errors."""
     objective, at = fit.at.objective, fit.at
-    unknowns, count = objective.unknowns, objective.errors
+    unknowns, count, shared = objective.unknowns, objective.errors, objective.shared
     images, prior = sum(fit.hessians, np.zeros_like(fit.half_hessian)), np.eye(len(at.scores))
-    # Motions, gains and backgrounds are fitted to the last; of the errors, what the images and not the prior determine.
-    determined = float(np.trace(np.linalg.solve(fit.half_hessian, images)[:count, :count]))
+    # Motions, gains and backgrounds are fitted to the last; of what is shared, what the images determine.
+    determined = float(np.trace(np.linalg.solve(fit.half_hessian, images)[:shared, :shared]))
     free = len(objective.motions) + 2 * len(objective.targets) + determined
     per_pixel = at.chi2 / max(objective.pixels - free, 1.0)
     inflation = max(per_pixel, 1.0)
@@ -72,18 +81,49 @@ def posterior_of(fit: Linearization) -> Posterior:
     scatter = np.linalg.inv(images + prior)
     scatter = scatter @ _scatter(fit) @ scatter
     larger = np.sqrt(np.maximum(np.diag(scatter) / np.diag(covariance), 1.0))
-    covariance = covariance * np.outer(larger, larger)
-    errors = unknowns.root @ covariance[:count, :count] @ unknowns.root.T
-    sigma = np.sqrt(np.diag(errors))
+    systematic = _step_of_finer_cells(fit)
+    covariance = covariance * np.outer(larger, larger) + np.outer(systematic, systematic)
+    prior_geometry = np.array(objective.model.geometry.sigma)
+    unknown = list(objective.model.geometry.unknown)
+    root = np.asarray(block_diag(unknowns.root, np.diag(prior_geometry[unknown])), np.float64)
+    found = root @ covariance[:shared, :shared] @ root.T
+    sigma = np.sqrt(np.diag(found))
+    geometry_sigma = np.zeros_like(prior_geometry)
+    geometry_sigma[unknown] = sigma[count:]
     return Posterior(
         covariance=covariance,
         values=objective.values(at.scores),
-        sigma=sigma,
-        correlation=errors / np.outer(sigma, sigma),
-        ratio=sigma / unknowns.sigma,
+        sigma=sigma[:count],
+        geometry=objective.motion(at.scores, 0)[3:],
+        geometry_sigma=geometry_sigma,
+        correlation=found / np.outer(sigma, sigma),
+        ratio=sigma[:count] / unknowns.sigma,
         chi2_per_pixel=per_pixel,
         inflation=float(np.sqrt(inflation)),
     )
+
+
+def _step_of_finer_cells(fit: Linearization) -> Scores:
+    """How far one Gauss-Newton step would lead if the model's cells were half as wide; zero where none can be made."""
+    objective, at = fit.at.objective, fit.at
+    doe = _finer_doe(at)
+    if doe is None:
+        return np.zeros(len(at.scores))
+    descent = np.zeros(len(at.scores))
+    for i, (found, rows) in enumerate(zip(at.matches, fit.jacobian.of_residuals(at), strict=True)):
+        change = doe.image(i, objective.motion(at.scores, i)) - found.model
+        descent -= rows @ found.residual_jacobian(change[None])[0]
+    return np.linalg.solve(fit.half_hessian, descent)
+
+
+def _finer_doe(at: Evaluation) -> DoeImages | None:
+    """The DOE of cells half as wide, or as narrow as its edges, which stay within half a cell, allow."""
+    model, values = at.objective.model, at.objective.values(at.scores)
+    parts = at.doe.parts
+    for finer in range(2 * parts, parts, -1):
+        with suppress(InputError):
+            return model.finer(finer).plate(values)
+    return None
 
 
 def _scatter(fit: Linearization) -> Float[np.ndarray, "s s"]:
@@ -107,7 +147,7 @@ def left_out(fit: Linearization) -> list[float]:
         step = np.linalg.solve(fit.half_hessian - fit.hessians[i], sum(fit.descents, -at.scores) - fit.descents[i])
         scores = at.scores.copy()
         # The image's own motion stays what it was.
-        scores[: objective.errors] += step[: objective.errors]
+        scores[: objective.shared] += step[: objective.shared]
         image = objective.model.plate(objective.values(scores)).image(i, objective.motion(scores, i))
         out.append(match(found.target, found.weights, image).chi2_per_pixel)
     return out

@@ -4,7 +4,7 @@ import math
 
 from fab.process import DEVIATIONS
 
-__all__ = ["error_label", "value_text"]
+__all__ = ["error_label", "number_text", "value_text"]
 
 
 def error_label(name: str) -> str:
@@ -19,7 +19,13 @@ def value_text(name: str, value: float, sigma: float | None = None) -> str:
     key = name.partition("[")[0]
     units = {"m": (1e9, "nm"), "rad": (math.degrees(1.0), "°"), "1": (100.0, "%")}
     factor, unit = (1e6, "ppm") if key == "magnification" else units[DEVIATIONS[key].unit]
-    if sigma is None or not sigma > 0:
-        return f"{factor * value:.3g} {unit}"
+    return number_text(value, sigma or 0.0, factor, unit)
+
+
+def number_text(value: float, sigma: float, factor: float = 1.0, unit: str = "") -> str:
+    """A number times `factor` with its unit, and its standard deviation unless that is 0, as many digits as count."""
+    unit = unit and f" {unit}"
+    if not sigma > 0:
+        return f"{factor * value:.3g}{unit}"
     digits = max(0, 1 - math.floor(math.log10(factor * sigma)))
-    return f"{factor * value:.{digits}f} ± {factor * sigma:.{digits}f} {unit}"
+    return f"{factor * value:.{digits}f} ± {factor * sigma:.{digits}f}{unit}"

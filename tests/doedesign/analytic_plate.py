@@ -1,12 +1,12 @@
 """A plate whose images are known in closed form, in the place of the one that light goes through.
 
-An image is base + s(first error) A + second error B + motion · C with patterns of random numbers, so every derivative,
-every least-squares fit and every covariance can be written down. `s` is the identity, or climbs with waves on it, so
-that a search that only climbs stays behind the first of them.
+An image is base + s(first error) A + second error B + motion · C, the camera's geometry included, with patterns of
+random numbers, so every derivative, every least-squares fit and every covariance can be written down. `s` is the
+identity, or climbs with waves on it, so that a search that only climbs stays behind the first of them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from doedesign.calibration.estimate import Calibration
 from doedesign.calibration.fit import search
 from doedesign.calibration.forward_model import DoeImages, ForwardModel, VariedDoe
+from doedesign.calibration.geometry import UPRIGHT, GeometryPrior
 from doedesign.calibration.measurement import Measurement
 from doedesign.calibration.objective import FitObjective
 from doedesign.calibration.target import MeasuredImage, Target
@@ -40,10 +41,11 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class AnalyticModel(ForwardModel):
-    """`patterns[image, pattern, y, x]` are base, A, B and three of the motion; `asked` collects all plates' values."""
+    """`patterns[image, pattern, y, x]` are base, A, B and seven of the motion; `asked` collects all plates' values."""
 
     patterns: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     waves: float = 0.0
+    missed: NDArray[np.float64] | float = 0.0
     asked: list[Values] = field(default_factory=list)
 
     def first(self, value: float) -> tuple[float, float]:
@@ -60,6 +62,12 @@ class AnalyticModel(ForwardModel):
         """The plate, and its derivative backwards: the gradient with respect to s and the second error comes in."""
         slopes = np.array([self.first(values[0])[1], 1.0])
         return self.plate(values), lambda gradient: slopes * np.array(gradient)
+
+    def finer(self, parts: int) -> "AnalyticModel":
+        """The same with `missed` more in every image: what cells half as wide would show."""
+        more = self.patterns.copy()
+        more[:, 0] += self.missed
+        return replace(self, patterns=more)
 
     def optic(self, index: int, grid: Any) -> Any:
         """What `search` asks for: the error of the transform."""
@@ -88,6 +96,11 @@ class AnalyticImages(DoeImages):
 
         return self.image(index, motion), back
 
+    @property
+    def parts(self) -> int:
+        """Cells of a cell."""
+        return 1
+
     def zeroth_order(self) -> float:
         """A curve, so that its difference over a step differs from its value."""
         return float(0.1 + 0.02 * self.values[0] + 0.05 * self.values[1])
@@ -103,23 +116,29 @@ def analytic_objective(
     gain_sigma: float | None = 0.03,
     noise_seed: int = 3,
     depths_m: tuple[float, ...] = (NEAR_M, np.inf),
+    geometry: GeometryPrior = UPRIGHT,
+    stood: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
     **limits: Any,
 ) -> FitObjective:
     """Images of a plate with errors `truth`, with noise, and the model that made them; only the first may be blurred.
+
+    The camera stood as `stood` says, of which `geometry` is known.
 
     `limits` replace attributes of the unknowns.
     """
     rng, noise_rng = np.random.default_rng(3), np.random.default_rng((noise_seed, 1))
     patterns = rng.normal(size=(images, 6, SIDE, SIDE)) * np.array([0.0, 0.1, 0.1, 0.05, 0.05, 0.05])[:, None, None]
     patterns[:, 0] = rng.uniform(0.5, 1.5, (images, SIDE, SIDE))
+    turned = 0.1 * np.random.default_rng(4).normal(size=(images, 4, SIDE, SIDE))
+    patterns = np.concatenate([patterns, turned], axis=1)
     ranges = {"mean": np.zeros(2), "root": np.diag(SIGMA), "low": -5 * SIGMA, "high": 5 * SIGMA, "start": np.zeros(2)}
     unseen: Any = None  # the drawing
     names = ("common_depth_scale", "common_cd_bias_m")
     unknowns = Unknowns(Process(Levels(4, 0.3e-6), name="analytic"), names, **{**ranges, **limits})
-    model = AnalyticModel(unseen, CAMERA, unknowns, depths_m[:images], patterns=patterns, waves=waves)
+    model = AnalyticModel(unseen, CAMERA, unknowns, depths_m[:images], geometry, patterns=patterns, waves=waves)
     targets = []
     for i in range(images):
-        light = model.plate(truth).image(i, np.zeros(3)) + noise * noise_rng.normal(size=(SIDE, SIDE))
+        light = model.plate(truth).image(i, np.append(np.zeros(3), stood)) + noise * noise_rng.normal(size=(SIDE, SIDE))
         floor = np.full((SIDE, SIDE), max(noise, 1e-6) ** 2)
         psf = MeasuredPsf(light, floor, np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE), bool))
         brightness = None if gain_sigma is None else (1.0, gain_sigma)

@@ -69,7 +69,7 @@ def light_of(
     camera = replace(design.camera, colours=(probe,), window=design.camera.window + margin)
     seen = ForwardModel(design.level_map.level, camera, unknowns, tuple(depths_m)).plate(np.zeros(1))
     whole = [round(s) for s in SHIFT]
-    part = np.array([s - w for s, w in zip(SHIFT, whole, strict=True)] + [0.0])
+    part = np.array([s - w for s, w in zip(SHIFT, whole, strict=True)] + [0.0] * 5)
     # The frame is wider still; what little light falls there is left out.
     around = [(_AROUND + w, _AROUND - w) for w in whole]
     return [np.pad(seen.image(i, part), around) for i in range(len(depths_m))]

@@ -1,0 +1,148 @@
+"""A bench that shares no code with the model: a plate on a raster, and a camera that stands askew before it.
+
+What a calibration is judged by must not come from what it fits with. Here a plate as fabricated is a raster of many
+samples per cell (`tests.physics.plate_raster`) behind a hard round rim; its light at the sensor is a sum over all
+samples, in double precision; and a pixel is a square that the camera's rotation, its scales and its distortion carry
+to a place in the light, integrated by Gauss's rule. Walls may add their lines of light, as `sim.rigorous.edge_widths`
+has them, to the samples on either side, one image for each polarisation.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+from doedesign.design.design import Design
+from fab.process import Process, variation_of
+from sim.material import refractive_index
+from sim.rigorous.edge_widths import edge_widths
+from tests.physics.plate_raster import raster_height_m
+
+SAMPLES = 25  # per cell and axis: 74 nm in a cell of 1.85 um, so moved edges move by multiples of that
+_SPACING = 0.125  # of lambda f / D, at which the intensity, of half that frequency at most, is sampled
+_ROOM = 6  # samples of the intensity beyond the outermost pixel
+_NODES = 5  # of Gauss's rule per axis of a pixel
+_WALL_M = 10e-9  # smaller steps of height are those of uneven depths
+_NODE_M = 10e-9  # between heights for which the light of walls is solved
+
+
+class Askew(NamedTuple):
+    """How a camera stands: pixel p (y, x), from the chief ray in pixels, sees the light at R S p (1 - k |p|² / f²).
+
+    R turns from +x toward +y by `rotation` (radians), S stretches by 1 + `scale`, and |p| / f is in the camera's
+    nominal pixels and focal length; k is `distortion`.
+    """
+
+    rotation: float = 0.0
+    scale_y: float = 0.0
+    scale_x: float = 0.0
+    distortion: float = 0.0
+
+
+EXACT = Askew()
+
+
+def foreign_light(
+    design: Design,
+    process: Process,
+    hidden: Mapping[str, float],
+    depths_m: Sequence[float],
+    wavelength_m: float,
+    *,
+    askew: Askew = EXACT,
+    shift_px: tuple[float, float] = (0.0, 0.0),
+    margin: int = 24,
+    edges: bool = False,
+) -> list[Float[np.ndarray, "v u"]]:
+    """Energy in every pixel, per unit power on the clear aperture, of frames `margin` pixels wider than the window.
+
+    Args:
+        design: the plate and its camera.
+        process: where the plate lies on the wafer, and how large that is.
+        hidden: errors of the plate by flat name.
+        depths_m: of the point source, one for every frame.
+        wavelength_m: of its light.
+        askew: how the camera stands.
+        shift_px: where the chief ray falls, (y, x) from the middle of the frame.
+        margin: pixels.
+        edges: add the light of walls, unpolarised.
+    """
+    camera, levels = design.camera, design.level_map.levels
+    variation = variation_of(levels.bits, hidden)
+    pitch, die, radius = camera.grid.pitch_m, process.die_m, process.wafer_radius_m
+    height = raster_height_m(design.level_map.level, levels, pitch, SAMPLES, variation, die, radius)
+    step = pitch / SAMPLES
+    axis = (np.arange(len(height)) + 0.5 - len(height) / 2) * step
+    square = axis[:, None] ** 2 + axis**2
+    open_ = square <= camera.aperture_m**2 / 4
+    index, waves = refractive_index(camera.material, wavelength_m), 2 * np.pi / wavelength_m
+    thin = np.exp(1j * waves * (index - 1) * height)
+    fields = _with_walls(thin, height, wavelength_m, index, step) if edges else [thin]
+    scale, side = wavelength_m * camera.focal_length_m, camera.window + margin
+    places, weights = _pixels(side, camera.fill, camera.pixel_m, camera.focal_length_m, askew, shift_px)
+    reach = np.ceil(np.abs(places).max() / (_SPACING * scale / camera.aperture_m)) + _ROOM
+    u = np.arange(-reach, reach + 1) * (_SPACING * scale / camera.aperture_m)
+    wave = np.exp(-2j * np.pi / scale * np.outer(u, axis)) * np.sinc(u * step / scale)[:, None] * step
+    frames = []
+    for depth in depths_m:
+        path = np.zeros_like(square) if np.isinf(depth) else square / (np.sqrt(square + depth**2) + depth)
+        source = open_ * np.exp(2j * np.pi / wavelength_m * path)
+        # The amplitude is that per unit of power on the clear aperture.
+        power = [np.abs(wave @ (field * source) @ wave.T / scale) ** 2 for field in fields]
+        intensity = np.mean(power, axis=0) / (np.pi * camera.aperture_m**2 / 4)
+        spline = RectBivariateSpline(u, u, intensity, kx=5, ky=5)
+        frames.append((spline.ev(places[0], places[1]) * weights).sum(axis=-1))
+    return frames
+
+
+def _pixels(
+    side: int, fill: float, pixel_m: float, focal_m: float, askew: Askew, shift_px: tuple[float, float]
+) -> tuple[Float[np.ndarray, "2 v u node"], Float[np.ndarray, "v u node"]]:
+    """Places (y, x) in the light of the nodes of all pixels, metres, and what part of an area each stands for."""
+    nodes, parts = np.polynomial.legendre.leggauss(_NODES)
+    inner_y, inner_x = (n.ravel() * fill / 2 for n in np.meshgrid(nodes, nodes, indexing="ij"))
+    share = np.outer(parts, parts).ravel() / 4 * (fill * pixel_m) ** 2
+    centre = np.arange(side) - (side - 1) / 2
+    y = centre[:, None, None] - shift_px[0] + inner_y + np.zeros((1, side, 1))
+    x = centre[None, :, None] - shift_px[1] + inner_x + np.zeros((side, 1, 1))
+    squared = -askew.distortion * (y**2 + x**2) * (pixel_m / focal_m) ** 2
+    bent = 1 + squared
+    wide_y, wide_x = (1 + askew.scale_y) * pixel_m, (1 + askew.scale_x) * pixel_m
+    cos, sin = np.cos(askew.rotation), np.sin(askew.rotation)
+    places = np.stack([(cos * wide_y * y + sin * wide_x * x) * bent, (cos * wide_x * x - sin * wide_y * y) * bent])
+    # Determinant of the map: along the radius the cubic counts three times.
+    area = (1 + askew.scale_y) * (1 + askew.scale_x) * bent * (1 + 3 * squared)
+    return places, share * area
+
+
+def _with_walls(
+    thin: Complex[np.ndarray, "y x"], height: np.ndarray, wavelength_m: float, index: float, step: float
+) -> list[Complex[np.ndarray, "y x"]]:
+    """Transmission with the lines of light of all upright walls, for light polarised along y and along x."""
+    waves, across = 2 * np.pi / wavelength_m, [_walls(height, axis) for axis in (0, 1)]
+    nodes = np.arange(0.0, max(size.max() for _, _, size in across) + 2 * _NODE_M, _NODE_M)
+    table = {
+        way: CubicSpline(nodes, edge_widths(tuple(nodes.tolist()), wavelength_m, index, way)) for way in ("TE", "TM")
+    }
+    fields = []
+    for polarised in (0, 1):
+        field = thin.copy()
+        for axis, (places, low, size) in enumerate(across):
+            # Light polarised across a wall is TM.
+            width, below = table["TM" if polarised == axis else "TE"](size), waves * (index * low - (low + size))
+            line = width * np.exp(1j * below) / step / 2
+            for beside in (0, 1):
+                rows, columns = (place + beside * (k == axis) for k, place in enumerate(places))
+                np.add.at(field, (rows, columns), line)
+        fields.append(field)
+    return fields
+
+
+def _walls(height: np.ndarray, axis: int) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Samples before a wall, the height of its lower side, and of the wall, metres."""
+    jump = np.diff(height, axis=axis)
+    places = np.nonzero(np.abs(jump) > _WALL_M)
+    behind = tuple(p + (a == axis) for a, p in enumerate(places))
+    return places, np.minimum(height[places], height[behind]), np.abs(jump[places])
