@@ -6,6 +6,7 @@ import sys
 TABLES = (
     "bench.psf",
     "bench.edges",
+    "bench.lens",
     "bench.step",
     "bench.masks",
     "bench.rules",

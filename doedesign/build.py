@@ -34,6 +34,8 @@ def camera_from_spec(spec: Spec) -> Camera:
         window=spec.sensor.window,
         fill=spec.sensor.fill_factor,
         defocus_m=spec.sensor.defocus_m,
+        mapping=spec.optics.mapping,
+        distortion=spec.optics.distortion,
     )
 
 

@@ -178,7 +178,8 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     write_history(run, design.history)
     flat = np.zeros_like(height)
     bank, lens = (psf(each, camera, (*near, *far), propagation=propagation) for each in (height, flat))
-    metrics: dict[str, Any] = {"psf": design_metrics(HeightOptic.of(camera, height), bank, near, lens)}
+    rows = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
+    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text}
     if patterns := pattern_metrics(spec, camera, bank, problem.terms):
         metrics["patterns"] = patterns
     if spec.process.chooses_depths:

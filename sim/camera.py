@@ -5,18 +5,25 @@ quadratic term of Fresnel propagation and only the source's own path differences
 out of focus leaves a quadratic remainder, which is added here.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 
+from fab.errors import InputError
 from fab.grid import Grid
 from sim.material import fresnel_transmission, refractive_index
 
 Mapping = Literal["sine", "tangent"]
+Distortion = tuple[float, float]
+IDEAL: Distortion = (0.0, 0.0)
 _INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach double precision for 20 %
+# How far beyond the corners of a window the image must not be folded over: light is looked for a little outside.
+_MARGIN = 1.2
 
 
 @dataclass(frozen=True)
@@ -54,10 +61,10 @@ class Camera:
             falls on the corner shared by the four middle pixels, for an odd one on the middle pixel's centre.
         fill: side of a pixel's light-sensitive square over `pixel_m`, 0-1.
         defocus_m: distance of the sensor beyond the focal plane.
-        mapping: how the lens images directions: at a height d sin(angle) from the axis on a sensor at distance d, or
-            at d tan(angle), as a lens without distortion does. The far field falls so by itself on a sphere ("sine").
-        distortion: (k1, k2), the relative change of that height r: light lands at r (1 + k1 (r/d)² + k2 (r/d)⁴) from
-            the axis. Negative numbers are a barrel, positive ones a pincushion.
+        mapping: how the lens images directions: light at an angle to the axis lands at the height r = d sin(angle)
+            ("sine") or d tan(angle) ("tangent", a lens without distortion) on a sensor at the distance d.
+        distortion: (k1, k2), by which that height changes: to r (1 + k1 (r/d)² + k2 (r/d)⁴). Negative numbers make
+            a barrel, positive ones a pincushion. An InputError if the image would fold over near the window.
     """
 
     grid: Grid
@@ -70,7 +77,11 @@ class Camera:
     fill: float = 1.0
     defocus_m: float = 0.0
     mapping: Mapping = "sine"
-    distortion: tuple[float, float] = (0.0, 0.0)
+    distortion: Distortion = IDEAL
+
+    def __post_init__(self) -> None:
+        """Refuse a lens that cannot image the window."""
+        check_lens(self.mapping, self.distortion, self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m)
 
     @property
     def is_sine(self) -> bool:
@@ -95,34 +106,22 @@ class Camera:
         """Pixel centres on the sensor relative to the chief ray, metres."""
         return Grid((self.window, self.window), self.pixel_m).axis_m("x")
 
-    def image_m(self, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
-        """Place (y, x) on the sensor of light with these direction sines, metres from the axis."""
-        scale = self.sensor_distance_m
-        if self.mapping == "tangent":
-            scale = scale * (1.0 - sine_y * sine_y - sine_x * sine_x) ** -0.5
-        y, x = sine_y * scale, sine_x * scale
+    @property
+    def lens_text(self) -> str:
+        """The lens's mapping in words."""
+        names = {"sine": "places follow the sine of the angle", "tangent": "places follow the tangent of the angle"}
         k1, k2 = self.distortion
-        share = (y * y + x * x) / self.sensor_distance_m**2
-        grown = 1.0 + share * (k1 + k2 * share)
-        return y * grown, x * grown
+        return names[self.mapping] + (f", distortion k1 = {k1:g}, k2 = {k2:g}" if any(self.distortion) else "")
+
+    def image_m(self, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
+        """Place (y, x) on the sensor, metres from the axis, of light with these direction sines."""
+        y, x = image_place(self.mapping, self.distortion, sine_y, sine_x)
+        return y * self.sensor_distance_m, x * self.sensor_distance_m
 
     def sines_of(self, y_m: Any, x_m: Any) -> tuple[Any, Any]:
-        """Direction sines (y, x) of the light that lands at a place on the sensor: the inverse of `image_m`.
-
-        Plain arithmetic, for numbers and arrays of numpy or jax. Meaningless where the distortion has folded the
-        image over (`farthest_image_m`).
-        """
-        y, x = y_m / self.sensor_distance_m, x_m / self.sensor_distance_m
-        (k1, k2), seen, shrunk = self.distortion, y * y + x * x, 1.0
-        for _ in range(_INVERSIONS if any(self.distortion) else 0):
-            share = seen * shrunk * shrunk
-            missed = shrunk * (1.0 + share * (k1 + k2 * share)) - 1.0
-            shrunk = shrunk - missed / (1.0 + share * (3.0 * k1 + 5.0 * k2 * share))
-        y, x = y * shrunk, x * shrunk
-        if self.mapping == "tangent":
-            scale = (1.0 + y * y + x * x) ** -0.5
-            y, x = y * scale, x * scale
-        return y, x
+        """Direction sines (y, x) of the light that lands at a place on the sensor; the inverse of `image_m`."""
+        distance = self.sensor_distance_m
+        return sines_at(self.mapping, self.distortion, y_m / distance, x_m / distance)
 
     def transmission(self, wavelength_m: float) -> float:
         """Power that passes both faces of the uncoated substrate."""
@@ -143,6 +142,75 @@ class Camera:
         distance = self.sensor_distance_m
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
         return self.aperture_m / 2 * abs(distance * inverse_depth + 1.0 - distance / self.focal_length_m)
+
+
+def image_place(mapping: Mapping, distortion: Distortion, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
+    """Place (y, x) of light with direction sines (y, x), as a share of the sensor's distance; see `Camera`."""
+    y, x = sine_y, sine_x
+    if mapping == "tangent":
+        longer = (1.0 - y * y - x * x) ** -0.5
+        y, x = y * longer, x * longer
+    (k1, k2), square = distortion, y * y + x * x
+    grown = 1.0 + square * (k1 + k2 * square)
+    return y * grown, x * grown
+
+
+def sines_at(mapping: Mapping, distortion: Distortion, y: Any, x: Any) -> tuple[Any, Any]:
+    """Direction sines (y, x) of light from its place, a share of the sensor's distance: the inverse of `image_place`.
+
+    Plain arithmetic, for numbers and arrays of numpy or jax. Meaningless where the image is folded over
+    (`farthest_place`).
+    """
+    (k1, k2), seen, shrunk = distortion, y * y + x * x, 1.0
+    for _ in range(_INVERSIONS if any(distortion) else 0):
+        square = seen * shrunk * shrunk
+        missed = shrunk * (1.0 + square * (k1 + k2 * square)) - 1.0
+        shrunk = shrunk - missed / (1.0 + square * (3.0 * k1 + 5.0 * k2 * square))
+    y, x = y * shrunk, x * shrunk
+    if mapping == "tangent":
+        shorter = (1.0 + y * y + x * x) ** -0.5
+        y, x = y * shorter, x * shorter
+    return y, x
+
+
+def farthest_place(mapping: Mapping, distortion: Distortion) -> float:
+    """Distance from the axis up to which every place sees a direction of its own, or infinity.
+
+    Beyond, a distortion folds the image over, or light would have to come from more than 90 degrees.
+    """
+    k1, k2 = distortion
+    # The height p (1 + k1 p² + k2 p⁴) stops growing where 1 + 3 k1 q + 5 k2 q² = 0 at q = p².
+    turns = [1.0 if mapping == "sine" else math.inf]
+    if k2:
+        root = 9 * k1**2 - 20 * k2
+        turns += [(-3 * k1 + sign * math.sqrt(root)) / (10 * k2) for sign in (-1, 1) if root >= 0]
+    elif k1:
+        turns.append(-1 / (3 * k1))
+    square = min(turn for turn in turns if turn > 0)
+    return math.inf if math.isinf(square) else math.sqrt(square) * (1 + square * (k1 + k2 * square))
+
+
+def check_lens(mapping: str, distortion: Distortion, corner: float, key: Callable[[str], str] = str) -> None:
+    """Raise an `InputError` for a lens that cannot image a window whose corners lie `corner` from the axis.
+
+    `key` writes the names of the two values, "mapping" and "distortion", as the user knows them.
+    """
+    if mapping not in get_args(Mapping):
+        rule = f"must be one of {', '.join(get_args(Mapping))}"
+        raise InputError(key("mapping"), rule, repr(mapping), 'Use "tangent" for a lens without distortion.')
+    if len(distortion) != 2 or not all(map(math.isfinite, distortion)):
+        rule = "must be two finite numbers, k1 and k2"
+        raise InputError(key("distortion"), rule, f"{distortion}", "Use (0, 0) for none.")
+    if mapping == "sine" and not any(distortion):
+        return
+    farthest = farthest_place(mapping, distortion)  # pyright: ignore[reportArgumentType]
+    if farthest < _MARGIN * corner:
+        rule = (
+            f"the image must not fold over within {_MARGIN:g} times the distance of the window's corners from the axis"
+        )
+        got = f"k1, k2 = {distortion[0]:g}, {distortion[1]:g}: at {farthest:.3g} sensor distances, with corners "
+        cure = "Use weaker distortion or a smaller window."
+        raise InputError(key("distortion"), rule, f"{got}at {corner:.3g}", cure)
 
 
 def direction_sines(field_rad: tuple[float, float]) -> Float[np.ndarray, "2"]:

@@ -53,7 +53,12 @@ class Optic(eqx.Module):
 
     @abstractmethod
     def plan(
-        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+        field_rad: tuple[float, float] = ON_AXIS,
     ) -> Any:
         """Operators of one wavelength and source depth (metres), made on the host.
 
@@ -62,6 +67,7 @@ class Optic(eqx.Module):
             depth_m: source depth.
             propagation: far field, or one of the direct kernels (for DOEs of cells).
             sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
+            field_rad: field angles (y, x); they matter to lenses that do not image sines (`Camera.mapping`).
 
         Raises:
             InputError: a direct path where eq. 6 does not hold.
@@ -122,11 +128,22 @@ class CellOptic(CameraOptic):
         """Height in metres and transmission besides it, both `[y, x]`; None where there is none."""
 
     def plan(
-        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+        field_rad: tuple[float, float] = ON_AXIS,
     ) -> FarField | DirectPath:
         """Operators of the far field, or of a direct kernel (which serves every depth)."""
         if propagation == "far_field":
-            return plan_far_field(self.camera, line.wavelength_m, depth_m=depth_m, sampling=sampling)
+            return plan_far_field(
+                self.camera,
+                line.wavelength_m,
+                depth_m=depth_m,
+                sampling=sampling,
+                field_rad=ON_AXIS if self.camera.is_sine else field_rad,
+            )
         return plan_direct(self.camera, line.wavelength_m, propagation)
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
@@ -236,7 +253,12 @@ class RingOptic(CameraOptic):
     profile_m: Float[Array, " ring"]
 
     def plan(
-        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+        field_rad: tuple[float, float] = ON_AXIS,
     ) -> Hankel:
         """Operators of the Hankel transform, for every depth."""
         if propagation != "far_field":

@@ -121,6 +121,7 @@ class PsfBank(eqx.Module):
         }
         if self.camera is None:
             return html_of("PSFs", rows)
+        rows["lens"] = self.camera.lens_text
         for name in ("throughput", "far_spot", "ring_to_disc"):
             values = self.metric(name)
             rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
@@ -165,7 +166,12 @@ class BankOptic(Optic):
         return tuple(SpectralLine(number, 0.0, 1.0) for number in range(len(self.colours)))
 
     def plan(
-        self, line: SpectralLine, depth_m: float, propagation: Propagation = "far_field", sampling: float | None = None
+        self,
+        line: SpectralLine,
+        depth_m: float,
+        propagation: Propagation = "far_field",
+        sampling: float | None = None,
+        field_rad: tuple[float, float] = ON_AXIS,
     ) -> None:
         """Nothing is propagated."""
 
@@ -266,7 +272,7 @@ def _prepared(
     """Plan and source of every line and depth, each made while the light of the one before it is computed."""
 
     def prepare(line: SpectralLine, depth: float) -> tuple[Any, Any]:
-        return optic.plan(line, depth, *way), optic.source(line, depth, field_rad)
+        return optic.plan(line, depth, *way, field_rad), optic.source(line, depth, field_rad)
 
     if is_traced(optic) or in_jit():  # a trace is one thread's own
         yield from (prepare(*each) for each in asked)

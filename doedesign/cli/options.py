@@ -42,6 +42,9 @@ _PLACES = {
     "aperture_m": "--aperture",
     "tile, overlap": "--tile, --overlap",
     "propagation": "optics.propagation",
+    "camera.mapping": "optics.mapping",
+    "mapping": "optics.mapping",
+    "distortion": "optics.distortion",
     "camera.window": "sensor.window",
     "sensor.pattern": "sensor.bayer",
 }

@@ -63,7 +63,8 @@ def ring_period_m(camera: Camera) -> float:
     """Period whose ring just fits the window for every colour, or 3.03 cells where the grid is too coarse for that."""
     longest = max(w for c in camera.colours for w in c.wavelengths_m)
     reach = 0.96 * camera.window * camera.pixel_m / 2
-    return max(longest * camera.sensor_distance_m / reach, 3.03 * camera.grid.pitch_m)
+    sine = reach / camera.sensor_distance_m if camera.is_sine else camera.sines_of(0.0, reach)[1]
+    return max(longest / sine, 3.03 * camera.grid.pitch_m)
 
 
 def flat(setup: StartSetup, options: Mapping[str, Any]) -> Heights:

@@ -115,9 +115,11 @@ def _computed(design: Design, process: Process, errors: Variation) -> Fabricated
 
 
 def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> None:
-    write_bank(folder / "fabricated.exr", found.bank, {"design": design.name, "plate": words})
+    write_bank(
+        folder / "fabricated.exr", found.bank, {"design": design.name, "plate": words, "lens": design.camera.lens_text}
+    )
     (folder / "variation.toml").write_text(variation_to_toml(found.variation, [words]), encoding="utf-8")
-    (folder / "metrics.json").write_bytes(canonical_json(found.rows))
+    (folder / "metrics.json").write_bytes(canonical_json({**found.rows, "lens": design.camera.lens_text}))
     save(plot_psfs(found.bank, design.camera, design.near_m, design.far_m), folder / "fabricated_psf.png")
     orders = [
         tuple(

@@ -131,12 +131,12 @@ def _write(
     flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
     lens = psf(flat, depths=depths, field_rad=field)
     lens_transfer = mtf(flat, depths=depths)
-    metrics: dict[str, Any] = {}
+    metrics: dict[str, Any] = {"lens": camera.lens_text}
     for name, height in designs.items():
         if name == "from_masks":
             continue
         bank = banks[name]
-        write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name})
+        write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
         save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
         transfer = mtf(height, camera, depths)
         save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")

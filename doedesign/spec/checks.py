@@ -13,6 +13,7 @@ from doedesign.spec.training import training_problems
 from doedesign.spec.values import NEAR_OBJECTIVES, nearest
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
+from sim.camera import check_lens, image_place
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
 
 _WAVE_TOLERANCE = 0.02
@@ -23,7 +24,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
-    rules = (_light, _doe, _sensor, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
+    rules = (_light, _doe, _sensor, _lens, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -71,6 +72,22 @@ def _sensor(spec: Spec) -> Iterator[InputError]:
         rule = "a mosaic needs three colours, from the longest wavelength to the shortest"
         got = ", ".join(colour.name for colour in colours)
         yield InputError("sensor.bayer", rule, got, "State the colours as red, green, blue, or leave `bayer` out.")
+
+
+def _lens(spec: Spec) -> Iterator[InputError]:
+    optics, sensor = spec.optics, spec.sensor
+    if optics.propagation == "fresnel":
+        cure = 'Set propagation = "far_field", or leave both out.'
+        rule = "the direct path has the lens of eq. 5, whose mapping cannot be chosen"
+        if optics.mapping != "sine":
+            yield InputError("optics.mapping", rule, f'"{optics.mapping}"', cure)
+        if any(optics.distortion):
+            yield InputError("optics.distortion", rule, f"{list(optics.distortion)}", cure)
+    corner = sensor.window_m / math.sqrt(2) / (optics.focal_length_m + sensor.defocus_m)
+    try:
+        check_lens(optics.mapping, optics.distortion, corner, "optics.{}".format)
+    except InputError as error:
+        yield error
 
 
 def _scene(spec: Spec) -> Iterator[InputError]:
@@ -150,6 +167,10 @@ def _limits(spec: Spec) -> Iterator[InputError]:
 
 def _training(spec: Spec) -> Iterator[InputError]:
     yield from training_problems(spec.network, spec.train, len(spec.optics.colours))
+    if spec.train.field == "random" and (spec.optics.mapping != "sine" or any(spec.optics.distortion)):
+        rule = 'scenes off the axis need optics.mapping = "sine" without distortion, for all steps share one plan'
+        cure = 'Set field = "off", or leave mapping and distortion out while training.'
+        yield InputError("train.field", rule, '"random"', cure)
 
 
 def spec_warnings(spec: Spec) -> list[str]:
@@ -177,6 +198,14 @@ def _level_warning(spec: Spec) -> Iterator[str]:
     )
 
 
+def _image_share(spec: Spec, sine: float) -> float:
+    """Where light with a direction sine lands, focal lengths from the axis."""
+    optics = spec.optics
+    if optics.mapping == "tangent" and sine >= 1:
+        return math.inf
+    return image_place(optics.mapping, optics.distortion, 0.0, sine)[1]
+
+
 def _window_warnings(spec: Spec) -> Iterator[str]:
     sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m, spec.doe.pitch_m
     binned = min(sensor.resolution) // sensor.binning
@@ -186,7 +215,7 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
             "side; PSFs will reach beyond the sensor."
         )
     wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2
-    reach_m = focal_m * wavelength_m / (2 * pitch_m)
+    reach_m = focal_m * _image_share(spec, wavelength_m / (2 * pitch_m))
     if half_m > reach_m:
         yield (
             f"sensor.window: it ends {half_m / UM:.0f} um from the axis, but cells of {format_length(pitch_m)} steer "

@@ -32,6 +32,7 @@ from doedesign.spec.values import (
     broken,
     known,
     length,
+    share,
 )
 from doedesign.spec.wafer import WaferSpec
 from fab.units import NM, UM, parse_length
@@ -41,6 +42,7 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 Wavelength = Annotated[float, length(200 * NM, 20 * UM)]
+Distortion = Annotated[float, share(-10.0, 10.0)]
 SpecName = Annotated[
     str, accepted(_FILE_NAME.fullmatch, "must be a file name of at most 64 letters, digits, dots, dashes")
 ]
@@ -99,12 +101,18 @@ class OpticsSpec(SpecTable, frozen=True):
             `spectral_response = "camera.csv"` for those of a measured camera (`doedesign.spec.response`).
         propagation: "far_field" (the lens cancels the quadratic phase, paper eqs. 7-9) or "fresnel" (the wave is
             propagated from the lens to the sensor, eq. 5; needs a fine pitch, eq. 6).
+        mapping: where the lens images a direction: at a height of f sin(angle), "sine", as the bare Fourier transform
+            has it, or of f tan(angle), "tangent", as a lens without distortion does.
+        distortion: [k1, k2], by which that height r changes: to r (1 + k1 (r/f)² + k2 (r/f)⁴); negative numbers make
+            a barrel, positive ones a pincushion. Far field only, as is "tangent".
     """
 
     focal_length_m: Annotated[float, length(10 * UM, 100.0)] = Field(examples=['"8 mm"'])
     design_wavelength_m: Wavelength = Field(examples=['"550 nm"'])
     colours: tuple[ColourSpec, ...] = Field(min_length=1)
     propagation: Literal["far_field", "fresnel"] = "far_field"
+    mapping: Literal["sine", "tangent"] = optional("sine")
+    distortion: tuple[Distortion, Distortion] = optional((0.0, 0.0))
 
     @model_validator(mode="before")
     @classmethod

@@ -71,7 +71,11 @@ class FieldOptics(NamedTuple):
         psf = np.stack([[np.stack([bank.at(depth) for depth in depths_m]) for bank in row] for row in banks])
         middle = psf[np.abs(y).argmin(), np.abs(x).argmin()]
         distance, pixel = camera.sensor_distance_m, banks[0][0].pixel_m
-        return cls(psf, distance * np.tan(y), distance * np.tan(x), Optics(middle, camera.aperture_m, distance, pixel))
+        axis = Optics(middle, camera.aperture_m, distance, pixel)
+        if camera.is_sine:  # places of a picture are those of its perspective, which is only the lens's near the axis
+            return cls(psf, distance * np.tan(y), distance * np.tan(x), axis)
+        # Along the two axes: a distortion bends the grid of nodes, by less than matters to how PSFs are mixed.
+        return cls(psf, camera.image_m(np.sin(y), 0 * y)[0], camera.image_m(0 * x, np.sin(x))[1], axis)
 
 
 def node_weights(positions: Float[np.ndarray, " p"], nodes: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n p"]:

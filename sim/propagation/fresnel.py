@@ -53,8 +53,16 @@ def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> f
 def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_spectrum") -> DirectPath:
     """Prepare the direct path of one wavelength; phases are formed in float64 and wrapped before float32.
 
-    An InputError where eq. 6 does not hold, or the window does not fit on the padded grid.
+    The lens is the thin one of eq. 5, which has a mapping of its own: near that of tangents, with aberrations of the
+    order of angle⁴. An InputError for a camera that asks for another, where eq. 6 does not hold, or where the window
+    does not fit on the padded grid.
     """
+    if not camera.is_sine:
+        rule, cure = (
+            "the direct path has the lens of eq. 5, whose mapping cannot be chosen",
+            'Use the "far_field" path.',
+        )
+        raise InputError("camera.mapping", rule, camera.lens_text, cure)
     cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m)
     if nyquist > camera.focal_length_m * (1 + 1e-9):

@@ -87,6 +87,19 @@ def _interpolation(coarse: int, lead: int) -> Float[np.ndarray, "coarse fine"]:
     return kernel / kernel.sum(axis=0)
 
 
+def _sine_radius_m(camera: Camera, place_m: Float[np.ndarray, "*s"]) -> tuple[np.ndarray, np.ndarray | float]:
+    """Where a lens that images sines would have the light of some radii, and what area there stands for one here."""
+    if camera.is_sine:
+        return place_m, 1.0
+
+    def radius(place_m: np.ndarray) -> np.ndarray:
+        return camera.sensor_distance_m * camera.sines_of(np.zeros_like(place_m), place_m)[1]
+
+    step_m = 1e-4 * camera.pixel_m
+    slope = (radius(place_m + step_m) - radius(place_m - step_m)) / (2 * step_m)
+    return radius(place_m), slope * radius(place_m) / place_m
+
+
 def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First fine radius, weights per fine radius, and the map to distinct pixels."""
     n = camera.window
@@ -95,16 +108,18 @@ def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray,
     keys, distinct = np.unique(high * (n + 1) + low, return_inverse=True)
     far, near = (keys // (n + 1)) * camera.pixel_m / 2, (keys % (n + 1)) * camera.pixel_m / 2
     offsets = Grid((_POINTS, _POINTS), camera.pixel_m * camera.fill / _POINTS).axis_m("x")
-    radius = (
-        np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1) / fine_m
-    )
+    place_m = np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1)
+    radius_m, share = _sine_radius_m(camera, place_m)
+    radius = radius_m / fine_m
     index = np.floor(radius).astype(np.int64)
     first = index.min(axis=1)
     width = int((index.max(axis=1) - first).max()) + 2
     slot = (index - first[:, None]) + np.arange(len(keys))[:, None] * width
     right = radius - index
-    areas = np.bincount(slot.ravel(), (1 - right).ravel(), minlength=len(keys) * width)
-    areas += np.bincount(slot.ravel() + 1, right.ravel(), minlength=len(keys) * width + 1)[: len(keys) * width]
+    areas = np.bincount(slot.ravel(), (share * (1 - right)).ravel(), minlength=len(keys) * width)
+    areas += np.bincount(slot.ravel() + 1, (share * right).ravel(), minlength=len(keys) * width + 1)[
+        : len(keys) * width
+    ]
     area = (camera.pixel_m * camera.fill) ** 2 / _POINTS**2
     return first, areas.reshape(len(keys), width) * area, distinct.reshape(n, n)
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from doedesign.build import camera_from_spec
 from doedesign.spec import (
     Options,
     SpecError,
@@ -202,6 +203,9 @@ REFUSED = [
     ("optics.wavelengths", '"656 nm"', ["optics.wavelengths", "must be a list"]),
     ("optics.colours", '[{name="red", wavelengths=["656 nm"]}]', ["optics.wavelengths", "must be stated once"]),
     ("optics.propagation", '"fresnell"', ["optics.propagation", "far_field, fresnel", "Did you mean `fresnel`?"]),
+    ("optics.mapping", '"fisheye"', ["optics.mapping", "sine, tangent"]),
+    ("optics.distortion", "[0.1]", ["optics.distortion"]),
+    ("optics.distortion", "[0.1, 11.0]", ["optics.distortion", "must lie between -10 and 10"]),
     ("doe.material", '"fused_slica"', ["doe.material", "a known material", "Did you mean `fused_silica`?"]),
     ("doe.samples", "30000", ["doe.samples", "must be at most 20000", "30000"]),
     ("doe.samples", "2400.5", ["doe.samples", "must be a whole number", "2400.5"]),
@@ -379,6 +383,21 @@ def test_impossible_openings_and_sensors(override: str, message: str):
         assert message in refusal(AUTOMOTIVE, override)
     else:
         assert load_spec(AUTOMOTIVE, [override]).process.chrome_overlap_m == 1e-3
+
+
+def test_a_lens_of_its_own():
+    """It is read, changes the camera, is said, and leaves no trace where it is not given."""
+    chosen = load_spec(AUTOMOTIVE, ["optics.mapping=tangent", "optics.distortion=[-0.1, 0.02]"])
+    camera = camera_from_spec(chosen)
+    assert (camera.mapping, camera.distortion) == ("tangent", (-0.1, 0.02))
+    assert "mapping" not in spec_to_json(load_spec(AUTOMOTIVE))["optics"]
+    assert spec_from_json(spec_to_json(chosen), "spec") == chosen
+    folded = refusal(AUTOMOTIVE, "optics.distortion=[-10.0, 0.0]", "sensor.window=1024")
+    assert "optics.distortion: the image must not fold over" in folded
+    for override, key in (("mapping=tangent", "mapping"), ("distortion=[0.1, 0.0]", "distortion")):
+        message = refusal(AUTOMOTIVE, f"optics.{override}", "optics.propagation=fresnel")
+        assert f"optics.{key}: the direct path has the lens of eq. 5" in message
+    assert "train.field" in refusal(AUTOMOTIVE, "optics.mapping=tangent", "train.field=random")
 
 
 def test_a_bound_itself_is_inside():

@@ -6,18 +6,26 @@ map's Jacobian, from differences.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
+from scipy.special import j0
 
+from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, Colour
-from sim.propagation.farfield import bent, plan_far_field
+from sim.camera import Camera, Colour, check_lens
+from sim.optic import HeightOptic, RingOptic
+from sim.propagation.farfield import bent, displaced, plan_far_field
+from sim.propagation.fresnel import plan_direct
+from sim.propagation.hankel import ring_count
 from sim.propagation.places import CUBIC
 from sim.propagation.pupil import DoeRows, doe_field
+from sim.psf_bank import psf
 from sim.source import MapColumns
 
 WAVELENGTH_M, PITCH_M, CELLS, PIXEL_M, POINTS = 550e-9, 1.85e-6, 96, 3.7e-6, 24
@@ -38,10 +46,12 @@ def directions(camera: Camera, y_m: np.ndarray, x_m: np.ndarray) -> np.ndarray:
     return ideal / np.sqrt(1 + (ideal**2).sum(0)) if camera.mapping == "tangent" else ideal
 
 
-def summed(camera: Camera, chief: np.ndarray, place_m, pixels: np.ndarray = PIXELS) -> np.ndarray:
+def summed(
+    camera: Camera, chief: np.ndarray, place_m: Any, pixels: np.ndarray = PIXELS, field_rad: Any = (0.0, 0.0)
+) -> np.ndarray:
     """Energy of some pixels; `place_m` gives a point's place on the sensor from its place on an ideal window."""
     coverage = circle_coverage(camera.grid, camera.aperture_m).astype(np.float64)
-    delay = np.float32(HEIGHT_M).astype(np.float64) * camera.waves_per_metre(WAVELENGTH_M)
+    delay = np.float32(HEIGHT_M).astype(np.float64) * camera.waves_per_metre(WAVELENGTH_M, field_rad)
     field = coverage * np.exp(2j * np.pi * delay)
     cells_m = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH_M
     offsets = ((np.arange(POINTS) + 0.5) / POINTS - 0.5) * camera.fill * PIXEL_M
@@ -73,6 +83,122 @@ def rows_of(camera: Camera) -> tuple[DoeRows, MapColumns]:
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     columns = MapColumns(jnp.float32(camera.waves_per_metre(WAVELENGTH_M)))
     return DoeRows(coverage, height, None, jnp.zeros_like(height)), columns
+
+
+def refused(**values: Any) -> str:
+    with pytest.raises(InputError) as caught:
+        replace(CAMERA, **values)
+    return str(caught.value)
+
+
+LENSES = {
+    "tangent": ("tangent", (0.0, 0.0)),
+    "barrel": ("tangent", (-0.3, 0.1)),
+    "sine with a pincushion": ("sine", (0.2, 0.0)),
+}
+
+
+@pytest.mark.parametrize("field_rad", [(0.0, 0.0), (-0.1, 0.25)])
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_that_do_not_image_sines(name: str, field_rad: tuple[float, float]):
+    """Pixels in the middle, on edges and in corners of a window about the axis or about an oblique chief ray."""
+    mapping, distortion = LENSES[name]
+    camera = replace(CAMERA, mapping=mapping, distortion=distortion)
+    tangents = np.tan(field_rad)
+    chief = tangents / np.sqrt(1 + (tangents**2).sum())
+    ideal = tangents if mapping == "tangent" else chief
+    square = (ideal**2).sum()
+    middle_m = camera.focal_length_m * ideal * (1 + distortion[0] * square + distortion[1] * square**2)
+    found = psf(HeightOptic.of(camera, HEIGHT_M), field_rad=field_rad).energy[0, 0] / camera.lines[0].factor
+    wanted = summed(camera, chief, lambda y, x: (y + middle_m[0], x + middle_m[1]), PIXELS, field_rad)
+    # The plan predicts 1.7e-3; oblique windows are sheared by up to 3 %: 0.3 % per degree.
+    limit = 6e-3 if any(field_rad) else 2.5e-3
+    assert np.linalg.norm(found[tuple(PIXELS.T)] - wanted) < limit * np.linalg.norm(wanted)
+    straight = psf(HeightOptic.of(CAMERA, HEIGHT_M), field_rad=field_rad).energy[0, 0] / camera.lines[0].factor
+    assert np.linalg.norm(straight[tuple(PIXELS.T)] - wanted) > 0.05 * np.linalg.norm(wanted)
+
+
+def test_bare_samples_see_the_lens_too(rng: np.random.Generator):
+    """One sample per lambda d / D, as the optimiser takes them: as rough an estimate as behind a sine lens."""
+    lens, (rows, columns) = replace(CAMERA, mapping="tangent"), rows_of(CAMERA)
+    offsets = jnp.asarray(rng.uniform(-PIXEL_M / 2, PIXEL_M / 2, (24, 2)), jnp.float32)
+
+    def mean(camera: Camera, sampling: float | None) -> np.ndarray:
+        plan = plan_far_field(camera, WAVELENGTH_M, sampling=sampling)
+        energy = jax.jit(lambda offset: displaced(plan, offset).energy(doe_field, rows, columns))
+        return np.mean([np.asarray(energy(offset), np.float64) for offset in offsets], axis=0)
+
+    (exact, bare), (straight, straight_bare) = ([mean(c, sampling) for sampling in (None, 1.0)] for c in (lens, CAMERA))
+    # Measured: 27 % of such a rough image behind either lens.
+    assert np.linalg.norm(bare - exact) < 1.05 * np.linalg.norm(straight_bare - straight)
+    # The mapping moves light by up to a pixel: estimates change with it as exact images do.
+    moved, wanted = bare - straight_bare, exact - straight
+    assert np.sum(moved * wanted) > 0.6 * np.linalg.norm(moved) * np.linalg.norm(wanted)
+
+
+def test_gradient_behind_a_tangent_lens(rng: np.random.Generator):
+    camera, weights = replace(CAMERA, mapping="tangent"), rng.normal(size=(104, 104))
+
+    def total(height_m: Any) -> Any:
+        return psf(height_m, camera).energy[0, 0]
+
+    gradient = np.asarray(jax.grad(lambda h: jnp.sum(weights * total(h)))(jnp.asarray(HEIGHT_M, jnp.float32)))
+    step = gradient / np.abs(gradient).max() * 2e-9
+    high, low = (np.sum(weights * np.asarray(total(HEIGHT_M + side * step), np.float64)) for side in (1, -1))
+    # Heights are rounded to 6e-14 m, sums to 1e-7: 1e-3 of the difference; the third derivative is smaller.
+    assert np.sum(gradient.astype(np.float64) * step) == pytest.approx((high - low) / 2, rel=2e-3)
+
+
+def test_rings_follow_the_lens():
+    """A row of pixels by the Hankel integral at the directions of 20 x 20 points in each, in float64."""
+    camera = replace(CAMERA, mapping="tangent", distortion=(-2.0, 0.0))
+    profile = np.where(np.arange(ring_count(camera)) % 3 < 1, 300e-9, 0.0)
+    found = psf(RingOptic(camera, jnp.asarray(profile, jnp.float32))).energy[0, 0] / camera.lines[0].factor
+    fine = (np.arange(len(profile) * 30) + 0.5) * PITCH_M / 30
+    wave = np.exp(2j * np.pi * np.repeat(profile, 30) * camera.waves_per_metre(WAVELENGTH_M)) * fine
+    points = ((np.arange(20) + 0.5) / 20 - 0.5) * PIXEL_M
+    y, x = np.meshgrid(0.5 * PIXEL_M + points, (camera.axis_m()[52:, None] + points).ravel(), indexing="ij")
+    radius, step = np.hypot(y, x), 1e-9
+
+    def sine(radius: np.ndarray) -> np.ndarray:
+        return directions(camera, 0 * radius, radius)[1]
+
+    jacobian = (sine(radius + step) - sine(radius - step)) / (2 * step) * sine(radius) / radius
+    rates = np.linspace(0, sine(radius).max(), 2000)  # cubic interpolation of the intensity between them: 1e-5
+    field = 2 * np.pi / WAVELENGTH_M * j0(2 * np.pi / WAVELENGTH_M * np.outer(rates, fine)) @ wave * PITCH_M / 30
+    density = CubicSpline(rates, np.abs(field) ** 2)(sine(radius)) * jacobian / (np.pi * camera.aperture_m**2 / 4)
+    wanted = density.reshape(20, 52, 20).mean((0, 2)) * PIXEL_M**2
+    # Linear interpolation between fine radii (1e-3) and 16 x 16 points per pixel; beyond the spot, which hardly moves.
+    assert np.linalg.norm(found[52, 56:] - wanted[4:]) < 6e-3 * np.linalg.norm(wanted[4:])
+    straight = psf(RingOptic(CAMERA, jnp.asarray(profile, jnp.float32))).energy[0, 0] / camera.lines[0].factor
+    assert np.linalg.norm(straight[52, 56:] - wanted[4:]) > 0.05 * np.linalg.norm(wanted[4:])
+
+
+def test_directions_and_places_are_inverse(rng: np.random.Generator):
+    for mapping, distortion in LENSES.values():
+        camera = replace(CAMERA, mapping=mapping, distortion=distortion)
+        sines = rng.uniform(-0.15, 0.15, (2, 50))
+        # Newton's steps end at double precision.
+        np.testing.assert_allclose(camera.sines_of(*camera.image_m(*sines)), sines, rtol=1e-12, atol=1e-15)
+
+
+def test_a_distortion_by_hand():
+    camera = replace(CAMERA, mapping="tangent", distortion=(-0.1, 0.02))
+    angle = np.radians(10.0)
+    ideal = np.tan(angle)
+    wanted = camera.focal_length_m * ideal * (1 - 0.1 * ideal**2 + 0.02 * ideal**4)
+    assert camera.image_m(0.0, np.sin(angle))[1] == pytest.approx(wanted, rel=1e-12)
+    assert "k1 = -0.1" in camera.lens_text
+
+
+def test_impossible_lenses_are_refused():
+    # 1 + 3 k1 p² = 0 at p = 0.129: the image ends at 2/3 of that, inside the window's corner at 0.17.
+    assert "fold over" in refused(distortion=(-20.0, 0.0))
+    assert "two finite numbers" in refused(distortion=(float("nan"), 0.0))
+    with pytest.raises(InputError, match="one of sine, tangent"):
+        check_lens("fisheye", (0.0, 0.0), 0.1)
+    with pytest.raises(InputError, match="mapping cannot be chosen"):
+        plan_direct(replace(CAMERA, mapping="tangent"), WAVELENGTH_M)
 
 
 def test_a_turned_stretched_and_bent_sensor():
