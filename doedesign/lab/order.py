@@ -18,6 +18,7 @@ from doedesign.lab.predictions import PROBE_M, predict_sheet
 from doedesign.prediction import predict
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import drawing_from
+from doedesign.runs.verdict import certified_orders
 from doedesign.spec import OrderSpec, ProcessSpec, WaferSpec, load_order, load_process, load_wafer
 from fab.errors import InputError
 from fab.layout.geometry import Chrome
@@ -100,18 +101,22 @@ def write_masks(
         repair = {**order.source["repair"], "psf": _psf_cost(design, order.level_map)}
         order = replace(order, source={**order.source, "repair": repair})
 
+    # Read before anything takes time; those of the map that is drawn, as designed or repaired.
+    certified = certified_orders(design and design.folder, order.level_map.digest)
+
     def predicted(order: Order) -> SheetPrediction | None:
         if design is None or design.spec is None:
             return None
         drawn, design_m = replace(design, level_map=order.level_map), design.spec.optics.design_wavelength_m
         moves_m = [move * order.dbu_m for move in order.edge_moves()]
         try:
-            return predict_sheet(drawn, order.process, design_m, probe_m, moves_m)
+            seen = predict_sheet(drawn, order.process, design_m, probe_m, moves_m)
         except InputError as error:
             if isinstance(error.__cause__, OSError):
                 raise  # a full disk is no limit of the model
             log.warning("the run sheet says nothing of the light: %s", error)
             return None
+        return seen._replace(predictions=replace(seen.predictions, certified=certified))
 
     return write_planned(Path("masks") / level_map.name if out is None else out, order, predict=predicted)
 

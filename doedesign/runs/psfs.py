@@ -15,6 +15,7 @@ from doedesign.design.metrics import design_metrics
 from doedesign.runs.folder import CONTINUOUS, Run, open_run
 from doedesign.runs.level_maps import drawn_in_masks, level_map_of_run, read_any_height
 from doedesign.runs.results import results_folder
+from doedesign.runs.verdict import certified_orders, verdict_in_words, with_verdict
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, spec_from_json, spec_to_json
 from fab.errors import CheckFailed
@@ -22,6 +23,7 @@ from fab.figure import save
 from fab.files import MANIFEST_NAME, canonical_json
 from fab.height import HeightMap
 from fab.plots.height import plot_height
+from fab.runsheet.tables import CertifiedOrder
 from sim.camera import Camera
 from sim.optic import HeightOptic, RingOptic
 from sim.plots.curves import plot_encircled, plot_mtf
@@ -48,7 +50,7 @@ def psfs(
         masks: its mask order; `masks/NAME` if there is one.
         depths_m: source depths, metres; those of the spec by default.
         field_rad: field angles (y, x), radians.
-        out: folder for the banks, their metrics (SI units) and pictures.
+        out: folder for the banks, their metrics (SI units) and pictures; with 0th orders of the run's certificate.
 
     Returns:
         PSF banks by name: "continuous" if the run has heights before rounding, "quantised", and "from_masks" if there
@@ -62,6 +64,7 @@ def psfs(
     camera = camera_from_spec(run.spec)
     near, far = _near_and_far(run.spec, depths_m)
     designs = _heights_of(run, masks)
+    certified = certified_orders(run.folder, level_map_of_run(run).digest)
     total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
     with results_folder(out, run.spec.name, run.folder) as fresh:
         with meter("PSFs", total) as progress:
@@ -80,7 +83,9 @@ def psfs(
             raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
         if fresh is not None:
             log.info("writing banks and pictures")
-            _write(fresh, run, camera, designs, banks, near, far)
+            _write(fresh, run, camera, designs, banks, near, far, certified)
+    for words in verdict_in_words(certified):
+        log.info(words)
     return banks
 
 
@@ -127,6 +132,7 @@ def _write(
     banks: dict[str, PsfBank],
     near: tuple[float, ...],
     far: tuple[float, ...],
+    certified: tuple[CertifiedOrder, ...],
 ) -> None:
     flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
     lens = psf(flat, depths=depths, field_rad=field)
@@ -142,6 +148,8 @@ def _write(
         save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
         save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
         metrics[name] = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
+    # Of the map itself; the heights before rounding have other walls.
+    metrics["quantised"] = with_verdict(metrics["quantised"], certified)
     if _takes_hankel(run, "continuous", field):
         # The budget's band is that of a raster of cells, which rings are not.
         metrics["continuous"] = [{k: v for k, v in row.items() if k != "budget"} for row in metrics["continuous"]]

@@ -25,9 +25,11 @@ _CURE = "Fetch the manifest again, or write the order again."
 
 
 def _plain(value: Any) -> Any:
-    """Turn a value into JSON values, fields by name."""
+    """Turn a value into JSON values, fields by name; without fields that are there `IF_ANY`, and are empty."""
     if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        parts = {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        left_out = [field.name for field in fields(value) if "if_any" in field.metadata and not parts[field.name]]
+        return {name: part for name, part in parts.items() if name not in left_out}
     if hasattr(value, "_asdict"):
         return _plain(value._asdict())
     if isinstance(value, Mapping):

@@ -64,6 +64,32 @@ class Importance(NamedTuple):
     zeroth_order: float
 
 
+class CertifiedOrder(NamedTuple):
+    """0th order of the DOE as drawn at one wavelength, and of rows cut out of it; shares of the light, 0 to 1.
+
+    Attributes:
+        colour: its name.
+        wavelength_m: vacuum wavelength, metres.
+        scalar: of the whole DOE as a thin element.
+        edges: of the whole DOE with the light of its walls.
+        cut_scalar: mean over the cut-outs, as thin elements.
+        cut_edges: the same with the light of their walls.
+        cut_rigorous: the same by Maxwell's equations.
+    """
+
+    colour: str
+    wavelength_m: float
+    scalar: float
+    edges: float
+    cut_scalar: float
+    cut_edges: float
+    cut_rigorous: float
+
+
+# A field with this mark is left out of records where it is empty, so that records without it stay what they are.
+IF_ANY: Mapping[str, bool] = {"if_any": True}
+
+
 @dataclass(frozen=True)
 class Predictions:
     """Light that the lab should see.
@@ -77,6 +103,7 @@ class Predictions:
         probe_waves: the full height in waves at the probe.
         gratings: what the test gratings show at the probe, against an empty window; a depth error of 0 among them.
         ranking: measured numbers, the most important first; empty if the process has no errors.
+        certified: 0th orders that a certificate of this DOE names; empty if it has none.
     """
 
     drawn: tuple[PredictedMetrics, ...]
@@ -87,6 +114,7 @@ class Predictions:
     probe_waves: float
     gratings: tuple[Grating, ...]
     ranking: tuple[Importance, ...] = ()
+    certified: tuple[CertifiedOrder, ...] = field(default=(), metadata=IF_ANY)
 
 
 class SheetPrediction(NamedTuple):

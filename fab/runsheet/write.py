@@ -226,6 +226,7 @@ def _predicted_record(predictions: Predictions) -> dict[str, Any]:
         "waves_at_probe": round(predictions.probe_waves, 5),
         "gratings": [_row(grating) for grating in predictions.gratings],
         "matters": [_row(one) for one in predictions.ranking],
+        **({"certified": [_row(one) for one in predictions.certified]} if predictions.certified else {}),
     }
 
 

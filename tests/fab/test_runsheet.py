@@ -10,6 +10,7 @@ import pytest
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.runsheet.recipe import depths_m, least_resist, next_target_m
+from fab.runsheet.tables import CertifiedOrder
 from fab.runsheet.write import BARS, PADS, record, run_sheet_page, write_run_sheet
 from fab.units import NM, UM
 from tests.fab.sheets import DIGEST, STEM, predictions, sheet, spreads_of
@@ -100,6 +101,19 @@ def test_without_predictions_the_page_promises_none():
         assert words in seen, words
     assert "one measurement only: overlay of mask 4" in seen
     assert "For the 0th order it is line width (CD bars) of every mask" in seen
+
+
+def test_certified_orders_stand_on_the_sheet_where_there_are_some():
+    row = CertifiedOrder("red", 656 * NM, 0.1234, 0.1357, 0.2, 0.2222, 0.2219)
+    seen = replace(predictions(), certified=(row,))
+    content = record(sheet(predictions=seen))
+    assert content["predicted"]["certified"] == [row._asdict()]
+    text = page_of(content).text
+    for words in ("656 nm", "12.34 %", "13.57 %", "20.00 %", "22.22 %", "22.19 %"):
+        assert words in text
+    without = record(sheet(predictions=predictions()))
+    assert "certified" not in without["predicted"]
+    assert "Maxwell" not in page_of(without).text
 
 
 def test_the_same_sheet_gives_the_same_bytes_and_is_json(tmp_path):
