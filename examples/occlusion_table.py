@@ -20,7 +20,7 @@ relative to the picture without the obstruction.
 import argparse
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,8 @@ def camera() -> Camera:
     """The camera of the table; its window is odd, so that a picture lies on its scene."""
     colour = Colour("green", (RIG.wavelength_m,), (1.0,))
     grid = Grid((RIG.cells, RIG.cells), RIG.pitch_m)
-    return Camera(grid, RIG.aperture_m, "fused_silica", (colour,), RIG.focal_m, RIG.pixel_m, RIG.window - 1)
+    whole = Camera(grid, RIG.aperture_m, "fused_silica", (colour,), RIG.focal_m, RIG.pixel_m, RIG.window - 1)
+    return replace(whole, mapping="sine")  # as a Fourier transform images directions
 
 
 def plate_m(name: str) -> np.ndarray:

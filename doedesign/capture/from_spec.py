@@ -38,7 +38,7 @@ def occlusion_from_spec(spec: Spec | None, source: str, given: str | None = None
         raise InputError("occlusion", rule, f'"{given}"', nearest(given, OCCLUSION_MODELS))
     model = given or (spec and spec.scene.occlusion)
     if model is None:
-        cure = 'Give `occlusion`: "reciprocal", nearest to wave optics, "radiometric", or "paper" for eq. 10.'
+        cure = 'Give `occlusion`: "reciprocal", the nearest to wave optics, "radiometric", or "paper" for eq. 10.'
         raise InputError(f"{source}: scene.occlusion", "the occlusion model must be named", "nothing", cure)
     return cast("Model", model)
 

@@ -236,8 +236,8 @@ def _occlusion_warning(spec: Spec) -> Iterator[str]:
     if (spec.obstruction or spec.scene.near_m) and spec.scene.occlusion is None:
         yield (
             "scene.occlusion: not named, so `simulate` and `train` will ask for it: how the obstruction takes light "
-            'from what is behind it has no default. Add occlusion = "reciprocal", nearest to wave optics, '
-            '"radiometric", or "paper" for eq. 10.'
+            'from what is behind it has no default. Add occlusion = "reciprocal", the nearest to wave optics for '
+            'plates of every kind, "radiometric", or "paper" for eq. 10.'
         )
 
 

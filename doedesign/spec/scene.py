@@ -49,8 +49,8 @@ class SceneSpec(SpecTable, frozen=True):
         near_m: depths of the obstruction; may be empty where no objective looks at it.
         far_m: depths of the scene behind it; "inf" in TOML for a star.
         occlusion: how an obstruction takes light from what lies behind it (`sim.imaging.occlusion`): "radiometric"
-            follows the light, "reciprocal" the light of the halo too, "paper" is eq. 10, "paper_release" what the
-            paper's public code does.
+            follows the light and leaves the PSF its shape, "reciprocal" lets a shadow change that, "paper" is eq. 10,
+            "paper_release" what the paper's public code does.
     """
 
     near_m: tuple[NearDepth, ...] = ()

@@ -25,8 +25,8 @@ Psfs = Float[Array, "*k layer y x"] | Float[np.ndarray, "*k layer y x"]
 Discs = Sequence[Array | np.ndarray]  # `[behind, y, x]` each, with another number of layers behind
 
 # Added to 1 - D², D the transform of the disc, which vanishes for the slowest waves: what is finer than five disc
-# radii is told from the PSFs, and what is wider counts as common. Ten times less or three times more changes no error
-# of examples/occlusion_table.py by more than a quarter.
+# radii is told from the PSFs, and what is wider counts as common. Of examples/occlusion_table.py the error that moves
+# most, blazed rings and a photograph behind an edge, is 5.6 % with it, 4.9 % with 0.001 and 7.2 % with 0.03.
 _LEAST = 0.01
 
 
