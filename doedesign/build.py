@@ -36,6 +36,7 @@ def camera_from_spec(spec: Spec) -> Camera:
         defocus_m=spec.sensor.defocus_m,
         mapping=spec.optics.mapping,
         distortion=spec.optics.distortion,
+        doe_distance_m=spec.optics.doe_distance_m,
     )
 
 

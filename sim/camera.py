@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.units import format_length
 from sim.material import fresnel_transmission, refractive_index
 
 Mapping = Literal["sine", "tangent"]
@@ -65,6 +66,8 @@ class Camera:
             ("sine") or d tan(angle) ("tangent", a lens without distortion) on a sensor at the distance d.
         distortion: (k1, k2), by which that height changes: to r (1 + k1 (r/d)² + k2 (r/d)⁴). Negative numbers make
             a barrel, positive ones a pincushion. An InputError if the image would fold over near the window.
+        doe_distance_m: distance of the DOE before the lens. Depths count from the DOE. The lens must be wide enough for
+            all light that passes the aperture: nothing is vignetted.
     """
 
     grid: Grid
@@ -78,6 +81,7 @@ class Camera:
     defocus_m: float = 0.0
     mapping: Mapping = "sine"
     distortion: Distortion = IDEAL
+    doe_distance_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a lens that cannot image the window."""
@@ -90,8 +94,23 @@ class Camera:
 
     @property
     def sensor_distance_m(self) -> float:
-        """Distance from the lens to the sensor."""
-        return self.focal_length_m + self.defocus_m
+        """Distance at which directions through the DOE's middle have their places: from the lens to the sensor.
+
+        For a DOE at a distance s before the lens it is the element B of the ray matrix from DOE to sensor,
+        d + s (1 - d/f) with d from lens to sensor, which Collins' integral has in place of d (S. A. Collins, J. Opt.
+        Soc. Am. 60, 1168, 1970). In the focal plane B = f whatever s is, and nothing is left of the lens's curvature:
+        there s changes phases on the sensor alone.
+        """
+        return self.focal_length_m + self.defocus_m - self.doe_distance_m * self.defocus_m / self.focal_length_m
+
+    def curvature_per_m(self, source_per_m: float = 0.0) -> float:
+        """Curvature of the wave behind the DOE as the sensor's distance has it, for a source's curvature at the DOE.
+
+        Lens and propagation leave A/B of the ray matrix, 1/d - 1/f for a DOE on the lens, and 0 in the focal plane.
+        """
+        if self.doe_distance_m:
+            return source_per_m - self.defocus_m / self.focal_length_m / self.sensor_distance_m
+        return source_per_m + 1 / self.sensor_distance_m - 1 / self.focal_length_m
 
     @property
     def lines(self) -> tuple[SpectralLine, ...]:
@@ -111,7 +130,9 @@ class Camera:
         """The lens's mapping in words."""
         names = {"sine": "places follow the sine of the angle", "tangent": "places follow the tangent of the angle"}
         k1, k2 = self.distortion
-        return names[self.mapping] + (f", distortion k1 = {k1:g}, k2 = {k2:g}" if any(self.distortion) else "")
+        bent = f", distortion k1 = {k1:g}, k2 = {k2:g}" if any(self.distortion) else ""
+        before = f", DOE {format_length(self.doe_distance_m)} before the lens" if self.doe_distance_m else ""
+        return names[self.mapping] + bent + before
 
     def image_m(self, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
         """Place (y, x) on the sensor, metres from the axis, of light with these direction sines."""
@@ -138,10 +159,13 @@ class Camera:
         return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
 
     def defocus_radius_m(self, depth_m: float) -> float:
-        """Radius on the sensor of the geometric blur disc: D/2 · |d/z + 1 - d/f|, or D f / (2 z) in the focal plane."""
-        distance = self.sensor_distance_m
+        """Radius on the sensor of the geometric blur disc: D/2 · |B/z + 1 - d/f|, or D f / (2 z) in the focal plane.
+
+        B is `sensor_distance_m` and d the distance from lens to sensor.
+        """
+        distance = self.focal_length_m + self.defocus_m
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
-        return self.aperture_m / 2 * abs(distance * inverse_depth + 1.0 - distance / self.focal_length_m)
+        return self.aperture_m / 2 * abs(self.sensor_distance_m * inverse_depth + 1.0 - distance / self.focal_length_m)
 
 
 def image_place(mapping: Mapping, distortion: Distortion, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
@@ -248,7 +272,7 @@ def path_at_m(
 ) -> Float[np.ndarray, "*u"]:
     """`source_path_m` at any points (y, x) of the aperture, broadcast against each other."""
     square = y_m**2 + x_m**2
-    defocus = (square / 2) * (1.0 / camera.sensor_distance_m - 1.0 / camera.focal_length_m)
+    defocus = (square / 2) * camera.curvature_per_m()
     if np.isinf(depth_m):
         return defocus
     y0, x0 = (-depth_m * np.tan(angle) for angle in field_rad)

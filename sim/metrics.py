@@ -197,7 +197,7 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
     `uncollected` near zero or below it would show a fault in either.
     """
     camera = optic.camera
-    curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+    curvature = camera.curvature_per_m(1 / depth_m)
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):

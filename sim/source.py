@@ -98,7 +98,7 @@ class SeparableSource(NamedTuple):
         """A source at a depth (metres, `inf` allowed) and field angles (y, x) of the chief ray."""
         tangents = np.tan(np.asarray(field_rad, np.float64))
         curvature = 0.0 if np.isinf(depth_m) else 1 / (depth_m * np.sqrt(1 + np.sum(tangents**2)))
-        bend = curvature + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+        bend = camera.curvature_per_m(curvature)
         waves_y, waves_x = (
             wrapped_waves(bend / 2 * camera.grid.axis_m(axis) ** 2, wavelength_m) for axis in ("y", "x")
         )

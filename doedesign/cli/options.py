@@ -43,6 +43,7 @@ _PLACES = {
     "tile, overlap": "--tile, --overlap",
     "propagation": "optics.propagation",
     "camera.mapping": "optics.mapping",
+    "camera.doe_distance": "optics.doe_distance",
     "mapping": "optics.mapping",
     "distortion": "optics.distortion",
     "camera.window": "sensor.window",

@@ -77,12 +77,19 @@ def _sensor(spec: Spec) -> Iterator[InputError]:
 def _lens(spec: Spec) -> Iterator[InputError]:
     optics, sensor = spec.optics, spec.sensor
     if optics.propagation == "fresnel":
-        cure = 'Set propagation = "far_field", or leave both out.'
+        cure = 'Set propagation = "far_field", or leave it out.'
         rule = "the direct path has the lens of eq. 5, whose mapping cannot be chosen"
         if optics.mapping != "sine":
             yield InputError("optics.mapping", rule, f'"{optics.mapping}"', cure)
         if any(optics.distortion):
             yield InputError("optics.distortion", rule, f"{list(optics.distortion)}", cure)
+        if optics.doe_distance_m:
+            rule = "on the direct path the DOE lies on the lens"
+            yield InputError("optics.doe_distance", rule, format_length(optics.doe_distance_m), cure)
+    if optics.doe_distance_m * sensor.defocus_m >= optics.focal_length_m**2 / 2:
+        rule = "with the sensor beyond the focus it must stay below focal_length² / (2 defocus)"
+        got, cure = format_length(optics.doe_distance_m), "Move the DOE to the lens or the sensor into focus."
+        yield InputError("optics.doe_distance", rule, got, cure)
     corner = sensor.window_m / math.sqrt(2) / (optics.focal_length_m + sensor.defocus_m)
     try:
         check_lens(optics.mapping, optics.distortion, corner, "optics.{}".format)

@@ -105,6 +105,8 @@ class OpticsSpec(SpecTable, frozen=True):
             has it, or of f tan(angle), "tangent", as a lens without distortion does.
         distortion: [k1, k2], by which that height r changes: to r (1 + k1 (r/f)² + k2 (r/f)⁴); negative numbers make
             a barrel, positive ones a pincushion. Far field only, as is "tangent".
+        doe_distance_m: distance of the DOE before the lens. Depths of the scene count from the DOE, and the lens must
+            let all its light pass. It matters only to a sensor out of focus. Far field only.
     """
 
     focal_length_m: Annotated[float, length(10 * UM, 100.0)] = Field(examples=['"8 mm"'])
@@ -113,6 +115,7 @@ class OpticsSpec(SpecTable, frozen=True):
     propagation: Literal["far_field", "fresnel"] = "far_field"
     mapping: Literal["sine", "tangent"] = optional("sine")
     distortion: tuple[Distortion, Distortion] = optional((0.0, 0.0))
+    doe_distance_m: Annotated[float, length(0.0, 100.0)] = optional(0.0)
 
     @model_validator(mode="before")
     @classmethod

@@ -158,7 +158,7 @@ def plan_far_field(
     else:
         pixels, miscounted = plan_mapped_pixels(places, camera.window, camera.fill, cutoff, factor, room)
     if not bare:
-        curvature = 1 / depth_m + 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+        curvature = camera.curvature_per_m(1 / depth_m)
         slope = curvature * pitch**2 / wavelength_m if cell else None
         refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope)
     return FarField(

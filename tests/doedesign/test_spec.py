@@ -400,6 +400,17 @@ def test_a_lens_of_its_own():
     assert "train.field" in refusal(AUTOMOTIVE, "optics.mapping=tangent", "train.field=random")
 
 
+def test_a_doe_before_its_lens():
+    chosen = load_spec(AUTOMOTIVE, ["optics.doe_distance=3 mm", "sensor.defocus=20 um"])
+    assert camera_from_spec(chosen).doe_distance_m == 3e-3
+    assert "DOE 3 mm before the lens" in camera_from_spec(chosen).lens_text
+    assert "doe_distance_m" not in spec_to_json(load_spec(AUTOMOTIVE))["optics"]
+    far = refusal(AUTOMOTIVE, "optics.doe_distance=50 m", "sensor.defocus=20 um")
+    assert "optics.doe_distance: with the sensor beyond the focus it must stay below" in far
+    assert "must lie between" in refusal(AUTOMOTIVE, "optics.doe_distance=-1 mm")
+    assert "the DOE lies on the lens" in refusal(AUTOMOTIVE, "optics.doe_distance=1 mm", "optics.propagation=fresnel")
+
+
 def test_a_bound_itself_is_inside():
     assert load_spec(AUTOMOTIVE, ["process.level_step=0.1 nm"]).process.level_step_m == pytest.approx(1e-10)
 
