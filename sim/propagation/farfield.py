@@ -39,10 +39,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Inexact, PyTree
+from jaxtyping import Array, Complex, Float, PyTree
 from scipy.fft import next_fast_len
 
 from sim.camera import Camera
+from sim.propagation.field_weights import FIELD_TAPS, field_weights
 from sim.propagation.mapped import MappedPixels, plan_mapped_pixels
 from sim.propagation.pixel import Banded, PixelWeights, pixel_weights, sampling_for
 from sim.propagation.places import cubic_places, largest_reach, window_places
@@ -51,8 +52,6 @@ from sim.propagation.pupil import PupilRows, block_size, cis, in_blocks
 TOLERANCE = 2e-3  # predicted relative L2 error of pixel energies, unless a plan says otherwise
 # Samples of the field per lambda d / D; 1 is its Nyquist rate, and a fourth more lets few taps interpolate it.
 _FIELD_SAMPLING = 1.25
-_FIELD_TAPS = 20
-_FLOOR = 1e-9  # keeps the interpolation's weights small where the band leaves them free
 
 
 class FarField(eqx.Module):
@@ -142,7 +141,7 @@ def plan_far_field(
         reach = largest_reach(places, camera.window) * (1 + 2 * room)
     half = reach + width + 8
     samples = 64 * int(np.ceil(2 * half / 64))
-    kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + _FIELD_TAPS + 2) / 64))
+    kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + FIELD_TAPS + 2) / 64))
     positions = (np.arange(samples) - samples // 2) * fine
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for fine².
     amount = pitch**2 / scale * fine / np.sqrt(np.pi * aperture**2 / 4)
@@ -182,39 +181,6 @@ def plan_far_field(
 def _pixel_rule(camera: Camera, width: float, fine: float, cutoff: float, samples: int) -> PixelWeights:
     """`pixel_weights` for samples `fine` metres apart; kept, for every depth of a wavelength has the same."""
     return pixel_weights(camera.axis_m() / fine + samples // 2, width, cutoff, samples)
-
-
-def field_weights(
-    positions: Float[np.ndarray, " fine"], samples: int, length: int, aperture: float, slope: float | None
-) -> tuple[Inexact[np.ndarray, "sample fine"], float]:
-    """Weights that interpolate the field behind a disc of square cells, and their relative RMS error along one axis.
-
-    `positions` count samples, whose middle one lies on the axis, from the first; `length` is that of their transform;
-    `aperture` is in cells; `slope` is the direction in which a cell is lit, in waves per cell and cell from the axis,
-    or None to leave out the factor sinc(direction of observation - direction of light) of a square cell.
-
-    Real weights if the imaginary part is zero. Least squares over the disc, weighted by its
-    chords: every cell x contributes exp(-2 pi i k x / length) at sample k and, to the wanted field, the same at a
-    fractional k times its sinc.
-    """
-    first = np.floor(positions - (_FIELD_TAPS - 1) / 2 + 0.5).astype(np.int64)
-    # One cell more than the aperture: for an even count its centre lies half a cell off the transform's origin.
-    # Gauss's rule for the weight sqrt(1 - x²), with enough nodes for the waves across twenty taps.
-    angle = np.arange(1, 65) * np.pi / 65
-    cell, power = np.cos(angle) * (aperture + 1) / 2, np.sin(angle) ** 2 * 2 / 65
-    lags = np.arange(_FIELD_TAPS)
-    gram = np.cos(2 * np.pi * (lags[:, None] - lags)[:, :, None] * cell / length) @ power + _FLOOR * np.eye(_FIELD_TAPS)
-    # The wave of a cell at a tap is that at the first tap, turned by that of the lag.
-    waves = np.exp(2j * np.pi * (first - positions)[:, None] * cell / length)
-    turns = np.exp(2j * np.pi * lags[:, None] * cell / length)
-    seen = (positions - samples // 2)[:, None] / length
-    target = np.ones((len(positions), len(cell))) if slope is None else np.sinc(seen - slope * cell)
-    weights = np.linalg.solve(gram, turns @ (waves * power * target).T).T
-    missed = np.abs((weights @ turns.conj()) * waves.conj() - target) ** 2 @ power
-    matrix = np.zeros((samples, len(positions)), np.complex128)
-    matrix[first[:, None] + lags, np.arange(len(positions))[:, None]] = weights
-    error = float(np.sqrt(missed.mean() / (target**2 @ power).mean()))
-    return matrix if slope else matrix.real, error
 
 
 def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:

@@ -99,7 +99,7 @@ def test_the_way_back_is_the_transpose(fill: float, rng: np.random.Generator):
 
 
 def test_gradient_in_the_map(rng: np.random.Generator):
-    """Of a turn, a stretch and a cubic bend, against differences; compiled and not."""
+    """Of a turn, a stretch and a cubic bend, against differences."""
     image = np.zeros((SAMPLES, SAMPLES))
     for fy, fx, phase in rng.uniform(-0.2, 0.2, (12, 3)):
         image += 1 + np.cos(2 * np.pi * (fy * AXIS[:, None] + fx * AXIS + 5 * phase))
@@ -113,12 +113,13 @@ def test_gradient_in_the_map(rng: np.random.Generator):
             PITCH * ((1 + wider) * column - turned * row + bend * (column / 15) ** 3),
         )
 
+    energy = jax.jit(lambda values: planned.at(moved(values)).energy(image))
+
     def total(values: jax.Array) -> jax.Array:
-        return jnp.sum(weights * planned.at(moved(values)).energy(image))
+        return jnp.sum(weights * energy(values))
 
     def total64(values: np.ndarray) -> float:
-        energy = planned.at(moved(jnp.asarray(values, jnp.float32))).energy(image)
-        return float(np.sum(weights * np.asarray(energy, np.float64)))
+        return float(np.sum(weights * np.asarray(energy(jnp.asarray(values, jnp.float32)), np.float64)))
 
     at = np.array([0.013, -0.021, 0.31])
     found = np.asarray(jax.jit(jax.grad(total))(jnp.asarray(at, jnp.float32)))
