@@ -1,6 +1,8 @@
-"""How far to trust a model of obstructed light: the camera's models against wave optics, for one plate.
+"""How far to trust a model of obstructed light: the camera's models against wave optics, for the plate of a run.
 
     python examples/compare_occlusion.py runs/automotive
+
+`occlusion_table.py` does so for plates and obstructions of every kind, at a small scale.
 
 A dark bar stands upright before the middle of the lens, at the nearest depth of the spec; it is a quarter to twice as
 wide as the aperture (1 to 10 mm for the automotive plate). Behind it, bright lines at equal distances fill the view.
