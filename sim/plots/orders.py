@@ -94,7 +94,8 @@ def _plot_orders(axes: "Axes", one: "CertifiedRow") -> None:
     radius = np.hypot(*one.row.centre_m)
     words = f"{one.wavelength_m / NM:.0f} nm, unpolarised, along {one.row.axis}, {1e3 * radius:.2f} mm from the axis"
     axes.set_title(words, color=INK)
-    axes.legend(loc="upper right")
+    axes.set_ylim(top=1.25 * axes.get_ylim()[1])  # for the legend
+    axes.legend(loc="upper right", ncols=3)
 
 
 def _plot_piece_orders(axes: "Axes", one: "CertifiedPiece") -> None:

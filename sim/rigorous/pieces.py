@@ -1,4 +1,9 @@
-"""A square of cells, three ways: as a thin element, as one with edges, and by Maxwell's equations."""
+"""A square of cells, three ways: as a thin element, as one with edges, and by Maxwell's equations.
+
+Nothing is added where walls of both axes meet. The corners of 2 x 2 cells that repeat are alike but for mirroring, so
+points of light at them would change the 0th order alone; with edges such squares were off by 0.1 to 2.4 % (486 to 656
+nm), of which the best strength for each left a quarter to all.
+"""
 
 from typing import NamedTuple
 
