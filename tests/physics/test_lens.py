@@ -111,8 +111,9 @@ def test_lenses_that_do_not_image_sines(name: str, field_rad: tuple[float, float
     middle_m = camera.focal_length_m * ideal * (1 + distortion[0] * square + distortion[1] * square**2)
     found = psf(HeightOptic.of(camera, HEIGHT_M), field_rad=field_rad).energy[0, 0] / camera.lines[0].factor
     wanted = summed(camera, chief, lambda y, x: (y + middle_m[0], x + middle_m[1]), PIXELS, field_rad)
-    # The plan predicts 1.7e-3; oblique windows are sheared by up to 3 %: 0.3 % per degree.
-    limit = 6e-3 if any(field_rad) else 2.5e-3
+    # The plan predicts 1.7e-3; slanted edges add 0.3 % per degree, and half of these pixels are in corners, where
+    # tangents shear the window by 0.8 degrees. Measured: 0.8e-3 to 2.4e-3.
+    limit = 3e-3
     assert np.linalg.norm(found[tuple(PIXELS.T)] - wanted) < limit * np.linalg.norm(wanted)
     straight = psf(HeightOptic.of(CAMERA, HEIGHT_M), field_rad=field_rad).energy[0, 0] / camera.lines[0].factor
     assert np.linalg.norm(straight[tuple(PIXELS.T)] - wanted) > 0.05 * np.linalg.norm(wanted)
