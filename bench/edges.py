@@ -10,6 +10,7 @@ within rounds.
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -31,7 +32,7 @@ def ways(camera: Camera, depth_m: float) -> dict[str, Callable[[Any], Any]]:
     found: dict[str, Callable[[Any], Any]] = {"thin": lambda height: psf(height, camera, depth_m).energy}
     for polarisation in TARGET:
         found[polarisation] = lambda height, way=polarisation: (
-            psf(with_edges(height, camera, way, depths_m=(depth_m,)), depths=depth_m).energy
+            psf(with_edges(height, replace(camera, polarisation=way), depths_m=(depth_m,)), depths=depth_m).energy
         )
     return found
 

@@ -37,6 +37,8 @@ def camera_from_spec(spec: Spec) -> Camera:
         mapping=spec.optics.mapping,
         distortion=spec.optics.distortion,
         doe_distance_m=spec.optics.doe_distance_m,
+        light=spec.optics.light,
+        polarisation=spec.optics.polarisation,
     )
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
@@ -43,11 +44,13 @@ from fab.levels import Levels
 from fab.plots.height import plot_height
 from fab.units import NM
 from sim.aperture import circle_coverage
+from sim.metrics import without_infinities
 from sim.optic import HeightOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
+from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
 
 log = logging.getLogger("doedesign")
@@ -176,18 +179,25 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     levels = None if spec.optimize.quantisation == "none" else design.levels
     names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
     write_history(run, design.history)
-    flat = np.zeros_like(height)
-    bank, lens = (psf(each, camera, (*near, *far), propagation=propagation) for each in (height, flat))
-    rows = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
-    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text}
+    drawn, flat = optic_as_drawn(camera, height, depths_m=(*near, *far)), HeightOptic.of(camera)
+    bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
+    rows = design_metrics(drawn, bank, near, lens)
+    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light}
     if patterns := pattern_metrics(spec, camera, bank, problem.terms):
         metrics["patterns"] = patterns
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(problem, design)
+    remark = ""
+    if propagation == "far_field":
+        ends = sorted({min(near + far), max(near + far)})
+        budget = accuracies(drawn, bank, ends)
+        metrics["accuracy"] = without_infinities([one._asdict() for one in budget])
+        remark = in_words(budget, camera)
+        log.info(remark)
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, spec.doe.aperture_m), levels, spec.name), run.path("height.png"))
-    save(plot_psfs(bank, camera, near, far), run.path("psf.png"))
-    transfers = [mtf(each, camera, (*near, *far)) for each in (height, flat)]
+    save(plot_psfs(bank, camera, near, far, remark=remark), run.path("psf.png"))
+    transfers = [mtf(each, depths=(*near, *far)) for each in (drawn, flat)]
     save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))
     save(plot_encircled(bank, camera, near, far, lens), run.path("encircled.png"))
     names += ["height.png", "psf.png", "mtf.png", "encircled.png"]
@@ -197,7 +207,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if targets := [term.target for term in problem.terms if term.target is not None]:
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
         efficiency, uniformity = (patterns[0][name] for name in ("efficiency", "uniformity"))
-        drawn = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)
-        save(drawn, run.path("pattern.png"))
+        picture = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)
+        save(picture, run.path("pattern.png"))
         names.append("pattern.png")
     return names

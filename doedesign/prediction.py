@@ -36,11 +36,11 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
 
 def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[dict[str, Any]]:
     """Numbers of a DOE as fabricated, one row per depth and colour (`sim.metrics.METRICS`, table "fabricated")."""
-    nominal = as_drawn(design.camera, design.level_map)
+    nominal = as_drawn(design.camera, design.level_map, design.depths_m)
     return metric_rows(bank.metric_inputs(design.near_m, surface, nominal), "fabricated")
 
 
 @lru_cache(maxsize=1)
-def as_drawn(camera: Camera, level_map: LevelMap) -> FabricatedDoe:
+def as_drawn(camera: Camera, level_map: LevelMap, depths_m: tuple[float, ...]) -> FabricatedDoe:
     """The DOE exactly as drawn; kept, because every draw is compared with it."""
-    return as_fabricated(level_map.level, camera, Process(level_map.levels), Variation())
+    return as_fabricated(level_map.level, camera, Process(level_map.levels), Variation(), depths_m=depths_m)

@@ -25,6 +25,8 @@ IDEAL: Distortion = (0.0, 0.0)
 _INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach double precision for 20 %
 # How far beyond the corners of a window the image must not be folded over: light is looked for a little outside.
 _MARGIN = 1.2
+Light = Literal["scalar", "edges"]
+Polarised = Literal["unpolarised", "x", "y"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ class Camera:
             a barrel, positive ones a pincushion. An InputError if the image would fold over near the window.
         doe_distance_m: distance of the DOE before the lens. Depths count from the DOE. The lens must be wide enough for
             all light that passes the aperture: nothing is vignetted.
+        light: "scalar" for a thin element, "edges" for one whose walls add their light (`sim.rigorous.edge_optic`).
+        polarisation: "unpolarised", or "x" or "y", the axis along which the electric field lies; for light with edges.
     """
 
     grid: Grid
@@ -82,10 +86,16 @@ class Camera:
     mapping: Mapping = "sine"
     distortion: Distortion = IDEAL
     doe_distance_m: float = 0.0
+    light: str = "scalar"
+    polarisation: str = "unpolarised"
 
     def __post_init__(self) -> None:
-        """Refuse a lens that cannot image the window."""
+        """Refuse a lens that cannot image the window, and words that mean nothing here."""
         check_lens(self.mapping, self.distortion, self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m)
+        for key, words in (("light", get_args(Light)), ("polarisation", get_args(Polarised))):
+            if getattr(self, key) not in words:
+                rule = f"must be one of {', '.join(words)}"
+                raise InputError(key, rule, repr(getattr(self, key)), "Choose one of them.")
 
     @property
     def is_sine(self) -> bool:

@@ -85,6 +85,10 @@ class Optic(eqx.Module):
         """Return it as it is."""
         return self
 
+    def prepared_for(self, depths_m: Sequence[float]) -> "Optic":
+        """The same, ready for sources at some depths, metres."""
+        return self
+
 
 class CameraOptic(Optic):
     """An optic that is computed for a camera."""
@@ -182,7 +186,7 @@ def height_transmission(height_m: Float[Array, "y x"], waves_per_metre: Float[Ar
 
 
 class HeightOptic(CellOptic):
-    """A DOE given by its height map.
+    """A DOE given by its height map, as a thin element.
 
     Attributes:
         height_m: `[y, x]` DOE height, metres; None where `deviation` holds all.

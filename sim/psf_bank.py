@@ -20,8 +20,9 @@ from fab.errors import InputError
 from fab.units import metres
 from sim.camera import Camera, SpectralLine
 from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, participation
-from sim.optic import ON_AXIS, CellOptic, HeightOptic, Optic, Propagation
+from sim.optic import ON_AXIS, CellOptic, Optic, Propagation
 from sim.propagation.farfield import FarField
+from sim.rigorous.edge_optic import optic_as_drawn
 from sim.tracing import in_jit, is_traced, on_host, stacked
 
 if TYPE_CHECKING:
@@ -188,8 +189,10 @@ class BankOptic(Optic):
         return (1 - share) * known[low] + share * known[low + 1]
 
 
-def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
+def optic_of(optic: Any, camera: Camera | None = None, depths_m: Sequence[float] = (np.inf,)) -> Optic:
     """The optic of something that carries one, or of a bare height map `[y, x]` (metres) and a camera.
+
+    It is ready for sources at some depths, metres.
 
     A ValueError for a map without a camera, or a camera of another grid, aperture or substrate; a TypeError for a
     camera beside an optic that is not made of cells.
@@ -197,13 +200,13 @@ def optic_of(optic: Any, camera: Camera | None = None) -> Optic:
     if hasattr(optic, "as_optic"):
         found: Optic = optic.as_optic()
         if camera is None:
-            return found
+            return found.prepared_for(depths_m)
         if not isinstance(found, CellOptic):
             raise TypeError(f"`camera` must be left out for a {type(found).__name__}, which has its own")
-        return found.with_camera(camera)
+        return found.with_camera(camera).prepared_for(depths_m)
     if camera is None:
         raise ValueError(f"a height map needs a `camera`, but got {type(optic).__name__} alone")
-    return HeightOptic.of(camera, optic)
+    return optic_as_drawn(camera, optic, depths_m=depths_m)
 
 
 def depths_from(depths: Length | Sequence[Length]) -> tuple[float, ...]:
@@ -243,7 +246,8 @@ def psf(
         ValueError: a height map that does not match its camera, or what the optic cannot do.
         InputError: a wavelength outside the material's range, or eq. 6 violated on a direct path.
     """
-    chosen, depths_m = optic_of(optic, camera), depths_from(depths)
+    depths_m = depths_from(depths)
+    chosen = optic_of(optic, camera, depths_m)
     way = propagation, sampling
     prepared = _prepared(chosen, [(line, depth) for depth in depths_m for line in chosen.lines], way, field_rad)
     rows = []

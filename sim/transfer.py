@@ -84,7 +84,8 @@ def mtf(
     Raises:
         TypeError: an optic that is not made of cells.
     """
-    doe, depths_m = optic_of(optic, camera), depths_from(depths)
+    depths_m = depths_from(depths)
+    doe = optic_of(optic, camera, depths_m)
     if not isinstance(doe, CellOptic):
         raise TypeError(f"`optic` must be made of cells for an MTF, but got {type(doe).__name__}")
     camera = doe.camera

@@ -157,7 +157,7 @@ def calibrate(
     unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read
     if not isinstance(measurement, Measurement):
         measurement = read_measurement(Path(measurement), design.camera)
-    writing = results_folder(out, design.name, design.folder)
+    writing = results_folder(out, design.name, design.folder, light=design.camera.light)
     # Usually seven rounds of derivatives and a step.
     with writing as fresh, models_meter("calibration", 7 * (len(unknowns.names) + 1)) as on_model:
         result = _calibrated(design, unknowns, measurement, evaluations, polish, seed, on_model)

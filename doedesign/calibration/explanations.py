@@ -298,7 +298,7 @@ def explain_ratio(
         rule = "the source must be near enough to be blurred by more than a pixel"
         raise InputError("depth", rule, f"{targets.depth_m:g} m", "Give the depth of the near PSF.")
     names = chosen_names(prior.masks, errors or _DEFAULT)
-    writing = results_folder(out, design.name, design.folder)
+    writing = results_folder(out, design.name, design.folder, light=design.camera.light)
     # About ten models for every error and six for a pair; those of a pair are followed to the end.
     with writing as fresh, models_meter("explanations", 200) as on_model:
         camera = replace(design.camera, colours=(Colour("probe", (targets.wavelength_m,), (1.0,)),))

@@ -43,7 +43,7 @@ from fab.figure import save
 from fab.files import MANIFEST_NAME, atomic_folder, canonical_json, read_json, sha256_bytes, sha256_file, write_atomic
 from fab.process import Process, Variation
 from sim.imaging.occlusion import follows_light
-from sim.optic import HeightOptic
+from sim.rigorous.edge_optic import optic_as_drawn
 from sim.surface import as_fabricated
 
 FORMAT = "doedesign simulation 1"
@@ -112,6 +112,7 @@ def simulate_files(
         "run": design.spec.name,
         "spec_sha256": spec_digest(design.spec),
         "level_map_sha256": design.level_map.digest,
+        "light": design.camera.light,
         "plate": words,
         "obstruction": getattr(kind, "name", type(kind).__name__),
         "parameters": plain_parameters(kind),
@@ -132,8 +133,8 @@ def simulate_files(
     size_words = f"{view.shape[1]} x {view.shape[0]} pixels"
     _log.info("%d items of %s, %s, %s; %s", count, size_words, settings["obstruction"], model.occlusion, words)
 
-    drawn = partial(HeightOptic.of, model.camera, design.level_map.height_m)
     depths_m = (*depth_range_m(kind), *far_m)
+    drawn = partial(optic_as_drawn, model.camera, design.level_map.height_m, depths_m=depths_m)
     made = partial(as_fabricated, design.level_map.level, model.camera, depths_m=depths_m)
     make = partial(made, *plate[:2]) if plate else drawn
     psfs = psfs_by_depth(make, model.camera), flat_psfs(model.camera)

@@ -5,7 +5,7 @@ PSFs are computed at the very depths of the scene; nothing is interpolated betwe
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from doedesign.capture.camera import CaptureModel
+from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, rgb_from_channels, sensor_from_spec
 from doedesign.capture.images import display_values
 from doedesign.capture.scenes import NamedScene, draw_scene
@@ -30,6 +30,7 @@ from sim.light import srgb_from_linear
 from sim.obstruction import CameraView, ObstructionKind
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
+from sim.rigorous.edge_optic import optic_as_drawn
 from sim.surface import FabricatedDoe
 
 if TYPE_CHECKING:
@@ -145,7 +146,9 @@ def simulate(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 0)))
     sample = NamedScene(name, draw_scene(shown, stage.kind, stage.view, stage.far_m, rng))
     camera = stage.model.camera
-    made = psfs_by_depth(lambda: fabricated or HeightOptic.of(camera, design.level_map.height_m), camera)
+    depths_m = (*depth_range_m(stage.kind), *stage.far_m)
+    drawn = partial(optic_as_drawn, camera, design.level_map.height_m, depths_m=depths_m)
+    made = psfs_by_depth(lambda: fabricated or drawn(), camera)
     return photograph(sample, stage.model, made, flat_psfs(camera), jax.random.fold_in(jax.random.key(seed), 0))
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
     from sim.optic import HeightOptic
+    from sim.rigorous.edge_optic import EdgeOptic
     from sim.surface import FabricatedDoe
 
 
@@ -79,11 +80,11 @@ class Design:
         """All source distances, near ones first, metres."""
         return (*self.near_m, *self.far_m)
 
-    def as_optic(self) -> "HeightOptic":
+    def as_optic(self) -> "HeightOptic | EdgeOptic":
         """The optic of the design as drawn, which `sim.psf` asks for PSFs."""
-        from sim.optic import HeightOptic
+        from sim.rigorous.edge_optic import optic_as_drawn
 
-        return HeightOptic.of(self.camera, self.height_m)
+        return optic_as_drawn(self.camera, self.height_m, depths_m=self.depths_m or (np.inf,))
 
     def bare(self) -> "Design":
         """The same without what only its optimisation knew: what other processes need to predict it."""

@@ -21,6 +21,7 @@ from sim.optic import HeightOptic, RingOptic, colour_energies
 from sim.propagation.farfield import displaced
 from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
+from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
 from sim.source import SourceMap
 
 
@@ -50,7 +51,7 @@ class Problem(eqx.Module):
     terms: tuple[Term, ...] = eqx.field(static=True)
     plans: tuple[Any, ...]
     waves_per_metre: tuple[Float[Array, ""], ...]
-    optic: HeightOptic | RingOptic
+    optic: HeightOptic | EdgeOptic | RingOptic
 
     @property
     def camera(self) -> Camera:
@@ -128,7 +129,9 @@ def plans_of(spec: Spec) -> Problem:
     # Depths that are to be chosen begin at 2^k steps.
     levels = levels_from_spec(process, Levels(process.levels, process.level_step_m))
     radial = spec.optimize.parametrization == "radial"
-    optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else HeightOptic.of(camera)
+    depths_m = (*spec.scene.near_m, *spec.scene.far_m)
+    flat = optic_as_drawn(camera, np.zeros(camera.grid.shape), depths_m=depths_m)
+    optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else flat
     propagation = "far_field" if radial else spec.optics.propagation
     sampling = 1.0 if _is_sparse(spec) else None
     return Problem(

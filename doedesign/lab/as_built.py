@@ -246,6 +246,7 @@ def as_built(
     sources = [each for each in ("measured", "process mean", "not measured, taken as 0") if count[each]]
     log.info(", ".join(f"{count[each]} errors: {each}" for each in sources))
     about = {"level_map_sha256": design.level_map.digest, "measured_sha256": sha256_file(Path(file))}
+    about["light"] = design.camera.light
     with results_folder(out, design.name, design.folder, **about) as folder:
         try:
             prediction = predict(design, made_by, doe.variation)

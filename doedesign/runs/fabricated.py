@@ -79,7 +79,7 @@ def fabricated(
     made_by = design.process(process)
     errors, words = design.plate_errors(made_by, variation, seed, draw)
     log.info(f"plate: {words}")
-    about = {"level_map_sha256": design.level_map.digest, "plate": words}
+    about = {"level_map_sha256": design.level_map.digest, "plate": words, "light": design.camera.light}
     with results_folder(out, design.name, design.folder, **about) as folder:
         found = _computed(design, made_by, errors)
         if folder is not None:
@@ -100,7 +100,7 @@ def _computed(design: Design, process: Process, errors: Variation) -> Fabricated
     excess = max(split.excess() for split in splits.values())
     if excess > _MOST_EXCESS:
         raise CheckFailed([f"leaked and diffracted light miss the plate's by {excess:.1e} of its brightest pixel"])
-    drawn = as_fabricated(level, camera, process, Variation())
+    drawn = as_fabricated(level, camera, process, Variation(), depths_m=design.depths_m)
     nominal = psf(drawn, depths=design.depths_m)
     energy = [[splits[c, d].total for d in range(len(design.depths_m))] for c in range(len(camera.colours))]
     bank = PsfBank(np.array(energy), nominal.colours, design.depths_m, camera.pixel_m, camera=camera)

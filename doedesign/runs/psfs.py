@@ -24,12 +24,12 @@ from fab.files import MANIFEST_NAME, canonical_json
 from fab.height import HeightMap
 from fab.plots.height import plot_height
 from fab.runsheet.tables import CertifiedOrder
-from sim.camera import Camera
 from sim.optic import HeightOptic, RingOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.psfs import plot_psfs
 from sim.propagation.hankel import radial_profile, ring_count
 from sim.psf_bank import PsfBank, psf
+from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
 from sim.store import write_bank
 from sim.transfer import mtf
 
@@ -66,12 +66,15 @@ def psfs(
     designs = _heights_of(run, masks)
     certified = certified_orders(run.folder, level_map_of_run(run).digest)
     total = len(designs) * len((*near, *far)) * sum(len(c.wavelengths_m) for c in camera.colours)
-    with results_folder(out, run.spec.name, run.folder) as fresh:
+    optics: dict[str, Any] = {
+        name: optic_as_drawn(camera, height, depths_m=(*near, *far)) for name, height in designs.items()
+    }
+    with results_folder(out, run.spec.name, run.folder, light=camera.light) as fresh:
         with meter("PSFs", total) as progress:
             done = count(1)
 
             def bank(name: str) -> PsfBank:
-                optic, propagation = HeightOptic.of(camera, designs[name]), run.spec.optics.propagation
+                optic, propagation = optics[name], run.spec.optics.propagation
                 profile = radial_profile(designs[name], camera.grid) if _takes_hankel(run, name, field_rad) else None
                 if profile is not None:
                     optic, propagation = RingOptic(camera, jnp.asarray(profile[: ring_count(camera)])), "far_field"
@@ -83,7 +86,7 @@ def psfs(
             raise CheckFailed([f"{run.folder}: the PSFs of the masks are not those of the quantised design"])
         if fresh is not None:
             log.info("writing banks and pictures")
-            _write(fresh, run, camera, designs, banks, near, far, certified)
+            _write(fresh, run, optics, banks, near, far, certified)
     for words in verdict_in_words(certified):
         log.info(words)
     return banks
@@ -127,27 +130,27 @@ def _takes_hankel(run: Run, name: str, field_rad: tuple[float, float]) -> bool:
 def _write(
     folder: Path,
     run: Run,
-    camera: Camera,
-    designs: dict[str, np.ndarray],
+    optics: dict[str, HeightOptic | EdgeOptic],
     banks: dict[str, PsfBank],
     near: tuple[float, ...],
     far: tuple[float, ...],
     certified: tuple[CertifiedOrder, ...],
 ) -> None:
+    camera = camera_from_spec(run.spec)
     flat, depths, field = HeightOptic.of(camera), (*near, *far), banks["quantised"].field_rad
     lens = psf(flat, depths=depths, field_rad=field)
     lens_transfer = mtf(flat, depths=depths)
-    metrics: dict[str, Any] = {"lens": camera.lens_text}
-    for name, height in designs.items():
+    metrics: dict[str, Any] = {"lens": camera.lens_text, "light": camera.light}
+    for name, optic in optics.items():
         if name == "from_masks":
             continue
         bank = banks[name]
         write_bank(folder / f"{name}.exr", bank, {"design": run.spec.name, "lens": camera.lens_text})
         save(plot_psfs(bank, camera, near, far), folder / f"{name}_psf.png")
-        transfer = mtf(height, camera, depths)
+        transfer = mtf(optic, depths=depths)
         save(plot_mtf(transfer, camera, near, far, lens_transfer), folder / f"{name}_mtf.png")
         save(plot_encircled(bank, camera, near, far, lens), folder / f"{name}_encircled.png")
-        metrics[name] = design_metrics(HeightOptic.of(camera, height), bank, near, lens)
+        metrics[name] = design_metrics(optic, bank, near, lens)
     # Of the map itself; the heights before rounding have other walls.
     metrics["quantised"] = with_verdict(metrics["quantised"], certified)
     if _takes_hankel(run, "continuous", field):
@@ -158,7 +161,7 @@ def _write(
         metrics["from_masks"] = metrics["quantised"]
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
-    if "continuous" in designs:
-        height_map = HeightMap(designs["continuous"], camera.grid, run.spec.doe.aperture_m)
+    if "continuous" in optics:
+        height_map = HeightMap(np.asarray(optics["continuous"].height_m), camera.grid, run.spec.doe.aperture_m)
         save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))

@@ -36,6 +36,7 @@ from doedesign.spec.values import (
 )
 from doedesign.spec.wafer import WaferSpec
 from fab.units import NM, UM, parse_length
+from sim.camera import Light, Polarised
 from sim.material import MATERIALS
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -107,6 +108,10 @@ class OpticsSpec(SpecTable, frozen=True):
             a barrel, positive ones a pincushion. Far field only, as is "tangent".
         doe_distance_m: distance of the DOE before the lens. Depths of the scene count from the DOE, and the lens must
             let all its light pass. It matters only to a sensor out of focus. Far field only.
+        light: "scalar" (a thin element) or "edges" (walls between cells add their light, certified against Maxwell's
+            equations; one and a half to two times the time). Rings are optimised as thin elements and judged with
+            their edges.
+        polarisation: of the light at walls: "unpolarised", or "x" or "y", the axis of the electric field.
     """
 
     focal_length_m: Annotated[float, length(10 * UM, 100.0)] = Field(examples=['"8 mm"'])
@@ -116,6 +121,8 @@ class OpticsSpec(SpecTable, frozen=True):
     mapping: Literal["sine", "tangent"] = optional("sine")
     distortion: tuple[Distortion, Distortion] = optional((0.0, 0.0))
     doe_distance_m: Annotated[float, length(0.0, 100.0)] = optional(0.0)
+    light: Light = optional("scalar")
+    polarisation: Polarised = optional("unpolarised")
 
     @model_validator(mode="before")
     @classmethod

@@ -92,6 +92,7 @@ class ToleranceResult:
         out = {
             "format": FORMAT,
             "design": self.study.design.name,
+            "light": self.study.design.camera.light,
             "seed": self.study.seed,
             "plan": self.plan,
             "units": "SI; a depth of null is infinity; a colour of null is the worst colour and depth of each plate",

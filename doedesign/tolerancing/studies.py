@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -36,6 +36,7 @@ from fab.draws import (
 from fab.errors import InputError
 from fab.files import sha256_bytes
 from fab.process import DEVIATIONS, Process, Variation, error_names
+from sim.camera import Camera
 
 if TYPE_CHECKING:
     from doedesign.design.design import Design
@@ -284,6 +285,12 @@ def _at_least_one(name: str, value: int) -> int:
     return value
 
 
+def _given(camera: Camera) -> dict[str, Any]:
+    """A camera without what is as it was before there was a choice, so that earlier studies go on."""
+    usual = {field.name: field.default for field in fields(Camera) if field.name not in ("fill", "defocus_m")}
+    return {name: value for name, value in asdict(camera).items() if name not in usual or value != usual[name]}
+
+
 def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
     """Everything a draw's numbers depend on besides its key, as JSON.
 
@@ -301,7 +308,7 @@ def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate)
             "level_sha256": sha256_bytes(level.tobytes()),
             "shape": list(level.shape),
             "levels": {"count": levels.count, "step_m": levels.step_m, **depths},
-            "camera": asdict(design.camera),
+            "camera": _given(design.camera),
             "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*design.near_m, *design.far_m)],
             "near": len(design.near_m),
         },

@@ -44,6 +44,7 @@ from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
+from sim.rigorous.edge_optic import EdgeOptic
 from sim.source import SeparableSource
 from sim.surface import as_fabricated
 
@@ -244,9 +245,11 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
 def _learnt_doe(spec: Spec, source: str) -> TrainingDoe:
     """A DOE that is learnt, or looked at off the axis, or with errors."""
     odd = spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
-    problem = plans_of(spec.model_copy(update={"sensor": odd}))
+    # Of a DOE with errors, the light of walls comes with its deviation from thin heights.
+    light = spec.optics.model_copy(update={"light": "scalar"} if spec.train.fabricated else {})
+    problem = plans_of(spec.model_copy(update={"sensor": odd, "optics": light}))
     optic = problem.optic
-    if isinstance(optic, HeightOptic):  # one compiled step serves all depths and fields
+    if isinstance(optic, HeightOptic | EdgeOptic):  # one compiled step serves all depths and fields
         optic = replace(optic, source_kind=SeparableSource)
     elif spec.train.field == "random" or spec.train.fabricated:
         key = "field" if spec.train.field == "random" else "fabricated"

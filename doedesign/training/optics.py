@@ -17,6 +17,7 @@ from doedesign.design.parametrize import LevelParametrization
 from sim.imaging.scene import Scene
 from sim.optic import ON_AXIS, HeightOptic, RingOptic, colour_energies
 from sim.psf_bank import BankOptic
+from sim.rigorous.edge_optic import EdgeOptic
 
 
 class TrainingDoe(eqx.Module):
@@ -25,7 +26,7 @@ class TrainingDoe(eqx.Module):
     Every line of the optic has a plan of propagation.
     """
 
-    optic: HeightOptic | RingOptic | BankOptic
+    optic: HeightOptic | EdgeOptic | RingOptic | BankOptic
     plans: tuple[Any, ...]
     parametrization: LevelParametrization | None = eqx.field(static=True, default=None)
 
@@ -56,9 +57,9 @@ class TrainingDoe(eqx.Module):
         return self.parametrization
 
     @property
-    def learnt(self) -> HeightOptic | RingOptic:
+    def learnt(self) -> HeightOptic | EdgeOptic | RingOptic:
         """The optic of a DOE that is learnt."""
-        return cast("HeightOptic | RingOptic", self.optic)
+        return cast("HeightOptic | EdgeOptic | RingOptic", self.optic)
 
 
 class TrainingScene(NamedTuple):

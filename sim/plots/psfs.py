@@ -38,13 +38,19 @@ class _Group(NamedTuple):
 
 
 def plot_psfs(
-    bank: "Bank", camera: Camera, near_m: Sequence[float], far_m: Sequence[float], ax: "Axes | None" = None
+    bank: "Bank",
+    camera: Camera,
+    near_m: Sequence[float],
+    far_m: Sequence[float],
+    ax: "Axes | None" = None,
+    *,
+    remark: str = "",
 ) -> "FigureBase":
     """Draw the PSFs of a bank: a row per colour, near depths on the left and far ones on the right.
 
     Energies are shown on a logarithmic scale, one for the near and one for the far columns. Three colours make a last
-    row in which they stand together. Of more than six depths, or six colours, an even choice is shown. A ValueError for
-    no depth, or one that is not in the bank.
+    row in which they stand together. Of more than six depths, or six colours, an even choice is shown; a remark stands
+    below. A ValueError for no depth, or one that is not in the bank.
     """
     most = _MOST_COLUMNS if len(near_m) + len(far_m) <= _MOST_COLUMNS else _MOST_COLUMNS // 2
     shown = {
@@ -67,7 +73,9 @@ def plot_psfs(
     # An empty column keeps the groups apart.
     widths = [1.0] * len(groups[0].depths) + ([0.15] + [1.0] * len(groups[1].depths) if groups[1:] else [])
     size = (max(0.9 + sum(widths) * (side + 0.1), 4.5), 1.3 + len(rows) * (side + 0.1))
-    with panels(ax, size, note=_notes(camera, bank, shown), layout="compressed") as figure:
+    with panels(
+        ax, size, note="; ".join(filter(None, (_notes(camera, bank, shown), remark))), layout="compressed"
+    ) as figure:
         grid = figure.subplots(len(rows), len(widths), sharex=True, sharey=True, squeeze=False, width_ratios=widths)
         first = 0
         for group in groups:
@@ -195,4 +203,6 @@ def _notes(camera: Camera, bank: "Bank", shown: dict[str, list[int]]) -> str:
         words.append("dotted: far spot (first dark ring + 1 pixel)")
     if len(camera.colours) == 3:
         words.append("together: all three as red, green, blue")
+    if camera.light == "edges":
+        words.append("with the light of walls")
     return "; ".join(words)

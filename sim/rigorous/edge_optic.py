@@ -26,19 +26,17 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
 from scipy.interpolate import CubicSpline
 
-from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.material import refractive_index
-from sim.optic import ON_AXIS, CellOptic, CellSource
+from sim.optic import CellOptic, CellSource, HeightOptic
 from sim.propagation.oblique import oblique_waves
 from sim.propagation.pupil import cis
-from sim.rigorous.edge_widths import edge_widths
-from sim.source import SourceMap
+from sim.rigorous.edge_widths import relative_widths
+from sim.source import SeparableSource, SourceMap
 from sim.tracing import is_traced
 
-POLARISATIONS = ("unpolarised", "x", "y")
 # Root mean square error of a line's far field that is good enough, and the largest that is borne before cells are
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
@@ -50,21 +48,24 @@ class EdgeOptic(CellOptic):
     """A DOE with the light of its walls.
 
     Attributes:
-        camera: lens, sensor and substrate. Its grid is that of the cells here: those of the DOE, or a whole number of
-            parts of them.
+        drawn: lens, sensor, substrate, and the grid of the DOE.
+        height_m: `[y, x]` height of every cell of the DOE.
+        camera: the same with the grid of the cells here: those of the DOE, or a whole number of parts of them.
         coverage: `[y, x]` open share of every cell.
         transmission: `[wavelength, y, x]` values of the cells whose far field is that of cells and walls.
         wavelengths_m: different vacuum wavelengths.
-        depths_m: nearest and farthest depth of sources for which that holds, metres.
+        depths_m: nearest and farthest depth of sources for which that holds, metres; from others, it is a little off.
         source_kind: how sources are described.
     """
 
+    drawn: Camera = eqx.field(static=True)
+    height_m: Float[Array, "v u"]
     camera: Camera = eqx.field(static=True)
     coverage: Float[Array, "y x"]
     transmission: Complex[Array, "w y x"]
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
     depths_m: tuple[float, float] = eqx.field(static=True)
-    source_kind: type[SourceMap] = eqx.field(static=True, default=SourceMap)
+    source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
 
     @property
     def means(self) -> Complex[Array, "w y x"]:
@@ -75,30 +76,46 @@ class EdgeOptic(CellOptic):
         """Transmission at one wavelength."""
         return None, self.transmission[self.wavelengths_m.index(line.wavelength_m)]
 
-    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
-        """The path to every cell; a ValueError for a depth that the light of the walls was not prepared for."""
-        nearest, farthest = self.depths_m
-        if not nearest <= depth_m <= farthest:
-            raise ValueError(
-                f"`depth_m` must lie within {nearest} to {farthest} m, the depths of `with_edges`: {depth_m}"
-            )
-        return super().source(line, depth_m, field_rad)
-
     def with_camera(self, camera: Camera) -> "EdgeOptic":
-        """A ValueError, for the light of walls is prepared for one lens and window."""
-        raise ValueError("`camera` must be given to `with_edges`, which prepares the light of walls for it")
+        """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
+        own = super().with_camera(replace(camera, grid=self.drawn.grid)).camera
+        drawn = replace(own, grid=self.drawn.grid)
+        return self if drawn == self.drawn else replace(self, drawn=drawn)._prepared(self.height_m, self.depths_m)
+
+    def prepared_for(self, depths_m: Sequence[float]) -> "EdgeOptic":
+        """The same for sources at other depths, metres."""
+        least, most = self.depths_m
+        enough = least <= min(depths_m) and max(depths_m) <= most
+        return self if enough else self._prepared(self.height_m, (*self.depths_m, *depths_m))
+
+    def with_heights(self, height_m: Float[Array, "y x"]) -> "EdgeOptic":
+        """The same with other heights; they may be traced."""
+        return self._prepared(height_m, self.depths_m)
+
+    def _prepared(self, height_m: Any, depths_m: Sequence[float]) -> "EdgeOptic":
+        return replace(with_edges(height_m, self.drawn, depths_m=depths_m), source_kind=self.source_kind)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the heights."""
+        return self.drawn.grid.shape
+
+    def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+        """Heights of the cells."""
+        return height_m
+
+    def heights_of(self, map_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"] | None:
+        """The heights that `with_heights` takes of a map on the grid."""
+        return map_m
 
 
-def with_edges(
-    height_m: Any, camera: Camera, polarisation: str = "unpolarised", *, depths_m: Sequence[float] = (np.inf,)
-) -> EdgeOptic:
+def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np.inf,)) -> EdgeOptic:
     """A DOE of upright walls, with their light.
 
     Args:
         height_m: `[y, x]` height of every cell of `camera.grid`, metres; numpy, or jax. Traced heights must not differ
             by more than two waves from one cell to the next.
-        camera: DOE grid, aperture, substrate, lens and sensor.
-        polarisation: "unpolarised", or the axis along which the light's electric field lies.
+        camera: DOE grid, aperture, substrate, lens and sensor, and the polarisation of the light.
         depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between.
 
     Returns:
@@ -106,16 +123,13 @@ def with_edges(
 
     Raises:
         ValueError: heights of another shape than the grid's.
-        InputError: a polarisation that is none.
     """
-    if polarisation not in POLARISATIONS:
-        raise InputError("polarisation", 'must be "unpolarised", "x" or "y"', repr(polarisation), "Choose one of them.")
-    height = jnp.asarray(height_m, jnp.float32)
+    drawn, height = camera, jnp.asarray(height_m, jnp.float32)
     if height.shape != camera.grid.shape:
         raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
     wavelengths = tuple(dict.fromkeys(line.wavelength_m for line in camera.lines))
     oblique = [oblique_waves(camera, wavelength, depths_m) for wavelength in wavelengths]
-    parts = 1
+    drawn_m, parts = height, 1
     while max(line_weights(*waves.over(parts))[1] for waves in oblique) > _WORST:
         parts += 1
     if parts > 1:
@@ -128,12 +142,28 @@ def with_edges(
         # Walls of two waves, where heights are traced.
         highest = 2 * wavelength / (index - 1) if is_traced(height) else float(jnp.ptp(height))
         nodes = max(2, int(np.ceil(highest / _NODE_M - 1e-3)) + 1)
-        table = [_table(wavelength, index, polarisation, axis, nodes) for axis in ("y", "x")]
+        table = [_table(wavelength, index, camera.polarisation, axis, nodes) for axis in ("y", "x")]
         weights = [_at_borders(line_weights(*waves.over(parts))[0], camera, axis) for axis in ("y", "x")]
         rate = camera.waves_per_metre(wavelength)
         found.append(_transmission(height, rate, *table, *weights, camera.grid.pitch_m))
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    return EdgeOptic(camera, coverage, jnp.stack(found), wavelengths, (min(depths_m), max(depths_m)))
+    depths = min(depths_m), max(depths_m)
+    return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), wavelengths, depths)
+
+
+def optic_as_drawn(
+    camera: Camera, height_m: Any = None, *, depths_m: Sequence[float] = (np.inf,)
+) -> HeightOptic | EdgeOptic:
+    """The optic of a DOE exactly as drawn, in the light that the camera asks for.
+
+    Args:
+        camera: DOE grid, lens and sensor; its `light` says whether walls add theirs.
+        height_m: `[y, x]` heights of the cells, metres; None for the bare lens.
+        depths_m: nearest and farthest depth of the sources that will be looked at, metres, and any between.
+    """
+    if height_m is None or camera.light == "scalar":
+        return HeightOptic.of(camera, height_m)
+    return with_edges(height_m, camera, depths_m=depths_m)
 
 
 @lru_cache(maxsize=64)
@@ -191,12 +221,9 @@ def _at_borders(
 def _table(wavelength_m: float, index: float, polarisation: str, axis: str, nodes: int) -> Complex[np.ndarray, " step"]:
     """Light of walls across an axis over that of the lower cell, metres, one per `_NODE_M / _PER_NODE` of height."""
     heights = np.arange(nodes) * _NODE_M
-    ways = {"unpolarised": ("TE", "TM"), axis: ("TM",)}.get(polarisation, ("TE",))
-    widths = np.mean([edge_widths(tuple(heights.tolist()), wavelength_m, index, way) for way in ways], axis=0)
-    # The lower cell's light is delayed by its own glass; all of the wall's height is air to it.
     fine = np.arange((nodes - 1) * _PER_NODE + 1) * (_NODE_M / _PER_NODE)
-    turned = CubicSpline(heights, widths)(fine) * np.exp(-2j * np.pi * fine / wavelength_m)
-    return turned.astype(np.complex64)
+    widths = CubicSpline(heights, relative_widths(heights, wavelength_m, index, polarisation, axis))(fine)
+    return widths.astype(np.complex64)
 
 
 @jax.jit

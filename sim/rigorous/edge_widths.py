@@ -82,6 +82,25 @@ def edge_widths(
     return np.array(found)
 
 
+def relative_widths(
+    heights_m: Float[np.ndarray, " height"], wavelength_m: float, index: float, polarisation: str, axis: str
+) -> Complex[np.ndarray, " height"]:
+    """Light of walls across an axis ("x" or "y") over that of the glass on their lower side, metres.
+
+    Args:
+        heights_m: of the walls.
+        wavelength_m: vacuum wavelength.
+        index: refractive index of the glass.
+        polarisation: "x" or "y", the axis along which the electric field lies, or "unpolarised": the mean of both.
+        axis: across which the walls stand.
+    """
+    ways: dict[str, tuple[Polarisation, ...]] = {"unpolarised": ("TE", "TM"), axis: ("TM",)}
+    heights = tuple(np.asarray(heights_m, float).tolist())
+    widths = [edge_widths(heights, wavelength_m, index, way) for way in ways.get(polarisation, ("TE",))]
+    # The lower side's light is delayed by its own glass; all of the wall's height is air to it.
+    return np.mean(widths, axis=0) * np.exp(-2j * np.pi * heights_m / wavelength_m)
+
+
 def _with_echoes(
     entered: Complex[np.ndarray, " mode"], echo: Callable[[Complex[np.ndarray, " mode"]], Complex[np.ndarray, " mode"]]
 ) -> Complex[np.ndarray, " mode"]:

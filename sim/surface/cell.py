@@ -17,11 +17,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
-from scipy.special import spherical_jn
+from scipy.special import factorial, spherical_jn
 
 DEGREE = 3  # of the highest moments
 # Moments kept: degree along y and along x.
 DEGREES = tuple((y, x) for y in range(DEGREE + 1) for x in range(DEGREE + 1 - y))
+LINE_DEGREE = 2  # the same of lines along borders
 REACH = 14  # cells to either side of a moment's own
 _RIDGE = 1e-8  # keeps weights small where the band leaves them free
 
@@ -114,24 +115,31 @@ def point_moments(at_y: Float[Array, "part degree q"], at_x: Float[Array, "part 
 
 def moment_weights(
     low: Float[np.ndarray, " band"], high: Float[np.ndarray, " band"], slope: float = 0.0
-) -> Complex[np.ndarray, "band higher tap"]:
-    """Weights on the cells -14 ... 14 from a moment's own whose far field is that of the moment of degree 1, 2 or 3.
+) -> Complex[np.ndarray, "band kind tap"]:
+    """Weights on the cells -14 ... 14 from a moment's own whose far field is that of the moment.
+
+    The first three kinds are moments of degree 1, 2 and 3 of a cell, the others those of degree 0, 1 and 2 of a line
+    about the lower border of its cell, sum of light times place^q with places in cells.
 
     A cell's far field is sinc(u). The sum of weights times exp(-2 pi i u k) sinc(u) is fitted by least squares to
-    (2q+1) (-i)^q j_q(pi u), the far field of moment q, for wave numbers u from `low` to `high`, waves per cell: those
-    of light to a pixel less that of the light on the cell. Any band narrower than 1 can be fitted, wherever it lies.
-    `slope` is how much more obliquely each cell is lit than the one before, waves per cell.
+    (2q+1) (-i)^q j_q(pi u), the far field of moment q, and to exp(i pi u) (-2 pi i u)^q / q!, that of a line's moment,
+    for wave numbers u from `low` to `high`, waves per cell: those of light to a pixel less that of the light on the
+    cell. Any band narrower than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit
+    than the one before, waves per cell.
 
-    The weights have no effect on the axis, so that they leave the mean of a plate alone; they are real for a band that
-    is symmetric about it.
+    The weights of all kinds but a line's light itself, whose weights sum to 1, have no effect on the axis, so that they
+    leave the mean of a plate alone; they are real for a band that is symmetric about it.
     """
     waves = (low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 200))[:, :, None]  # [band, node, place]
     places = np.arange(-REACH, REACH + 1)
     seen = np.exp(-2j * np.pi * waves * places + 1j * np.pi * slope * places**2) * np.sinc(waves - slope * places)
-    degrees = np.arange(1, DEGREE + 1)
-    wanted = (2 * degrees + 1) * (-1j) ** degrees * spherical_jn(degrees, np.pi * waves)
+    degrees, powers = np.arange(1, DEGREE + 1), np.arange(LINE_DEGREE + 1)
+    cells = (2 * degrees + 1) * (-1j) ** degrees * spherical_jn(degrees, np.pi * waves)
+    lines = np.exp(1j * np.pi * waves) * (-2j * np.pi * waves) ** powers / factorial(powers)
+    wanted = np.concatenate([cells, lines], 2)
+    on_axis = np.where(np.arange(wanted.shape[2]) == DEGREE, 1.0, 0.0)
     turned = seen.conj().swapaxes(1, 2) / waves.shape[1]
     # As good as exact on the axis, and then exact.
     matrix = turned @ seen + 1e3 * np.ones((len(places), len(places))) + _RIDGE * np.eye(len(places))
-    weights = np.linalg.solve(matrix, turned @ wanted).swapaxes(1, 2)
-    return weights - weights.mean(axis=2, keepdims=True)
+    weights = np.linalg.solve(matrix, turned @ wanted + 1e3 * on_axis).swapaxes(1, 2)
+    return weights + ((on_axis - weights.sum(axis=2)) / len(places))[:, :, None]

@@ -20,12 +20,16 @@ from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.metrics import in_parts
 from sim.optic import ON_AXIS, CellOptic, height_transmission
+from sim.rigorous.edge_optic import EdgeOptic, with_edges
 from sim.source import SourceMap, ViewedSource
+from sim.surface.lines import wall_series
 from sim.surface.pieces import TILE
 from sim.surface.relief import View, plan_of, relief_of, require_possible, view_weights
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 from sim.tracing import is_traced, single
+
+_HEADROOM = 1.25  # of the sum of all depths, for errors
 
 
 class FabricatedDoe(CellOptic):
@@ -114,6 +118,8 @@ def as_fabricated(
     traced = is_traced(variation)
     waves = np.array([camera.waves_per_metre(w) for w in lines])
     rates = jnp.asarray(waves, jnp.float32)
+    if not traced and variation.nominal and camera.light == "edges":
+        return _walled(with_edges(height_of(level_map, levels), camera, depths_m=depths_m), lines)
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
@@ -132,7 +138,11 @@ def as_fabricated(
     rough = None
     if traced or variation.roughness_m:
         rough = cell_roughness(camera.grid, variation.roughness_m, variation.correlation_m, variation.seed)
-    relief = relief_of(process, variation, rough)
+    walls = None
+    if camera.light == "edges":
+        highest = _highest_m(process, variation, traced)
+        walls = wall_series(camera, lines, highest), single(highest)
+    relief = relief_of(process, variation, rough, walls)
     packed = np.packbits(etched, axis=0, bitorder="little")[0]  # bit k for mask k
     left = np.ones(len(waves), np.float32)
     if traced or variation.roughness_m:
@@ -143,7 +153,32 @@ def as_fabricated(
     transmission, means = transmission_of(plan, packed, widths, relief, rates, left, weights)
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
+    if camera.light == "edges":
+        means = _first_views(transmission, views, lines)
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+
+
+def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
+    """A height that no wall exceeds by much; errors of usual size have it in common, and what is made for it."""
+    none = (0,) * process.masks
+    drawn = [depth * (1 + n) for depth, n in zip(process.depths_m(), variation.repeats or none, strict=True)]
+    scales = none if traced else variation.depth_scale or none
+    common = 0.0 if traced else variation.common_depth_scale
+    made = sum(abs(depth * (1 + common) * (1 + scale)) for depth, scale in zip(drawn, scales, strict=True))
+    return _HEADROOM * sum(drawn) * max(1, int(np.ceil(made / sum(drawn) / _HEADROOM)))
+
+
+def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:
+    """A DOE as drawn, with its light of walls."""
+    light = optic.transmission[np.array([optic.wavelengths_m.index(wavelength) for wavelength in wavelengths_m])]
+    views = tuple(View(wavelength, *optic.depths_m) for wavelength in wavelengths_m)
+    return FabricatedDoe(optic.camera, optic.coverage, light, views, light, wavelengths_m)
+
+
+def _first_views(transmission: Array, views: tuple[View, ...], wavelengths_m: tuple[float, ...]) -> Array:
+    """Transmission from the farthest depths: lines of light have no mean within a cell."""
+    first = [next(k for k, view in enumerate(views) if view.wavelength_m == wavelength) for wavelength in wavelengths_m]
+    return transmission[np.array(first)]
 
 
 def drawn_alike(
@@ -158,7 +193,9 @@ def drawn_alike(
 
     Arguments as of `as_fabricated`. Its transmission is that of the heights, which are not kept.
     """
-    drawn = as_fabricated(level_map, camera, process, Variation())
+    drawn = as_fabricated(level_map, camera, process, Variation(), depths_m=depths_m)
+    if drawn.grid != camera.grid:
+        return drawn  # its light of walls is that of parts of cells
     depths = min(depths_m), max(depths_m)
     plan, views = plan_of(camera, process, variation, drawn.wavelengths_m, depths, traced=False)
     means = jnp.asarray(in_parts(drawn.means, plan.parts))

@@ -47,6 +47,7 @@ class EtchParameters(NamedTuple):
     tilt: Array  # `[(y, x)]` depth share per metre
     rough_m: Array | None  # `[y, x]` height of the roughness, or None
     height_m: Array  # height of the blank surface above the deepest nominal floor
+    walls: tuple[Any, Any] | None = None  # their light (`sim.surface.lines.wall_series`), and the highest
 
 
 class TilePlan(NamedTuple):
@@ -60,7 +61,8 @@ class TilePlan(NamedTuple):
     views: tuple[tuple[int, int], ...]  # wavelength of every view, and degree of the highest moments that it needs
     cut: bool
     corners: bool
-    walls: bool
+    walls: bool  # tilted
+    lines: bool  # of light, along walls
 
 
 def effective_bias(relief: EtchParameters) -> Float[Array, " mask"]:
@@ -95,13 +97,13 @@ def plan_of(
     depths (the nearest and the farthest) are parted.
     """
     grid = camera.grid
-    reach = _USUAL_REACH
+    reach, lines = _USUAL_REACH, camera.light == "edges"
     cut = corners = walls = True
     if not traced:
         corners, walls = variation.corner_radius_m > 0, variation.sidewall_rad > 0
         shifts = np.abs(_corner_shifts_m(grid, process, variation))
         widened = bool(variation.common_cd_bias_m) or any(variation.cd_bias_m)
-        cut = bool(shifts.max() > 0 or widened or corners or walls)
+        cut = bool(shifts.max() > 0 or widened or corners or walls or lines)
         # Half a cell for the bias, and a cell more for corners seen from the next one.
         reach = max(_USUAL_REACH, int(np.ceil(shifts.max() / grid.pitch_m)) + 2)
         if reach > _MOST + 2:
@@ -125,7 +127,7 @@ def plan_of(
     numbers = [wavelengths_m.index(view.wavelength_m) for view in views]
     needed = tuple((number, degrees[number]) for number in numbers)
     parts = parts if cut else 1
-    return TilePlan(grid, process.masks, process.die_m, parts, reach, needed, cut, corners, walls), views
+    return TilePlan(grid, process.masks, process.die_m, parts, reach, needed, cut, corners, walls, lines), views
 
 
 def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, float]) -> list[View]:
@@ -140,10 +142,10 @@ def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, floa
 
 @lru_cache(maxsize=8)  # every draw of a study needs the same
 def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int) -> Float[np.ndarray, "..."]:
-    """Light that moments of a row of tiles add to cells: `[tile, view, 1 or 2, degree, cell, cell + 2 reach]`.
+    """Light that moments of a row of tiles add to cells: `[tile, view, 1 or 2, kind, cell, cell + 2 reach]`.
 
     The same along both axes. A tile is `tile` DOE cells wide, each divided into `parts` along either axis. The third
-    axis holds real and imaginary parts, if there are any.
+    axis holds real and imaginary parts, if there are any. Kinds are those of `moment_weights`: of lines, with edges.
     """
     grid, size = camera.grid, tile * parts
     count, radius = -(-grid.shape[0] // tile), camera.aperture_m / 2 / grid.pitch_m * parts
@@ -155,6 +157,8 @@ def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int)
         lit = nodes * waves.low, nodes * waves.high
         slope = (waves.low + waves.high) / 2 / radius
         weights = moment_weights(-waves.seen - np.maximum(*lit), waves.seen - np.minimum(*lit), slope)
+        if camera.light == "scalar":
+            weights = weights[:, :DEGREE]
         between = make_interp_spline(nodes, weights, k=1)
         found.append(between(np.clip(place, -1, 1)))
     weights = np.moveaxis(np.stack(found).reshape(len(views), count, size, *found[0].shape[1:]), 0, 1)
@@ -180,8 +184,13 @@ def _corner_shifts_m(grid: Grid, process: Process, variation: Variation) -> np.n
     )
 
 
-def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x"] | None = None) -> EtchParameters:
-    """The errors of one plate and the depths of its etches as the numbers that all tiles share."""
+def relief_of(
+    process: Process,
+    variation: Variation,
+    rough_m: Float[Array, "y x"] | None = None,
+    walls: tuple[Any, Any] | None = None,
+) -> EtchParameters:
+    """The errors of one plate, the depths of its etches and the light of its walls as the numbers that tiles share."""
     masks, levels = process.masks, process.levels
 
     # Known errors are numbers of the host: one by one, the operations below would take a second to compile.
@@ -212,6 +221,7 @@ def relief_of(process: Process, variation: Variation, rough_m: Float[Array, "y x
         tilt=tilt * (np.float32(1) / np.float32(radius)),
         rough_m=rough_m,
         height_m=single(levels.count - 1) * single(levels.step_m) if levels.is_binary else single(levels.total_m),
+        walls=walls,
     )
 
 

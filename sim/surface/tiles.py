@@ -6,10 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float, UInt8
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int, UInt8
 
-from sim.surface.cell import DEGREE, DEGREES, REACH, axis_moments, cuts, plane_moments, whole_cell
+from sim.surface.cell import DEGREE, DEGREES, LINE_DEGREE, REACH, axis_moments, cuts, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
+from sim.surface.lines import LINE_DEGREES, line_moments
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 from sim.tracing import in_jit, is_traced
@@ -32,7 +34,7 @@ def _transmission(
     relief: EtchParameters,
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
-    weights: Float[Array, "tile view part higher s wide"],
+    weights: Float[Array, "tile view part kind s wide"],
 ) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
@@ -54,8 +56,8 @@ def _transmission(
             lost = relief.lag * relief.depth_m[:, None, None] / (jnp.maximum(width, 1.0) * plan.grid.pitch_m)
             states = states * jnp.clip(1.0 - lost, 0.0, 1.0)
         bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
-        moments = _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
-        return _tile_rows(moments * left[:, None, None], along_x, plan)
+        moments, lines = _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
+        return _tile_rows(moments * left[:, None, None], lines * left[:, None, None], along_x, plan)
 
     def strip(start_y: Array, along_y: Array) -> tuple[Array, Array]:
         values = jax.checkpoint(lambda at: tile(start_y, *at))
@@ -63,7 +65,10 @@ def _transmission(
         rows = _joined(rows, 5, reach)
         if not plan.cut:
             return rows[:, 0], _joined(means, 4, 0)
-        views = [_strip_values(rows[v, : most + 1], along_y[v, :, :most]) for v, (_, most) in enumerate(plan.views)]
+        views = []
+        for v, (_, most) in enumerate(plan.views):
+            kinds = _kinds(most, LINE_DEGREE, plan)
+            views.append(_strip_values(rows[v, np.array([0, *kinds + 1])], along_y[v][:, kinds]))
         return jnp.stack(views), _joined(means, 4, 0)
 
     strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights))
@@ -91,16 +96,17 @@ def _tile_moments(
     start: tuple[Array, Array],
     rates: Float[Array, " w"],
     plan: TilePlan,
-) -> Float[Array, "moment 2 w t t"]:
-    """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which)."""
+) -> tuple[Float[Array, "moment 2 w t t"], Float[Array, "axis kind 2 w t t"]]:
+    """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which), and of lines."""
     pitch, tile = plan.grid.pitch_m, TILE
     ny, nx = plan.grid.shape
     middle_y = (start[0] + (tile - ny) / 2) * pitch
     middle_x = (start[1] + (tile - nx) / 2) * pitch
+    turned = jnp.stack([relief.turn * middle_x, -relief.turn * middle_y], 1)
+    shift = (relief.shift_m + relief.growth[:, None] * jnp.stack([middle_y, middle_x]) + turned) / pitch
     if plan.cut:
         bias = effective_bias(relief) / pitch
-        along_y = cuts((relief.shift_m[:, 0] + relief.growth * middle_y + relief.turn * middle_x) / pitch, bias)
-        along_x = cuts((relief.shift_m[:, 1] + relief.growth * middle_x - relief.turn * middle_y) / pitch, bias)
+        along_y, along_x = (cuts(shift[:, axis], bias) for axis in (0, 1))
         shares = mask_states(states, along_y, along_x, bias, plan)
         pieces = own_states(shares)
     else:
@@ -115,7 +121,8 @@ def _tile_moments(
     y, x = middle_y + plan.die_m[0] + axis[:, None], middle_x + plan.die_m[1] + axis[None, :]
     uniform = 1.0 + relief.bowl * (y * y + x * x) + relief.tilt[0] * y + relief.tilt[1] * x
     # What differs from cell to cell goes into the product; after it, it would be computed again for every piece.
-    pieces = (pieces * uniform.reshape(-1)).reshape(-1, tile * tile)
+    uniform = uniform.reshape(-1)
+    pieces = (pieces * uniform).reshape(-1, tile * tile)
     if bump is not None:
         pieces = jnp.concatenate([pieces, -bump.reshape(1, -1)])
         taken = jnp.concatenate([taken, jnp.ones((taken.shape[0], 1))], axis=1)
@@ -127,38 +134,77 @@ def _tile_moments(
         moments = moments + walls(light, depth, along_y, along_x, relief, rates, plan)
     if shares is not None and plan.corners:
         moments = moments + corners(light, shares > 0, along_y, along_x, relief, rates, plan)
-    return moments.reshape(*moments.shape[:3], tile, tile)
+    lines = jnp.zeros((2, 0, *moments.shape[1:]))
+    if plan.lines:
+        lines = line_moments(states, uniform, 0.0 if bump is None else bump.reshape(-1), shift, relief, rates, plan)
+    return moments.reshape(*moments.shape[:-1], tile, tile), lines.reshape(*lines.shape[:-1], tile, tile)
+
+
+def _kinds(most: int, along: int, plan: TilePlan) -> Int[np.ndarray, " kind"]:
+    """Which kinds of moments across an axis are used: of cells to degree `most`, of lines to degree `along`."""
+    lines = along + 1 if plan.lines else 0
+    return np.array([*range(most), *range(DEGREE, DEGREE + lines)], int)
 
 
 def _tile_rows(
-    moments: Float[Array, "m 2 w t t"], along_x: Float[Array, "view part higher s wide"], plan: TilePlan
-) -> tuple[Float[Array, "view degree 2 v u"], Float[Array, "w 2 s s"]]:
-    """Moments along y of a tile's rows in every view, with what spills to `REACH` cells at either end; and means."""
-    parts, lines = plan.parts, moments.shape[2]
-    moments = moments.reshape(parts, parts, len(DEGREES), 2, lines, TILE, TILE)
+    moments: Float[Array, "m 2 w t t"],
+    lines: Float[Array, "axis line 2 w t t"],
+    along_x: Float[Array, "view part kind s wide"],
+    plan: TilePlan,
+) -> tuple[Float[Array, "view row 2 v u"], Float[Array, "w 2 s s"]]:
+    """Moments along y of a tile's rows in every view, with what spills to `REACH` cells at either end; and means.
+
+    The first rows are moments of cells, by degree; the others those of lines across y.
+    """
+    parts, count = plan.parts, moments.shape[2]
+    moments = moments.reshape(parts, parts, len(DEGREES), 2, count, TILE, TILE)
     # [degree, w, 2, (row, part), (column, part)]
     size = TILE * parts
-    values = jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(len(DEGREES), lines, 2, size, size)
+    values = jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(len(DEGREES), count, 2, size, size)
     if not plan.cut:
         return values[:1, jnp.array([number for number, _ in plan.views])].swapaxes(0, 1), values[0]
+    across_y, across_x = (_line_values(lines[axis], axis, plan) for axis in (0, 1))
+
+    def spread(first: Array, higher: list[Array], weights: Array) -> Array:
+        """Values of cells that look like moments along x: those of degree 0, and others with their weights."""
+        row = jnp.pad(first, ((0, 0), (0, 0), (REACH, REACH)))
+        if not higher:
+            return row
+        matrix = weights.reshape(weights.shape[0], -1, weights.shape[-1])
+        product = jnp.tensordot(jnp.concatenate(higher, axis=2), matrix, (2, 1), precision=PRECISION)
+        return row + _complex_sum(jnp.moveaxis(product, 2, 0))
 
     def seen(number: int, most: int, weights: Array) -> Array:
         of, rows = dict(zip(DEGREES, values[:, number], strict=True)), []
         for degree in range(DEGREE + 1):
-            row = jnp.pad(of[degree, 0], ((0, 0), (0, 0), (REACH, REACH)))
-            higher = [of[degree, x] for x in range(1, most + 1 - degree)]
-            if higher:
-                matrix = weights[:, : len(higher)].reshape(weights.shape[0], -1, weights.shape[-1])
-                product = jnp.tensordot(jnp.concatenate(higher, axis=2), matrix, (2, 1), precision=PRECISION)
-                row = row + _complex_sum(jnp.moveaxis(product, 2, 0))
-            rows.append(row)
+            top = max(most - degree, 0)
+            higher = [of[degree, x] for x in range(1, top + 1)]
+            higher += [across_x[degree, x][number] for x in range(LINE_DEGREE + 1 - degree) if plan.lines]
+            rows.append(spread(of[degree, 0], higher, weights[:, _kinds(top, LINE_DEGREE - degree, plan)]))
+        for y in range(LINE_DEGREE + 1 if plan.lines else 0):
+            higher = [across_y[x, y][number] for x in range(1, LINE_DEGREE + 1 - y)]
+            rows.append(spread(across_y[0, y][number], higher, weights[:, : len(higher)]))
         return jnp.stack(rows)
 
     return jnp.stack([seen(*view, along_x[v]) for v, view in enumerate(plan.views)]), values[0]
 
 
+def _line_values(
+    lines: Float[Array, "line 2 w t t"], axis: int, plan: TilePlan
+) -> dict[tuple[int, int], Float[Array, "w 2 s s"]]:
+    """Moments of lines across an axis (0 or 1), by degree along and across the line, on the parts of the cells."""
+    found = jnp.swapaxes(lines, 1, 2)
+    if plan.parts > 1:
+        # A line lies on the lower border of its cell's first part, and along all of them.
+        found = jnp.repeat(found, plan.parts, axis=-1 - axis)
+        between = np.zeros(plan.parts, np.float32)
+        between[0] = 1
+        found = jnp.moveaxis(jnp.kron(jnp.moveaxis(found, axis - 2, -1), between), -1, axis - 2)
+    return dict(zip(LINE_DEGREES, found, strict=False))
+
+
 def _strip_values(
-    rows: Float[Array, "degree 2 s x"], weights: Float[Array, "part higher s wide"]
+    rows: Float[Array, "row 2 s x"], weights: Float[Array, "part kind s wide"]
 ) -> Float[Array, "2 wide x"]:
     """One row of tiles as values of its cells in one view, with what spills to `REACH` cells above and below."""
     product = jnp.tensordot(weights, rows[1:], ((1, 2), (0, 2)), precision=PRECISION)  # [part, wide, 2, x]

@@ -1,5 +1,7 @@
 """PSFs with the light of walls, against sums over cells and walls written out, and against coupled waves."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,10 @@ from fab.grid import Grid
 from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.material import refractive_index
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous import compare_row, edge_widths
-from sim.rigorous.edge_optic import line_weights, with_edges
+from sim.rigorous.edge_optic import line_weights, optic_as_drawn, with_edges
 
 PITCH, STEP, WAVELENGTH = 1.85e-6, 75e-9, 0.552e-6
 INDEX = refractive_index("fused_silica", WAVELENGTH)
@@ -83,7 +86,7 @@ def test_light_of_walls_is_that_of_the_sum_over_walls(
     """
     lens = camera(64, 96, 1e-3)
     height = levels(64)
-    optic = with_edges(height, lens, polarisation, depths_m=depths)
+    optic = with_edges(height, replace(lens, polarisation=polarisation), depths_m=depths)
     assert optic.camera.grid == lens.grid
     for depth in depths:
         found = np.asarray(psf(optic, depths=depth).energy[0, 0])
@@ -100,7 +103,7 @@ def test_light_of_walls_is_that_of_the_sum_over_walls(
 def test_cells_are_split_where_light_is_too_oblique_for_them():
     """The window ends at 0.41 waves per cell, and the nearest source lights the rim with 0.28."""
     lens, height, depths = camera(64, 130, 1e-3), levels(64), (0.7e-3, np.inf)
-    optic = with_edges(height, lens, "x", depths_m=depths)
+    optic = with_edges(height, replace(lens, polarisation="x"), depths_m=depths)
     assert optic.camera.grid == Grid((128, 128), PITCH / 2)
     for depth in depths:
         found = np.asarray(psf(optic, depths=depth).energy[0, 0])
@@ -110,7 +113,7 @@ def test_cells_are_split_where_light_is_too_oblique_for_them():
 
 def test_unpolarised_light_is_the_mean_of_both():
     lens, height = camera(64, 64, 1e-3), levels(64, 1)
-    both = [psf(with_edges(height, lens, way)).energy[0, 0] for way in ("x", "y")]
+    both = [psf(with_edges(height, replace(lens, polarisation=way))).energy[0, 0] for way in ("x", "y")]
     found = psf(with_edges(height, lens)).energy[0, 0]
     assert off(np.asarray(found), np.mean(both, axis=0)) < 1e-3
 
@@ -124,7 +127,7 @@ def test_a_grating_sends_light_where_maxwell_does():
     apart = WAVELENGTH * lens.focal_length_m / (4 * PITCH) / lens.pixel_m  # pixels from order to order
     bare = np.asarray(psf(np.zeros((128, 128)), lens).energy[0, 0])
     for row, polarisation in enumerate(("y", "x")):  # walls across x: TE, then TM
-        found = np.asarray(psf(with_edges(height, lens, polarisation)).energy[0, 0])
+        found = np.asarray(psf(with_edges(height, replace(lens, polarisation=polarisation))).energy[0, 0])
         pixels = np.arange(256) - 127.5
 
         def near(energy: np.ndarray, number: int, pixels: np.ndarray = pixels) -> float:
@@ -172,13 +175,37 @@ def test_weights_of_a_line_have_its_far_field(seen: float, low: float, high: flo
 
 def test_what_cannot_be_is_refused():
     lens = camera(32, 32, 1e-3)
-    with pytest.raises(InputError, match='polarisation: must be "unpolarised", "x" or "y", but got \'round\''):
-        with_edges(levels(32), lens, "round")
+    for key, value in (("polarisation", "round"), ("light", "bright")):
+        with pytest.raises(InputError, match=f"{key}: must be one of .*, but got '{value}'"):
+            replace(lens, **{key: value})
     with pytest.raises(ValueError, match=r"`height_m` must have the grid's shape \(32, 32\)"):
         with_edges(levels(16), lens)
+
+
+def test_other_depths_and_cameras_are_prepared_for():
+    """A plate serves what it was not made for as well as one that was made for it."""
+    lens, other = camera(32, 32, 1e-3), camera(32, 48, 1e-3)
     optic = with_edges(levels(32), lens, depths_m=(0.1, 1.0))
-    for depth in (0.05, np.inf):
-        with pytest.raises(ValueError, match=r"`depth_m` must lie within 0\.1 to 1\.0 m"):
-            psf(optic, depths=depth)
-    with pytest.raises(ValueError, match="`camera` must be given to `with_edges`"):
-        psf(optic, camera(32, 48, 1e-3), depths=0.5)
+    for depth in (0.7e-3, np.inf):
+        made_for = psf(with_edges(levels(32), lens, depths_m=(0.1, 1.0, depth)), depths=depth).energy
+        np.testing.assert_array_equal(psf(optic, depths=depth).energy, made_for)
+    found = psf(optic, other, depths=0.5)
+    assert found.camera is not None
+    assert found.camera.window == 48
+    np.testing.assert_array_equal(
+        found.energy, psf(with_edges(levels(32), other, depths_m=(0.1, 1.0)), depths=0.5).energy
+    )
+    assert optic.with_camera(lens) is optic
+    with pytest.raises(ValueError, match="`camera` must have the DOE's aperture and substrate"):
+        optic.with_camera(replace(lens, aperture_m=1e-6))
+
+
+def test_heights_in_a_camera_whose_light_has_edges():
+    lens = replace(camera(32, 32, 1e-3), light="edges")
+    walls = psf(with_edges(levels(32), lens)).energy
+    np.testing.assert_array_equal(psf(levels(32), lens).energy, walls)
+    assert off(np.asarray(psf(levels(32), replace(lens, light="scalar")).energy), np.asarray(walls)) > 0.02
+    assert isinstance(optic_as_drawn(lens), HeightOptic)  # a bare lens has no walls
+    np.testing.assert_array_equal(
+        psf(optic_as_drawn(lens, np.zeros((32, 32))).with_heights(jnp.asarray(levels(32)))).energy, walls
+    )

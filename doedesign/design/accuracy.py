@@ -1,0 +1,134 @@
+"""How far PSFs may be off, by cause: the error budget of a prediction.
+
+Every entry is a relative difference, root sum of squares over that of the light, and says how it was found:
+
+    numerics    of pixel energies, predicted by the transform's own weights (`sim.propagation.farfield`)
+    rim         of intensities at 256 directions of the window, measured: cells on the aperture's rim pass the mean of
+                their open part instead of the part itself
+    walls       of pixel energies, measured: what the light of walls changes; None where PSFs have it already, of which
+                `doedesign certify` proves what is left
+    lens        of pixel energies, measured: what a lens that images tangents changes where sines are in force, or one
+                that images sines where tangents are
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sim.camera import Camera, Mapping, SpectralLine, path_at_m
+from sim.metrics import mean_wavelength_m
+from sim.optic import HeightOptic
+from sim.propagation.farfield import FarField
+from sim.psf_bank import PsfBank, psf
+from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
+
+_SIDE = 16  # directions per axis, one in each part of the window
+_PARTS = 8  # of a cell on the rim, per axis
+_SEED = 0
+_OTHER: dict[str, Mapping] = {"sine": "tangent", "tangent": "sine"}
+
+
+class Accuracy(NamedTuple):
+    """Relative differences of one PSF, by cause; None for what does not apply."""
+
+    colour: str
+    depth_m: float
+    numerics: float | None
+    rim: float
+    walls: float | None
+    lens: float
+
+
+def accuracies(optic: HeightOptic | EdgeOptic, bank: PsfBank, depths_m: Sequence[float]) -> list[Accuracy]:
+    """Error budget of a bank in the middle one of its colours, at some of its depths.
+
+    Args:
+        optic: the DOE as drawn that the bank is of.
+        bank: its PSFs on the axis, by the far field.
+        depths_m: depths of the bank to look at, metres.
+    """
+    camera = optic.camera
+    middle = len(camera.colours) // 2
+    line = next(line for line in camera.lines if line.colour == middle)
+    one = replace(camera, colours=(camera.colours[middle],))
+    walls: dict[float, float] = {}
+    if camera.light == "scalar":
+        lit = optic_as_drawn(replace(one, light="edges"), optic.height_m, depths_m=depths_m)
+        seen = psf(lit, depths=depths_m).energy[0]
+        walls = {
+            depth: relative_difference(bank.energy[middle, bank.depths_m.index(depth)], image)
+            for depth, image in zip(depths_m, seen, strict=True)
+        }
+    other = psf(optic, replace(one, mapping=_OTHER[camera.mapping]), depths_m).energy[0]
+    found = []
+    for depth, image in zip(depths_m, other, strict=True):
+        lens = relative_difference(bank.energy[middle, bank.depths_m.index(depth)], image)
+        plan = optic.plan(line, depth)
+        numerics = plan.expected_error if isinstance(plan, FarField) else None
+        rim = rim_error(optic, line, depth)
+        found.append(Accuracy(camera.colours[middle].name, depth, numerics, rim, walls.get(depth), lens))
+    return found
+
+
+def relative_difference(found: Float[np.ndarray, "y x"], better: Float[np.ndarray, "y x"]) -> float:
+    """Root sum of squares of a difference over that of the better one."""
+    found, better = (np.asarray(image, np.float64) for image in (found, better))
+    return float(np.linalg.norm(found - better) / np.linalg.norm(better))
+
+
+def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float) -> float:
+    """Relative difference of intensities within the window, of grey cells on the rim from a true circle.
+
+    The field of all cells is summed directly, in double precision, at one direction in each part of the window, and so
+    is what a true circle adds to it: on cells of the rim its open parts less their mean.
+    """
+    camera = optic.camera
+    pitch, wavelength = camera.grid.pitch_m, line.wavelength_m
+    rng = np.random.default_rng(_SEED)
+    extent = camera.window * camera.pixel_m / camera.sensor_distance_m / wavelength  # waves per metre
+    waves = [((np.arange(_SIDE) + rng.random(_SIDE)) / _SIDE - 0.5) * extent for _ in "yx"]
+    axis = camera.grid.axis_m("x")
+    bend = 0.0 if np.isinf(depth_m) else 1 / depth_m
+    bend += 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+
+    def kernel(seen: np.ndarray) -> np.ndarray:
+        """Far field of the cells of a row in some directions; cells farther from the axis are lit more obliquely."""
+        oblique = np.sinc(pitch * (seen - bend * axis[:, None] / wavelength))
+        return np.exp(-2j * np.pi * axis[:, None] * seen) * oblique
+
+    coverage = np.asarray(optic.coverage, np.float64)
+    field = np.asarray(optic.field(line, depth_m), np.complex128)
+    whole = kernel(waves[0]).T @ field @ kernel(waves[1])
+    y, x = np.nonzero((coverage > 0) & (coverage < 1))
+    inside = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
+    at_y = np.broadcast_to(axis[y][:, None, None] + inside[:, None] * pitch, (len(y), _PARTS, _PARTS))
+    at_x = np.broadcast_to(axis[x][:, None, None] + inside[None, :] * pitch, at_y.shape)
+    open_ = np.hypot(at_y, at_x) <= camera.aperture_m / 2
+    path = path_at_m(camera, at_y, at_x, depth_m) - path_at_m(camera, axis[y], axis[x], depth_m)[:, None, None]
+    # Within a cell the field has its source's phase.
+    passed = (field[y, x] / coverage[y, x])[:, None, None] * np.exp(2j * np.pi * path / wavelength)
+    more = (open_ - coverage[y, x][:, None, None]) * passed / _PARTS**2
+    turns = [np.exp(-2j * np.pi * at.reshape(-1, 1) * seen) for at, seen in zip((at_y, at_x), waves, strict=True)]
+    added = (turns[0] * more.reshape(-1, 1)).T @ turns[1]
+    return relative_difference(np.abs(whole) ** 2, np.abs(whole + added) ** 2)
+
+
+def in_words(found: Sequence[Accuracy], camera: Camera) -> str:
+    """The largest of every cause, on one line."""
+
+    def largest(values: list[float]) -> str:
+        return f"{100 * max(values):.2g} %"
+
+    parts = []
+    if numerics := [one.numerics for one in found if one.numerics is not None]:
+        parts.append(f"numerics {largest(numerics)}")
+    parts.append(f"cells on the rim {largest([one.rim for one in found])}")
+    if walls := [one.walls for one in found if one.walls is not None]:
+        parts.append(f"walls left out {largest(walls)}")
+    words = {"sine": "f sin angle instead of f tan angle", "tangent": "f tan angle instead of f sin angle"}
+    parts.append(f"{words[camera.mapping]} {largest([one.lens for one in found])}")
+    nanometres = mean_wavelength_m(camera.colours[len(camera.colours) // 2]) * 1e9
+    return f"PSFs may be off ({nanometres:.0f} nm, relative): " + ", ".join(parts)
