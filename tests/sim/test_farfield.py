@@ -60,6 +60,7 @@ def energy64(plan: FarField, field: np.ndarray) -> np.ndarray:
         unit = jnp.eye(plan.kept, dtype=jnp.float32)
         real, imaginary = np.asarray(plan.refine.of_complex(jnp.stack([unit, 0 * unit])), np.float64)
         matrix = (real + 1j * imaginary).T @ matrix
+    assert plan.gather is not None
     gather = dense(plan.gather, len(matrix))
     return gather.T @ np.abs(matrix @ field @ matrix.T) ** 2 @ gather
 
