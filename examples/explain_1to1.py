@@ -3,6 +3,7 @@
     python examples/explain_1to1.py            a quarter of the paper's aperture: a minute or two
     python examples/explain_1to1.py --full     the paper's own size, at every fourth lift: ten minutes
     python examples/explain_1to1.py --even     a design that spreads near light evenly instead of in a ring
+    python examples/explain_1to1.py --edges    with the light of walls
 
 A plate with a ratio of 3:1 is designed in the paper's geometry (examples/automotive.toml), made with every error that a
 careful lab may have, alone and together, and looked at as the paper did: the near PSF of a fibre tip at 520 nm, where
@@ -302,10 +303,10 @@ def write(answer: Answer, folder: Path) -> list[Path]:
     return files
 
 
-def main(run: Run, lifts: Sequence[int] = ALL_LIFTS, count: int = 24) -> str:
+def main(run: Run, lifts: Sequence[int] = ALL_LIFTS, count: int = 24, light: str = "scalar") -> str:
     """Explain a run: the table and the verdict that are printed."""
-    answer = explain(bench_of(run), lifts, count)
-    files = write(answer, run.folder / "explain")
+    answer = explain(bench_of(run, light), lifts, count)
+    files = write(answer, run.folder / ("explain" if light == "scalar" else f"explain-{light}"))
     return "\n".join([table(answer), "", *(f"- {sentence}" for sentence in verdict(answer)), "", *map(str, files)])
 
 
@@ -313,6 +314,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--full", action="store_true", help="the paper's own size instead of a quarter of it")
     parser.add_argument("--even", action="store_true", help="near light spread evenly instead of in a ring")
+    parser.add_argument("--edges", action="store_true", help="with the light of walls")
     given = parser.parse_args()
+    light = "edges" if given.edges else "scalar"
     scale, lifts, count = (1, ALL_LIFTS[::4], 8) if given.full else (4, ALL_LIFTS, 24)
-    sys.exit(exit_code(lambda: print(main(design(scale, EVEN if given.even else RING), lifts, count))))
+    sys.exit(exit_code(lambda: print(main(design(scale, EVEN if given.even else RING), lifts, count, light))))

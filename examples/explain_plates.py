@@ -68,9 +68,9 @@ class Bench:
         return self.camera.transmission(LINES[1].wavelengths_m[0])
 
 
-def bench_of(run: Run) -> Bench:
-    """The bench of a finished run."""
-    camera = replace(camera_from_spec(run.spec), colours=LINES)
+def bench_of(run: Run, light: str = "scalar") -> Bench:
+    """The bench of a finished run, in scalar light or in light with "edges"."""
+    camera = replace(camera_from_spec(run.spec), colours=LINES, light=light)
     return Bench(level_map_of_run(run), camera, run.spec.scene.near_m[0])
 
 
