@@ -84,8 +84,9 @@ def test_the_psf_folder_holds_what_its_manifest_lists(finished):
     for name, digest in manifest["results_sha256"].items():
         assert sha256_file(folder / name) == digest, name
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert set(metrics) == {"continuous", "quantised", "from_masks", "lens"}
+    assert set(metrics) == {"continuous", "quantised", "from_masks", "lens", "light"}
     assert metrics["lens"] == "places follow the sine of the angle"
+    assert metrics["light"] == "scalar"
 
 
 def test_what_is_drawn_is_what_was_optimised(finished):
