@@ -163,9 +163,10 @@ class EnergyBudget(NamedTuple):
     higher_orders: float  # at angles beyond lambda / (2 pitch), scattered by the square cells and the aperture's edge
 
 
-def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
-    """Energy of square cells within the band of their grid, lit from a direction of `slope` waves per cell and cell.
+def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 0.5) -> float:
+    """Energy of square cells within a band, lit from a direction of `slope` waves per cell and cell.
 
+    The band reaches to `band` waves per cell on either side of the axis; at most to that of the cells' grid, 1/2.
     The factor sinc(nu - slope x) of a cell is interpolated between three directions, exact to 1e-3 up to a sixth of the
     band, so nine transforms take the place of one sum per cell.
     """
@@ -181,10 +182,18 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float) -> float:
         for share_x, seen_x in zip(shares, seen, strict=True):
             part = field * (share_y[:, None] * share_x).astype(np.float32)
             total += np.asarray(fft2(part, workers=-1)) * (seen_y[:, None] * seen_x).astype(np.float32)
-    return float(np.sum(np.square(np.abs(total)), dtype=np.float64))
+    inside = (nu >= -band) & (nu < band)
+    return float(np.sum(np.square(np.abs(total[np.ix_(inside, inside)])), dtype=np.float64))
 
 
-def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: float, colour: Colour) -> EnergyBudget:
+def energy_budget(
+    optic: CellOptic,
+    psf: Float[np.ndarray, "v u"],
+    depth_m: float,
+    colour: Colour,
+    *,
+    pitch_m: float | None = None,
+) -> EnergyBudget:
     """Energy budget of one PSF of one colour.
 
     Args:
@@ -192,6 +201,7 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
         psf: `[y, x]` PSF on the sensor, Fresnel loss included.
         depth_m: source depth, metres.
         colour: colour of this PSF.
+        pitch_m: pitch of the DOE's grid, metres, where the optic's cells are parts of its cells.
 
     The band's share comes from a transform of its own (Parseval on the bare DOE grid, with the cells' sinc), so
     `uncollected` near zero or below it would show a fault in either.
@@ -199,12 +209,13 @@ def energy_budget(optic: CellOptic, psf: Float[np.ndarray, "v u"], depth_m: floa
     camera = optic.camera
     curvature = camera.curvature_per_m(1 / depth_m)
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
+    reach = camera.grid.pitch_m / (pitch_m or camera.grid.pitch_m) / 2
     passed = band = 0.0
     for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True):
         field = np.asarray(optic.field(SpectralLine(0, wavelength, 1.0), depth_m))
         share = weight * camera.transmission(wavelength)
         passed += share
-        band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength) / scale
+        band += share * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength, reach) / scale
     energy, spot = float(total(psf)), float(far_spot(psf, camera, colour))
     return EnergyBudget(1 - passed, spot, energy - spot, band - energy, passed - band)
 

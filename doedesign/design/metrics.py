@@ -27,13 +27,15 @@ from sim.psf_bank import PsfBank
 def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], lens: PsfBank) -> list[dict[str, Any]]:
     """Return one row per depth and colour of a bank on the axis: metrics (`sim.metrics`) and energy budget.
 
-    `near_m` are those of its depths, metres, that are obstructions; `lens` has the plain lens at the same depths.
+    `near_m` are those of its depths, metres, that are obstructions; `lens` has the plain lens at the same depths, and
+    the DOE's grid: with light of walls, the optic's cells may be parts of its cells.
     """
+    pitch = lens.metric_inputs().camera.grid.pitch_m
     rows = without_infinities(metric_rows(bank.metric_inputs(near_m, optic, lens=lens), "design"))
     places = ((d, c) for d in range(len(bank.depths_m)) for c in range(len(bank.colours)))
     for row, (d, c) in zip(rows, places, strict=True):
         colour = optic.camera.colours[c]
-        row["budget"] = energy_budget(optic, bank.energy[c, d], bank.depths_m[d], colour)._asdict()
+        row["budget"] = energy_budget(optic, bank.energy[c, d], bank.depths_m[d], colour, pitch_m=pitch)._asdict()
     return rows
 
 

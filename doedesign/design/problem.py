@@ -55,8 +55,8 @@ class Problem(eqx.Module):
 
     @property
     def camera(self) -> Camera:
-        """Optics and sensor."""
-        return self.optic.camera
+        """Optics, sensor, and the grid of the DOE; light of walls may be computed on parts of its cells."""
+        return self.optic.drawn if isinstance(self.optic, EdgeOptic) else self.optic.camera
 
 
 class SourceSet(NamedTuple):

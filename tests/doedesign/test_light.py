@@ -13,6 +13,7 @@ from doedesign.design.problem import judge_height, problem_of
 from doedesign.spec import load_spec, spec_digest, spec_to_toml
 from fab.errors import InputError
 from fab.process import Variation
+from sim.metrics import energy_budget
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
 from tests.doedesign.small_runs import SPEC, call, finished_run
@@ -95,3 +96,25 @@ def test_captures_follow_the_design(run: Path):
     picture = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
     found = [dd.simulate(picture, one, obstruction="dirt", occlusion="radiometric", size=64) for one in (design, thin)]
     assert off(*(np.asarray(one.doe) for one in found)) > 1e-4
+
+
+# So near, and so wide a window, that light of walls is computed on halves of cells.
+OBLIQUE = LIT.replace("window = 32", "window = 160").replace('near = ["6 mm"]', 'near = ["1 mm"]')
+OBLIQUE = OBLIQUE.replace("steps = 0", "steps = 2")
+
+
+def test_cells_that_are_split_for_walls_are_still_those_of_the_design(tmp_path: Path):
+    run = finished_run(tmp_path, OBLIQUE)
+    design = dd.open_design(run)
+    optic = design.as_optic()
+    assert optic.camera.grid.shape == (96, 96)
+    assert design.height_m.shape == (48, 48)
+    rows = json.loads((run / "metrics.json").read_text())["psf"]
+    thin = replace(design, camera=replace(design.camera, light="scalar"))
+    for row, depth in zip(rows, design.depths_m, strict=True):
+        assert sum(row["budget"].values()) == pytest.approx(1, abs=1e-9)
+        # What lies beyond the band of the cells that were drawn hardly depends on the walls.
+        image = psf(thin, depths=[depth]).energy[0, 0]
+        scalar = energy_budget(thin.as_optic(), image, depth, design.camera.colours[0])
+        assert row["budget"]["higher_orders"] == pytest.approx(scalar.higher_orders, abs=0.02)
+        assert row["budget"]["uncollected"] > -2e-3

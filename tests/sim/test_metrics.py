@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.reference import make_camera, wrapped_map
+from fab.grid import Grid
 from sim.camera import Colour
 from sim.metrics import (
     MetricInputs,
@@ -15,6 +16,7 @@ from sim.metrics import (
     encircled_energy,
     energy_budget,
     energy_within,
+    in_parts,
     mean_wavelength_m,
     participation,
     radius_map_m,
@@ -110,6 +112,19 @@ def test_the_budget_sums_to_one(plate: str, fill: float, depth_m: float, rng: np
     # White noise of one cell spreads as sinc² x sinc², of which the band |nu| < 1/2 holds (0.774)^2 = 0.599.
     if plate == "rough":
         assert budget.higher_orders == pytest.approx((1 - budget.reflected) * (1 - 0.599), rel=0.05)
+
+
+@pytest.mark.parametrize("depth_m", [np.inf, 0.02])
+def test_the_budget_does_not_depend_on_the_parts_of_a_cell(depth_m: float, rng: np.random.Generator):
+    """Cells of half the width, four of the same height in a row, are the same plate."""
+    height = rng.uniform(0, 1.2e-6, (256, 256))
+    image = psf(height, CAMERA, [depth_m]).energy[0, 0]
+    whole = energy_budget(HeightOptic.of(CAMERA, height), image, depth_m, CAMERA.colours[0])
+    parted = dataclasses.replace(CAMERA, grid=Grid((512, 512), CAMERA.grid.pitch_m / 2))
+    optic = HeightOptic.of(parted, in_parts(height, 2))
+    split = energy_budget(optic, image, depth_m, CAMERA.colours[0], pitch_m=CAMERA.grid.pitch_m)
+    # The round rim is drawn in other cells.
+    np.testing.assert_allclose(split, whole, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("prism", [-0.3, 0.0, 0.3])
