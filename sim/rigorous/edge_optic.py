@@ -20,11 +20,9 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
-from scipy.interpolate import CubicSpline
 
 from fab.grid import Grid
 from sim.aperture import circle_coverage
@@ -32,8 +30,8 @@ from sim.camera import Camera, SpectralLine
 from sim.material import refractive_index
 from sim.optic import CellOptic, CellSource, HeightOptic
 from sim.propagation.oblique import oblique_waves
-from sim.propagation.pupil import cis
-from sim.rigorous.edge_widths import relative_widths
+from sim.rigorous.edge_widths import width_series
+from sim.rigorous.walls import Walls, light_of_cells_and_walls
 from sim.source import SeparableSource, SourceMap
 from sim.tracing import is_traced
 
@@ -41,7 +39,7 @@ from sim.tracing import is_traced
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
 _SHARES = 33  # of the way from the axis to the rim, for which weights are fitted
-_NODE_M, _PER_NODE = 25e-9, 16  # between heights of walls that are solved, and steps of the table between two of them
+_NODE_M = 25e-9  # highest walls are rounded up to, so that plates much alike share what is made for them
 
 
 class EdgeOptic(CellOptic):
@@ -141,11 +139,13 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
         index = refractive_index(camera.material, wavelength)
         # Walls of two waves, where heights are traced.
         highest = 2 * wavelength / (index - 1) if is_traced(height) else float(jnp.ptp(height))
-        nodes = max(2, int(np.ceil(highest / _NODE_M - 1e-3)) + 1)
-        table = [_table(wavelength, index, camera.polarisation, axis, nodes) for axis in ("y", "x")]
-        weights = [_at_borders(line_weights(*waves.over(parts))[0], camera, axis) for axis in ("y", "x")]
-        rate = camera.waves_per_metre(wavelength)
-        found.append(_transmission(height, rate, *table, *weights, camera.grid.pitch_m))
+        highest = _NODE_M * max(1, int(np.ceil(highest / _NODE_M - 1e-3)))
+        walls = []
+        for axis in ("y", "x"):
+            series = width_series(highest, wavelength, index, camera.polarisation, axis)
+            weights = _at_borders(line_weights(*waves.over(parts))[0], camera, axis)
+            walls.append(Walls.of(series, highest, weights, camera.grid.pitch_m))
+        found.append(light_of_cells_and_walls(height, camera.waves_per_metre(wavelength), *walls))
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
     depths = min(depths_m), max(depths_m)
     return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), wavelengths, depths)
@@ -212,65 +212,4 @@ def _at_borders(
     part = (place - below)[:, None]
     found = weights[below] * (1 - part) + weights[below + 1] * part
     # On the other side light is oblique the other way.
-    return np.where(share[:, None] < 0, found.conj(), found).T.astype(
-        np.complex64 if np.iscomplexobj(found) else np.float32
-    )
-
-
-@lru_cache(maxsize=64)
-def _table(wavelength_m: float, index: float, polarisation: str, axis: str, nodes: int) -> Complex[np.ndarray, " step"]:
-    """Light of walls across an axis over that of the lower cell, metres, one per `_NODE_M / _PER_NODE` of height."""
-    heights = np.arange(nodes) * _NODE_M
-    fine = np.arange((nodes - 1) * _PER_NODE + 1) * (_NODE_M / _PER_NODE)
-    widths = CubicSpline(heights, relative_widths(heights, wavelength_m, index, polarisation, axis))(fine)
-    return widths.astype(np.complex64)
-
-
-@jax.jit
-def _transmission(
-    height_m: Float[Array, "y x"],
-    rate: Any,
-    across_y: Complex[Array, " step"],
-    across_x: Complex[Array, " step"],
-    weights_y: Inexact[Array, "tap border_y"],
-    weights_x: Inexact[Array, "tap border_x"],
-    pitch_m: Any,
-) -> Complex[Array, "y x"]:
-    light = cis(height_m * rate)
-
-    def lines(first: Array, second: Array, first_light: Array, second_light: Array, table: Array) -> Array:
-        place = jnp.abs(second - first) * (_PER_NODE / _NODE_M)
-        below = jnp.clip(place.astype(jnp.int32), 0, table.shape[0] - 2)
-        share = place - below
-        width = table[below] * (1 - share) + table[below + 1] * share
-        return width * jnp.where(first < second, first_light, second_light) / pitch_m
-
-    over_y = lines(height_m[:-1], height_m[1:], light[:-1], light[1:], across_y)
-    over_x = lines(height_m[:, :-1], height_m[:, 1:], light[:, :-1], light[:, 1:], across_x)
-    return light + _spread(over_y, weights_y) + _spread(over_x.T, weights_x).T
-
-
-@jax.custom_vjp
-def _spread(wall: Complex[Array, "border x"], weights: Inexact[Array, "tap border"]) -> Complex[Array, "y x"]:
-    """Lines along x, spread over the cells along y; no derivative is taken with respect to the weights."""
-    reach, count = weights.shape[0] // 2, wall.shape[0] + 1
-    wall, weights = jnp.pad(wall, ((reach, reach), (0, 0))), jnp.pad(weights, ((0, 0), (reach, reach)))
-    # The first of the weights is for the cell `reach` places before the one behind a border.
-    starts = [2 * reach - 1 - tap for tap in range(2 * reach)]
-    parts = [wall[start:][:count] * weights[tap, start:][:count, None] for tap, start in enumerate(starts)]
-    return sum(parts[1:], parts[0])
-
-
-def _spread_forward(wall: Array, weights: Array) -> tuple[Array, Array]:
-    return _spread(wall, weights), weights
-
-
-def _spread_back(weights: Array, cotangent: Array) -> tuple[Array, None]:
-    """Transpose: sums over the same cells, not the padded sums that jax would write."""
-    reach, count = weights.shape[0] // 2, weights.shape[1]
-    cells = jnp.pad(cotangent, ((reach, reach), (0, 0)))
-    parts = [cells[tap + 1 :][:count] * weights[tap, :, None] for tap in range(2 * reach)]
-    return sum(parts[1:], parts[0]), None
-
-
-_spread.defvjp(_spread_forward, _spread_back)
+    return np.where(share[:, None] < 0, found.conj(), found).T

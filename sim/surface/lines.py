@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from sim.camera import Camera
 from sim.material import refractive_index
-from sim.rigorous.edge_widths import relative_widths
+from sim.rigorous.edge_widths import series_at, width_series
 from sim.surface.cell import LINE_DEGREE
 from sim.surface.pieces import TILE, Pair, light_of
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
@@ -31,27 +31,21 @@ from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 # Moments kept: degree along the line and across it.
 LINE_DEGREES = tuple((along, across) for along in range(LINE_DEGREE + 1) for across in range(LINE_DEGREE + 1 - along))
 _TOGETHER_M = 60e-9  # distance at which walls act together
-_TERMS, _NODE_M = 9, 25e-9  # of a series, and heights that it is fitted to: leaves 0.7 nm of up to 400
 
 
 @lru_cache(maxsize=16)
 def wall_series(
     camera: Camera, wavelengths_m: tuple[float, ...], highest_m: float
 ) -> Float[np.ndarray, "axis part w term"]:
-    """Light of walls across y and across x over that of the lower side, times pitch, as a series of their height h.
-
-    Real and imaginary part of h / highest times a polynomial in 2 h / highest - 1, lowest power first.
-    """
-    heights = np.arange(1, int(np.ceil(highest_m / _NODE_M)) + 1) * _NODE_M
-    place = 2 * heights / highest_m - 1
-    powers = place[:, None] ** np.arange(_TERMS) * (heights / highest_m)[:, None]
-    found = []
-    for axis in ("y", "x"):
-        for wavelength in wavelengths_m:
-            index = refractive_index(camera.material, wavelength)
-            widths = relative_widths(heights, wavelength, index, camera.polarisation, axis)
-            found.append(np.linalg.lstsq(powers, widths, rcond=None)[0])
-    series = np.reshape(found, (2, len(wavelengths_m), _TERMS)) / camera.grid.pitch_m
+    """Light of walls across y and across x over that of the lower side, over the pitch (`width_series`)."""
+    found = [
+        width_series(highest_m, wavelength, refractive_index(camera.material, wavelength), camera.polarisation, axis)
+        for axis in ("y", "x")
+        for wavelength in wavelengths_m
+    ]
+    terms = max(map(len, found))
+    series = np.array([np.pad(one, (0, terms - len(one))) for one in found]) / camera.grid.pitch_m
+    series = series.reshape(2, len(wavelengths_m), terms)
     return np.stack([series.real, series.imag], 1).astype(np.float32)
 
 
@@ -109,11 +103,8 @@ def line_moments(
         def light(wall: _Wall) -> Array:
             lower = wall.height_m - jnp.maximum(wall.rise_m, 0.0)
             size = jnp.abs(wall.rise_m) / highest
-            z, terms = 2 * size - 1, series[axis][..., None]  # [part, w, term, 1]
-            value = terms[:, :, -1]
-            for term in range(_TERMS - 2, -1, -1):
-                value = value * z + terms[:, :, term]
-            own = Pair(*(value * (size * plan.parts)))
+            terms = jnp.moveaxis(series[axis], -1, 0)[..., None]  # [term, part, w, 1]
+            own = Pair(*(series_at(terms, 2 * size - 1) * (size * plan.parts)))
             return jnp.stack(Pair(*light_of(lower[None], rates)[0]).times(own))
 
         def moments(wall: _Wall, amount: Array | float) -> Array:

@@ -7,6 +7,7 @@ are too wide or too narrow and masks lie off. Plates are small, their wafers too
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -55,10 +56,14 @@ def askew_at(seed: int) -> Askew:
     return Askew(turn * np.radians(1), tall * 0.02, wide * 0.02, rng.normal(0, 0.2))
 
 
-def measured(folder: Path, seed: int, more: str = "") -> tuple[Calibration, Mapping[str, float]]:
+def measured(
+    folder: Path, seed: int, more: str = "", *, light: Literal["scalar", "edges"] = "scalar"
+) -> tuple[Calibration, Mapping[str, float]]:
     design, process = plate()
-    hidden, depths = hidden_at(seed, process.masks), (NEAR_M, FAR_M)
-    lights = foreign_light(design, process, hidden, depths, PROBE_M, askew=askew_at(seed), shift_px=SHIFT)
+    design = replace(design, camera=replace(design.camera, light=light))
+    hidden, depths, askew = hidden_at(seed, process.masks), (NEAR_M, FAR_M), askew_at(seed)
+    edges = light == "edges"
+    lights = foreign_light(design, process, hidden, depths, PROBE_M, askew=askew, shift_px=SHIFT, edges=edges)
     path = photograph(folder, lights, depths, seed=seed, more=more)
     measurement = read_measurement(path, design.camera)
     return calibrate(design, measurement, ERRORS, process=process), hidden
@@ -117,13 +122,14 @@ def test_a_camera_taken_for_upright_spoils_the_errors(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_standard_deviations_are_honest(tmp_path: Path):
-    """Twenty plates and cameras: what is promised of all, and nine errors in ten within two standard deviations."""
+@pytest.mark.parametrize(("light", "plates"), [("scalar", 5), ("edges", 20)])
+def test_standard_deviations_are_honest(tmp_path: Path, light: Literal["scalar", "edges"], plates: int):
+    """Plates and cameras: what is promised of all, and nine errors in ten within two standard deviations."""
     pulls, turned = [], []
-    for seed in range(20):
+    for seed in range(plates):
         folder = tmp_path / str(seed)
         folder.mkdir()
-        result, hidden = measured(folder, seed)
+        result, hidden = measured(folder, seed, light=light)
         errors = missed(result, hidden)
         require_within_limits(errors)
         pulls.append([error / sigma for error, sigma in errors.values()])

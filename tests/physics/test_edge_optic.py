@@ -16,6 +16,8 @@ from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous import compare_row, edge_widths
 from sim.rigorous.edge_optic import line_weights, optic_as_drawn, with_edges
+from sim.rigorous.edge_widths import series_at, width_series
+from sim.rigorous.walls import Walls, light_of_cells_and_walls
 
 PITCH, STEP, WAVELENGTH = 1.85e-6, 75e-9, 0.552e-6
 INDEX = refractive_index("fused_silica", WAVELENGTH)
@@ -151,6 +153,38 @@ def test_gradients_are_those_of_finite_differences():
     slope = jax.grad(spot)(0.0)
     # Single precision of a sum of a thousand cells limits the difference to a percent.
     assert float(slope) == pytest.approx(float(spot(2e-3) - spot(-2e-3)) / 4e-3, rel=0.02)
+
+
+@pytest.mark.parametrize("oblique", [False, True])
+def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
+    """Cell by cell, at the rim too, where the weights of a line lie partly beyond the cells."""
+    weights, _ = line_weights(0.3, 0.0, 0.28 * oblique)
+    assert np.iscomplexobj(weights) == oblique
+    some = weights[4:32:4].T  # at seven borders, each with its own if light is oblique
+    series = [width_series(1.2e-6, WAVELENGTH, INDEX, "x", axis) for axis in ("y", "x")]
+    walls = [Walls.of(one, 1.2e-6, some, PITCH) for one in series]
+    rng = np.random.default_rng(0)
+    height, rate = jnp.asarray(rng.uniform(0, 1.1e-6, (8, 8)), jnp.float32), (INDEX - 1) / WAVELENGTH
+    seen = jnp.asarray(rng.normal(size=(8, 8)) + 1j * rng.normal(size=(8, 8)), jnp.complex64)
+
+    def amount(height: jax.Array) -> jax.Array:
+        return jnp.sum(seen * light_of_cells_and_walls(height, rate, *walls)).real
+
+    slopes = np.asarray(jax.grad(amount)(height)) * 1e-9
+    steps = 1e-9 * np.eye(64, dtype=np.float32).reshape(64, 8, 8)
+    differences = np.array([amount(height + step) - amount(height - step) for step in steps]).reshape(8, 8) / 2
+    # Single precision of sums of 64 cells, over differences of a hundredth.
+    np.testing.assert_allclose(slopes, differences, rtol=0, atol=2e-3 * np.abs(slopes).max())
+
+
+def test_widths_from_their_series_are_those_that_were_solved():
+    """Between the heights it was fitted to."""
+    height = np.random.default_rng(0).uniform(0, 1.125e-6, 50)
+    series = width_series(1.125e-6, WAVELENGTH, INDEX, "unpolarised", "x")
+    found = series_at(series, 2 * height / 1.125e-6 - 1) * height / 1.125e-6
+    solved = np.mean([edge_widths(tuple(height.tolist()), WAVELENGTH, INDEX, way) for way in ("TE", "TM")], axis=0)
+    wanted = solved * np.exp(-2j * np.pi * height / WAVELENGTH)
+    assert np.abs(found - wanted).max() < 2.5e-9  # of 350; the series is good to 2 where it was fitted
 
 
 def test_a_flat_doe_is_as_it_was():
