@@ -3,6 +3,7 @@
 None changes a PSF's energy. `jax.grad`, `jit` and `vmap` go through all but the energy budget.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
@@ -140,11 +141,13 @@ def zeroth_order(doe: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]
 def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Float[Array, " w"]:
     """Overlap |<t conj(t_nominal)>|^2 with the field of the DOE exactly as drawn, for `doe.wavelengths_m`.
 
-    Where `doe` has finer cells, those of `nominal` are repeated.
+    The cells of `doe` and those of `nominal` may be parts of those that were drawn.
     """
-    parts = doe.camera.grid.shape[0] // nominal.camera.grid.shape[0]
-    xp = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np
-    meant = in_parts(xp.conj(xp.asarray(nominal.means)), parts)
+    own, other = doe.camera.grid.shape[0], nominal.camera.grid.shape[0]
+    xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(own, other)
+    meant = in_parts(xp.conj(xp.asarray(nominal.means)), common // other)
+    if common > own:
+        meant = meant.reshape(len(meant), own, common // own, own, common // own).mean((2, 4))
     return abs(_mean_over_aperture(doe, xp.asarray(doe.means) * meant)) ** 2
 
 

@@ -24,7 +24,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
-from sim.source import SeparableSource, SourceMap, ViewedSource
+from sim.source import SeparableSource, SourceMap, View, ViewedSource
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
     from typing import ClassVar as AbstractVar
@@ -174,6 +174,43 @@ class CellOptic(CameraOptic):
     def field(self, line: SpectralLine, depth_m: float = np.inf) -> Complex[Array, "y x"]:
         """The whole field behind the DOE for a source on the axis, `[y, x]`, unit amplitude where open."""
         return _whole_field(*self.rows(line, self.source(line, depth_m)))
+
+
+class ViewedOptic(CellOptic):
+    """A DOE whose cells have other values from other depths: what is finer than a cell looks different aslant.
+
+    Attributes:
+        transmission: `[view, y, x]` transmission of every cell.
+        views: wavelength and depths of sources for which each transmission holds, the farthest of a wavelength first.
+    """
+
+    transmission: AbstractVar[Complex[Array, "view y x"]]
+    views: AbstractVar[tuple[View, ...]]
+
+    def view(self, wavelength_m: float, depth_m: float = np.inf) -> int:
+        """Which of the views is that from a source depth, or the nearest to it; a ValueError for another wavelength."""
+        own = [k for k, view in enumerate(self.views) if view.wavelength_m == wavelength_m]
+        if not own:
+            raise ValueError(f"`wavelength_m` must be one of {self.wavelengths_m}, but got {wavelength_m}")
+        # The farthest comes first.
+        return next((k for k in own if depth_m >= self.views[k].nearest_m * (1 - 1e-6)), own[-1])
+
+    def at(self, wavelength_m: float, depth_m: float = np.inf) -> Complex[Array, "y x"]:
+        """Transmission at one of the wavelengths for a source depth; a ValueError for another wavelength."""
+        return self.transmission[self.view(wavelength_m, depth_m)]
+
+    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> ViewedSource:
+        """The path to every cell, and the view from there or from the nearest depth that there is a view for."""
+        view = jnp.int32(self.view(line.wavelength_m, depth_m))
+        return ViewedSource(self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad), view)
+
+    def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
+        """Transmission in the source's view."""
+        return None, self.transmission[source.view]
+
+    def from_afar(self, wavelengths_m: Sequence[float]) -> Complex[Array, "w y x"]:
+        """Transmission for the farthest depths, at some of the wavelengths."""
+        return self.transmission[np.array([self.view(wavelength) for wavelength in wavelengths_m])]
 
 
 _whole_field = jax.jit(doe_field)

@@ -12,6 +12,7 @@ k = 1 / c and direction sines s, is
 free of cancellation and small enough for single precision.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -113,8 +114,25 @@ class SeparableSource(NamedTuple):
         return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)
 
 
+class View(NamedTuple):
+    """One wavelength and a range of depths, metres, from which a DOE looks like certain values of its cells."""
+
+    wavelength_m: float
+    nearest_m: float
+    farthest_m: float
+
+    @classmethod
+    def several(cls, wavelength_m: float, depths_m: tuple[float, float], count: int) -> "list[View]":
+        """Views from the nearest depth to the farthest, equally wide in obliquity, the farthest first."""
+        nearest, farthest = depths_m
+        with np.errstate(divide="ignore"):  # of infinity
+            bounds = 1 / np.linspace(1 / farthest, 1 / nearest, count + 1)
+        bounds[[0, -1]] = farthest, nearest
+        return [cls(wavelength_m, float(near), float(far)) for far, near in itertools.pairwise(bounds)]
+
+
 class ViewedSource(eqx.Module):
-    """A point source, and by its number how a DOE looks from there (`sim.surface.FabricatedDoe.views`)."""
+    """A point source, and by its number how a DOE looks from there (`sim.optic.ViewedOptic.views`)."""
 
     path: SourceMap | SeparableSource
     view: Int[Array, ""]

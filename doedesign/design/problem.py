@@ -22,21 +22,20 @@ from sim.propagation.farfield import displaced
 from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import EdgeOptic, optic_as_drawn
-from sim.source import SourceMap
 
 
 class StepSources(NamedTuple):
     """Those of a `SourceSet` that one evaluation of the loss looks at, and where the image lies.
 
     Attributes:
-        near: `[line][depth]` source waves of near depths.
-        far: `[line][depth]` source waves of far depths.
+        near: `[line][depth]` sources at near depths.
+        far: `[line][depth]` sources at far depths.
         lens: `[w, n]` participation of the plain lens at the near depths.
         offset_m: displacement (y, x) of the image on the sensor, or None to leave it on the axis.
     """
 
-    near: tuple[tuple[Array, ...], ...]
-    far: tuple[tuple[Array, ...], ...]
+    near: tuple[tuple[Any, ...], ...]
+    far: tuple[tuple[Any, ...], ...]
     lens: Float[Array, "w n"]
     offset_m: Float[Array, "2"] | None
 
@@ -50,7 +49,6 @@ class Problem(eqx.Module):
     parametrization: LevelParametrization = eqx.field(static=True)
     terms: tuple[Term, ...] = eqx.field(static=True)
     plans: tuple[Any, ...]
-    waves_per_metre: tuple[Float[Array, ""], ...]
     optic: HeightOptic | EdgeOptic | RingOptic
 
     @property
@@ -62,8 +60,8 @@ class Problem(eqx.Module):
 class SourceSet(NamedTuple):
     """Everything a step may look at, as in `StepSources`, and the largest displacement of the image, metres or 0."""
 
-    near: tuple[tuple[Array, ...], ...]
-    far: tuple[tuple[Array, ...], ...]
+    near: tuple[tuple[Any, ...], ...]
+    far: tuple[tuple[Any, ...], ...]
     lens: Float[np.ndarray, "w n"]
     displacement_m: float
 
@@ -90,11 +88,11 @@ class SourceSet(NamedTuple):
         return self._chosen([0] if self.near[0] else [], [0] if self.far[0] else [], None)
 
     def _chosen(self, near: list[int], far: list[int], offset_m: Array | None) -> StepSources:
-        near_waves, far_waves = (
-            tuple(tuple(line[i] for i in chosen) for line in waves)
-            for waves, chosen in ((self.near, near), (self.far, far))
+        near_sources, far_sources = (
+            tuple(tuple(line[i] for i in chosen) for line in sources)
+            for sources, chosen in ((self.near, near), (self.far, far))
         )
-        return StepSources(near_waves, far_waves, jnp.asarray(self.lens[:, near]), offset_m)
+        return StepSources(near_sources, far_sources, jnp.asarray(self.lens[:, near]), offset_m)
 
 
 def problem_of(
@@ -106,7 +104,7 @@ def problem_of(
     camera, optic = problem.camera, problem.optic
     sources: Any = optic.source
     near, far = (
-        tuple(tuple(sources(line, depth).source_waves for depth in depths_m) for line in optic.lines)
+        tuple(tuple(sources(line, depth) for depth in depths_m) for line in optic.lines)
         for depths_m in (spec.scene.near_m, spec.scene.far_m)
     )
     lens = np.zeros((len(camera.colours), 0), np.float32)
@@ -138,7 +136,6 @@ def plans_of(spec: Spec) -> Problem:
         parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
         terms=(),
         plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),
-        waves_per_metre=tuple(jnp.float32(camera.waves_per_metre(line.wavelength_m)) for line in optic.lines),
         optic=optic,
     )
 
@@ -149,9 +146,8 @@ def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
     # Only far-field plans are displaced: see `_is_sparse`.
     plans = problem.plans if look.offset_m is None else [displaced(plan, look.offset_m) for plan in problem.plans]
 
-    def bank(waves: tuple[tuple[Array, ...], ...]) -> Array:
-        sources = [map(SourceMap, one, problem.waves_per_metre) for one in zip(*waves, strict=True)]
-        images = [colour_energies(optic, plans, list(one)) for one in sources]
+    def bank(sources: tuple[tuple[Any, ...], ...]) -> Array:
+        images = [colour_energies(optic, plans, list(one)) for one in zip(*sources, strict=True)]
         return jnp.stack(images, 1) if images else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
 
     return PsfSet(bank(look.near), bank(look.far), look.lens, camera)

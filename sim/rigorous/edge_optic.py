@@ -26,13 +26,13 @@ from jaxtyping import Array, Complex, Float, Inexact
 
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, SpectralLine
+from sim.camera import Camera
 from sim.material import refractive_index
-from sim.optic import CellOptic, CellSource, HeightOptic
+from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
 from sim.rigorous.edge_widths import width_series
 from sim.rigorous.walls import Walls, light_of_cells_and_walls
-from sim.source import SeparableSource, SourceMap
+from sim.source import SeparableSource, SourceMap, View
 from sim.tracing import is_traced
 
 # Root mean square error of a line's far field that is good enough, and the largest that is borne before cells are
@@ -42,7 +42,7 @@ _SHARES = 33  # of the way from the axis to the rim, for which weights are fitte
 _NODE_M = 25e-9  # highest walls are rounded up to, so that plates much alike share what is made for them
 
 
-class EdgeOptic(CellOptic):
+class EdgeOptic(ViewedOptic):
     """A DOE with the light of its walls.
 
     Attributes:
@@ -50,7 +50,8 @@ class EdgeOptic(CellOptic):
         height_m: `[y, x]` height of every cell of the DOE.
         camera: the same with the grid of the cells here: those of the DOE, or a whole number of parts of them.
         coverage: `[y, x]` open share of every cell.
-        transmission: `[wavelength, y, x]` values of the cells whose far field is that of cells and walls.
+        transmission: `[view, y, x]` values of the cells whose far field is that of cells and walls.
+        views: wavelength and depths of sources for which each transmission holds.
         wavelengths_m: different vacuum wavelengths.
         depths_m: nearest and farthest depth of sources for which that holds, metres; from others, it is a little off.
         source_kind: how sources are described.
@@ -60,19 +61,16 @@ class EdgeOptic(CellOptic):
     height_m: Float[Array, "v u"]
     camera: Camera = eqx.field(static=True)
     coverage: Float[Array, "y x"]
-    transmission: Complex[Array, "w y x"]
+    transmission: Complex[Array, "view y x"]
+    views: tuple[View, ...] = eqx.field(static=True)
     wavelengths_m: tuple[float, ...] = eqx.field(static=True)
     depths_m: tuple[float, float] = eqx.field(static=True)
     source_kind: type[SourceMap] | type[SeparableSource] = eqx.field(static=True, default=SourceMap)
 
     @property
     def means(self) -> Complex[Array, "w y x"]:
-        """The transmission: weights of a line sum to its light."""
-        return self.transmission
-
-    def cells(self, line: SpectralLine, source: CellSource) -> tuple[None, Array]:
-        """Transmission at one wavelength."""
-        return None, self.transmission[self.wavelengths_m.index(line.wavelength_m)]
+        """The transmission from afar: weights of a line sum to its light."""
+        return self.from_afar(self.wavelengths_m)
 
     def with_camera(self, camera: Camera) -> "EdgeOptic":
         """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
@@ -126,29 +124,45 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
     if height.shape != camera.grid.shape:
         raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
     wavelengths = tuple(dict.fromkeys(line.wavelength_m for line in camera.lines))
-    oblique = [oblique_waves(camera, wavelength, depths_m) for wavelength in wavelengths]
+    depths = min(depths_m), max(depths_m)
     drawn_m, parts = height, 1
-    while max(line_weights(*waves.over(parts))[1] for waves in oblique) > _WORST:
+    while not all(_is_seen(camera, wavelength, (depth,), parts) for wavelength in wavelengths for depth in depths):
         parts += 1
+    views = [view for wavelength in wavelengths for view in _views(camera, wavelength, depths, parts)]
     if parts > 1:
         height = jnp.repeat(jnp.repeat(height, parts, axis=0), parts, axis=1)
         grid = Grid((camera.grid.shape[0] * parts, camera.grid.shape[1] * parts), camera.grid.pitch_m / parts)
         camera = replace(camera, grid=grid)
     found = []
-    for wavelength, waves in zip(wavelengths, oblique, strict=True):
+    for view in views:
+        wavelength = view.wavelength_m
         index = refractive_index(camera.material, wavelength)
         # Walls of two waves, where heights are traced.
         highest = 2 * wavelength / (index - 1) if is_traced(height) else float(jnp.ptp(height))
         highest = _NODE_M * max(1, int(np.ceil(highest / _NODE_M - 1e-3)))
+        taps, _ = line_weights(*oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m)))
         walls = []
         for axis in ("y", "x"):
             series = width_series(highest, wavelength, index, camera.polarisation, axis)
-            weights = _at_borders(line_weights(*waves.over(parts))[0], camera, axis)
-            walls.append(Walls.of(series, highest, weights, camera.grid.pitch_m))
+            walls.append(Walls.of(series, highest, _at_borders(taps, camera, axis), camera.grid.pitch_m))
         found.append(light_of_cells_and_walls(height, camera.waves_per_metre(wavelength), *walls))
     coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
-    depths = min(depths_m), max(depths_m)
-    return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), wavelengths, depths)
+    return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), tuple(views), wavelengths, depths)
+
+
+def _is_seen(camera: Camera, wavelength_m: float, depths_m: Sequence[float], parts: int) -> bool:
+    """Whether weights on parts of cells do for the light of walls, from all these depths alike."""
+    return line_weights(*oblique_waves(camera, wavelength_m, depths_m).over(parts))[1] <= _WORST
+
+
+def _views(camera: Camera, wavelength_m: float, depths_m: tuple[float, float], parts: int) -> list[View]:
+    """As few views as do for the light of walls."""
+    count = 1
+    while True:
+        views = View.several(wavelength_m, depths_m, count)
+        if all(_is_seen(camera, wavelength_m, (view.nearest_m, view.farthest_m), parts) for view in views):
+            return views
+        count += 1
 
 
 def optic_as_drawn(

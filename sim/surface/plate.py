@@ -19,12 +19,12 @@ from fab.process import MaskDisc, Process, Variation
 from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.metrics import in_parts
-from sim.optic import ON_AXIS, CellOptic, height_transmission
+from sim.optic import ViewedOptic, height_transmission
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
-from sim.source import SourceMap, ViewedSource
+from sim.source import SourceMap, View
 from sim.surface.lines import wall_series
 from sim.surface.pieces import TILE
-from sim.surface.relief import View, plan_of, relief_of, require_possible, view_weights
+from sim.surface.relief import plan_of, relief_of, require_possible, view_weights
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 from sim.tracing import is_traced, single
@@ -32,7 +32,7 @@ from sim.tracing import is_traced, single
 _HEADROOM = 1.25  # of the sum of all depths, for errors
 
 
-class FabricatedDoe(CellOptic):
+class FabricatedDoe(ViewedOptic):
     """A DOE as fabricated, with its chrome.
 
     Attributes:
@@ -63,26 +63,9 @@ class FabricatedDoe(CellOptic):
         """The cells."""
         return self.camera.grid
 
-    def view(self, wavelength_m: float, depth_m: float = np.inf) -> int:
-        """Which of the views is that from a source depth, or the nearest to it; a ValueError for another wavelength."""
-        own = [k for k, view in enumerate(self.views) if view.wavelength_m == wavelength_m]
-        if not own:
-            raise ValueError(f"`wavelength_m` must be one of {self.wavelengths_m}, but got {wavelength_m}")
-        # The farthest comes first.
-        return next((k for k in own if depth_m >= self.views[k].nearest_m * (1 - 1e-6)), own[-1])
-
-    def at(self, wavelength_m: float, depth_m: float = np.inf) -> Complex[Array, "y x"]:
-        """Transmission at one of the wavelengths for a source depth; a ValueError for another wavelength."""
-        return self.transmission[self.view(wavelength_m, depth_m)]
-
-    def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> ViewedSource:
-        """The path to every cell, and the view from there or from the nearest depth that there is a view for."""
-        view = jnp.int32(self.view(line.wavelength_m, depth_m))
-        return ViewedSource(self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad), view)
-
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
         """Heights as drawn, or transmission in the source's view."""
-        return (None, self.transmission[source.view]) if self.height_m is None else (self.height_m, None)
+        return super().cells(line, source) if self.height_m is None else (self.height_m, None)
 
 
 def as_fabricated(
@@ -153,9 +136,9 @@ def as_fabricated(
     transmission, means = transmission_of(plan, packed, widths, relief, rates, left, weights)
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
-    if camera.light == "edges":
-        means = _first_views(transmission, views, lines)
-    return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+    found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+    # Lines of light have no mean within a cell.
+    return replace(found, means=found.from_afar(lines)) if camera.light == "edges" else found
 
 
 def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
@@ -170,15 +153,9 @@ def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
 
 def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:
     """A DOE as drawn, with its light of walls."""
-    light = optic.transmission[np.array([optic.wavelengths_m.index(wavelength) for wavelength in wavelengths_m])]
-    views = tuple(View(wavelength, *optic.depths_m) for wavelength in wavelengths_m)
-    return FabricatedDoe(optic.camera, optic.coverage, light, views, light, wavelengths_m)
-
-
-def _first_views(transmission: Array, views: tuple[View, ...], wavelengths_m: tuple[float, ...]) -> Array:
-    """Transmission from the farthest depths: lines of light have no mean within a cell."""
-    first = [next(k for k, view in enumerate(views) if view.wavelength_m == wavelength) for wavelength in wavelengths_m]
-    return transmission[np.array(first)]
+    own = [k for k, view in enumerate(optic.views) if view.wavelength_m in wavelengths_m]
+    light, views = optic.transmission[np.array(own)], tuple(optic.views[k] for k in own)
+    return FabricatedDoe(optic.camera, optic.coverage, light, views, optic.from_afar(wavelengths_m), wavelengths_m)
 
 
 def drawn_alike(
@@ -194,8 +171,8 @@ def drawn_alike(
     Arguments as of `as_fabricated`. Its transmission is that of the heights, which are not kept.
     """
     drawn = as_fabricated(level_map, camera, process, Variation(), depths_m=depths_m)
-    if drawn.grid != camera.grid:
-        return drawn  # its light of walls is that of parts of cells
+    if camera.light == "edges":
+        return drawn  # with views of its own
     depths = min(depths_m), max(depths_m)
     plan, views = plan_of(camera, process, variation, drawn.wavelengths_m, depths, traced=False)
     means = jnp.asarray(in_parts(drawn.means, plan.parts))

@@ -1,6 +1,5 @@
 """A process and its errors as the numbers that all tiles of a plate share."""
 
-import itertools
 from dataclasses import fields
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from fab.process import Process, Variation
 from fab.units import format_length
 from sim.camera import Camera
 from sim.propagation.oblique import ObliqueWaves, oblique_waves
+from sim.source import View
 from sim.surface.cell import DEGREE, REACH, moment_weights
 from sim.tracing import single, stacked
 
@@ -75,14 +75,6 @@ def effective_bias(relief: EtchParameters) -> Float[Array, " mask"]:
 _MOST, _USUAL_REACH = 8, 3
 
 
-class View(NamedTuple):
-    """One wavelength and a range of depths, metres, from which a plate looks like certain values of its cells."""
-
-    wavelength_m: float
-    nearest_m: float
-    farthest_m: float
-
-
 def plan_of(
     camera: Camera,
     process: Process,
@@ -131,13 +123,9 @@ def plan_of(
 
 
 def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, float]) -> list[View]:
-    """As many views as are needed, equally wide, the farthest first."""
+    """As many views as are needed."""
     count = max(1, int(np.ceil((waves.high - waves.low) / (_WIDEST - 2 * waves.seen) - 1e-9)))
-    nearest, farthest = depths_m
-    with np.errstate(divide="ignore"):  # of infinity
-        bounds = 1 / np.linspace(1 / farthest, 1 / nearest, count + 1)
-    bounds[[0, -1]] = farthest, nearest
-    return [View(wavelength_m, float(near), float(far)) for far, near in itertools.pairwise(bounds)]
+    return View.several(wavelength_m, depths_m, count)
 
 
 @lru_cache(maxsize=8)  # every draw of a study needs the same

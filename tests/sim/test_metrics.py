@@ -22,6 +22,7 @@ from sim.metrics import (
     radius_map_m,
     ring_to_disc,
     spot_radius_m,
+    strehl,
     zeroth_order,
 )
 from sim.optic import HeightOptic
@@ -125,6 +126,22 @@ def test_the_budget_does_not_depend_on_the_parts_of_a_cell(depth_m: float, rng: 
     split = energy_budget(optic, image, depth_m, CAMERA.colours[0], pitch_m=CAMERA.grid.pitch_m)
     # The round rim is drawn in other cells.
     np.testing.assert_allclose(split, whole, rtol=0, atol=2e-3)
+
+
+def test_the_strehl_ratio_does_not_depend_on_the_parts_of_a_cell(rng: np.random.Generator):
+    height = rng.uniform(0, 1.2e-6, (256, 256))
+    drawn, made = HeightOptic.of(CAMERA, height), HeightOptic.of(CAMERA, 0.9 * height)
+    expected = strehl(made, drawn)
+    assert expected[0] < 0.99
+
+    def parted(height: np.ndarray, parts: int) -> HeightOptic:
+        grid = Grid((256 * parts, 256 * parts), CAMERA.grid.pitch_m / parts)
+        return HeightOptic.of(dataclasses.replace(CAMERA, grid=grid), in_parts(height, parts))
+
+    for own, other in ((1, 2), (2, 1), (2, 3)):
+        found = strehl(parted(0.9 * height, own), parted(height, other))
+        # The round rim is drawn in other cells.
+        assert found[0] == pytest.approx(expected[0], abs=1e-4)
 
 
 @pytest.mark.parametrize("prism", [-0.3, 0.0, 0.3])
