@@ -4,6 +4,8 @@ The chrome opening is a true circle. The amplitude of a cell on its edge is the 
 beyond the angles of the cell grid (a few parts in ten thousand of the light) counts among the higher orders.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -47,10 +49,18 @@ def displaced_circle_coverage(
     # A known circle is NumPy's: one by one, jax's operations take a second to compile. They divide by a number as these
     # do; under a trace the compiler folds it.
     traced = is_traced(diameter_m, centre_m)
-    xp, per_pitch = (jnp if traced else np), np.float32(1) / np.float32(grid.pitch_m)
-    radius = diameter_m / 2 / grid.pitch_m
-    y, x = (single(grid.axis_m("y")) - centre_m[0])[:, None], (single(grid.axis_m("x")) - centre_m[1])[None, :]
+    per_pitch = np.float32(1) / np.float32(grid.pitch_m)
+    y, x = single(grid.axis_m("y")) - centre_m[0], single(grid.axis_m("x")) - centre_m[1]
     y, x = (axis / grid.pitch_m if traced else axis * per_pitch for axis in (y, x))
+    return jnp.asarray(open_shares(y, x, diameter_m / 2 / grid.pitch_m, jnp if traced else np))
+
+
+def open_shares(y: Any, x: Any, radius: Any, xp: Any = jnp) -> Any:
+    """Share of the area of unit squares with their centres at the rows `y` and columns `x` inside a circle, `[y, x]`.
+
+    The circle of a `radius` about the origin is taken as straight within a square; `xp` is jax.numpy or numpy.
+    """
+    y, x = y[:, None], x[None, :]
     distance = xp.sqrt(xp.maximum(y * y + x * x, 1e-6))
     # At least 0.7, but in the very middle of the circle, where nothing is to be divided by zero.
     steep = xp.maximum(xp.maximum(xp.abs(y), xp.abs(x)) / distance, 0.5)
@@ -60,4 +70,4 @@ def displaced_circle_coverage(
     # A line through opposite sides cuts a trapezoid; nearer to a corner, a triangle.
     triangle = xp.square(xp.maximum(far - xp.abs(inward), 0.0)) / (2 * steep * flat)
     beyond = xp.where(inward > 0, 1.0 - triangle, triangle)
-    return jnp.asarray(xp.where(xp.abs(inward) <= near, 0.5 + inward / steep, beyond))
+    return xp.where(xp.abs(inward) <= near, 0.5 + inward / steep, beyond)

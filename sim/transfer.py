@@ -66,7 +66,7 @@ def _row_spectra(rows: DoeRows, columns: SourceColumns) -> Array:
         spectrum = jnp.fft.fft(doe_field(block, columns), len(total))
         return total + jnp.sum(spectrum.real**2 + spectrum.imag**2, axis=0), None
 
-    count, cells = rows.coverage.shape
+    count, cells = rows.amplitude.shape
     return jax.lax.scan(add, jnp.zeros(2 * cells), in_blocks(rows, block_size(count)))[0]
 
 

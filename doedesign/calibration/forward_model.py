@@ -32,11 +32,8 @@ from sim.surface import as_fabricated
 Motion = Float[np.ndarray, "7"]
 
 
-class VariedDoe(NamedTuple):
-    """Transmission of the cells at the probe's wavelength in every view, and the open share of each."""
-
-    transmission: Complex[Array, "view y x"]
-    coverage: Float[Array, "y x"]
+# Of the cells and the chrome over them, at the probe's wavelength in every view.
+Transmission = Complex[Array, "view y x"]
 
 
 class _MovedColumns(NamedTuple):
@@ -63,11 +60,11 @@ class _Optic(eqx.Module):
 
 
 @eqx.filter_jit
-def _energy(optic: _Optic, view: Int[Array, ""], plate: VariedDoe, motion: Float[Array, "7"]) -> Float[Array, "v u"]:
+def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Float[Array, "7"]) -> Float[Array, "v u"]:
     plan = optic.plan
     if optic.camera:
         plan = bent(plan, optic.camera, displacement_m(optic.camera, motion[3:], motion[:2]))
-    rows = DoeRows(plate.coverage, None, plate.transmission[view], (optic.source_waves, optic.axis))
+    rows = DoeRows(None, None, plate[view], (optic.source_waves, optic.axis))
     return optic.factor * plan.energy(doe_field, rows, _MovedColumns(optic.axis, optic.rates * motion[:3]))
 
 
@@ -87,12 +84,12 @@ class ForwardModel:
         """The probe's."""
         return self.camera.colours[0].wavelengths_m[0]
 
-    def _surface(self, values: Any) -> tuple[VariedDoe, tuple[Grid, tuple[int, ...]]]:
+    def _surface(self, values: Any) -> tuple[Transmission, tuple[Grid, tuple[int, ...]]]:
         process, variation = self.unknowns.process, self.unknowns.variation(values)
         wavelength, depths = self.wavelength_m, self.depths_m
         surface = as_fabricated(self.level, self.camera, process, variation, (wavelength,), depths_m=depths)
         views = tuple(surface.view(wavelength, depth) for depth in depths)
-        return VariedDoe(surface.transmission, surface.coverage), (surface.grid, views)
+        return surface.transmission, (surface.grid, views)
 
     def plate(self, values: Float[np.ndarray, " p"]) -> "DoeImages":
         """The plate with some errors."""
@@ -101,7 +98,7 @@ class ForwardModel:
 
     def plate_and_vjp(
         self, values: Float[np.ndarray, " p"]
-    ) -> tuple["DoeImages", Callable[[VariedDoe], Float[np.ndarray, " p"]]]:
+    ) -> tuple["DoeImages", Callable[[Transmission], Float[np.ndarray, " p"]]]:
         """The plate, and the function that turns a gradient with respect to it into one with respect to the errors."""
         plate, pull, seen = jax.vjp(self._surface, jnp.asarray(values, jnp.float32), has_aux=True)
         return DoeImages(self, plate, *seen), lambda gradient: np.asarray(pull(gradient)[0], np.float64)
@@ -138,7 +135,7 @@ class DoeImages:
     """A plate and the images of it."""
 
     model: ForwardModel
-    plate: VariedDoe
+    plate: Transmission
     grid: Grid
     views: tuple[int, ...]  # which of the plate's transmissions every image sees
 
@@ -152,12 +149,12 @@ class DoeImages:
         optic, view = self.model.optic(index, self.grid), jnp.int32(self.views[index])
         return np.asarray(_energy(optic, view, self.plate, jnp.asarray(motion, jnp.float32)), np.float64)
 
-    def image_and_vjp(self, index: int, motion: Motion) -> tuple[Image, Callable[[Image], tuple[VariedDoe, Motion]]]:
+    def image_and_vjp(self, index: int, motion: Motion) -> tuple[Image, Callable[[Image], tuple[Transmission, Motion]]]:
         """The image, and the function that turns a gradient with respect to it into those of plate and motion."""
         energy = partial(_energy, self.model.optic(index, self.grid), jnp.int32(self.views[index]))
         image, pull = jax.vjp(energy, self.plate, jnp.asarray(motion, jnp.float32))
 
-        def back(gradient: Image) -> tuple[VariedDoe, Motion]:
+        def back(gradient: Image) -> tuple[Transmission, Motion]:
             to_plate, to_motion = pull(jnp.asarray(gradient, jnp.float32))
             return to_plate, np.asarray(to_motion, np.float64)
 
@@ -165,6 +162,6 @@ class DoeImages:
 
     def zeroth_order(self) -> float:
         """Share of the light that passes as if the plate were flat."""
-        light = np.asarray(jnp.sum(self.plate.transmission[0] * self.plate.coverage, axis=1), np.complex128).sum()
+        light = np.asarray(jnp.sum(self.plate[0], axis=1), np.complex128).sum()
         mean = complex(light) / (np.pi * (self.model.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
         return float(abs(mean) ** 2)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.calibration.forward_model import DoeImages, ForwardModel, Motion, VariedDoe
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, Motion
 from doedesign.calibration.target import Image, Match, Target, match
 from doedesign.calibration.unknowns import Unknowns
 
@@ -108,7 +108,7 @@ class FitObjective:
             for place, (kind, unit) in self.motion_units(i).items():
                 gradient[place] += unit * to_motion[kind]
             matches.append(found)
-            total = to_doe if total is None else VariedDoe(*(a + b for a, b in zip(total, to_doe, strict=True)))
+            total = to_doe if total is None else total + to_doe
         assert total is not None  # there is at least one image
         gradient[: self.errors] += self.unknowns.root.T @ doe_vjp(total)
         return Evaluation(self, scores, doe, tuple(matches)), gradient

@@ -202,7 +202,11 @@ class Trainer(eqx.Module):
         height = jnp.asarray(height_of(level, parametrization.levels).astype(np.float32))
         wavelengths = [line.wavelength_m for line in camera.lines]
         ratio = [_deviation(doe.at(w), height, camera.waves_per_metre(w)) for w in wavelengths]
-        return eqx.tree_at(lambda t: t.doe.optic.deviation, self, jnp.stack(ratio), is_leaf=lambda leaf: leaf is None)
+        assert isinstance(self.doe.optic, HeightOptic)
+        # Its transmission has the chrome already.
+        open_ = jnp.ones_like(self.doe.optic.coverage)
+        optic = replace(self.doe.optic, deviation=jnp.stack(ratio), coverage=open_)
+        return replace(self, doe=replace(self.doe, optic=optic))
 
 
 @eqx.filter_jit

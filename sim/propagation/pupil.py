@@ -37,10 +37,16 @@ def _cis_tangent(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
 class DoeRows(NamedTuple):
     """Rows of a DOE and of the wave that lights it; every array's first axis is the grid's y."""
 
-    coverage: Float[Array, "y x"]  # open share of every cell
+    coverage: Float[Array, "y x"] | None  # open share of every cell, or None where the transmission has it
     height_m: Float[Array, "y x"] | None  # DOE height, metres, or None
     transmission: Complex[Array, "y x"] | None  # transmission besides that of the height, or None for 1
     source: Any  # rows of the source (`sim.source`)
+
+    @property
+    def amplitude(self) -> Array:
+        """Open share times transmission; one of them must be there."""
+        given = [part for part in (self.coverage, self.transmission) if part is not None]
+        return given[0] if len(given) == 1 else given[0] * given[1]
 
 
 @runtime_checkable
@@ -55,7 +61,7 @@ class SourceColumns(Protocol):
 def doe_field(rows: DoeRows, columns: SourceColumns) -> Complex[Array, "y x"]:
     """Field coverage * transmission * exp(2 pi i waves) behind the DOE: eqs. 1, 2 and 4 without the lens."""
     wave = cis(columns.waves(rows.source, rows.height_m))
-    return (rows.coverage if rows.transmission is None else rows.coverage * rows.transmission) * wave
+    return rows.amplitude * wave
 
 
 # One block of rows (64-256 of a few thousand samples) fits a processor's second-level cache.

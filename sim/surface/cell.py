@@ -23,7 +23,7 @@ DEGREE = 3  # of the highest moments
 # Moments kept: degree along y and along x.
 DEGREES = tuple((y, x) for y in range(DEGREE + 1) for x in range(DEGREE + 1 - y))
 LINE_DEGREE = 2  # the same of lines along borders
-REACH = 14  # cells to either side of a moment's own
+REACH = 20  # cells to either side of a moment's own
 _RIDGE = 1e-8  # keeps weights small where the band leaves them free
 
 
@@ -114,9 +114,12 @@ def point_moments(at_y: Float[Array, "part degree q"], at_x: Float[Array, "part 
 
 
 def moment_weights(
-    low: Float[np.ndarray, " band"], high: Float[np.ndarray, " band"], slope: float = 0.0
+    low: Float[np.ndarray, " band"],
+    high: Float[np.ndarray, " band"],
+    slope: float = 0.0,
+    within: tuple[int, int] = (-REACH, REACH),
 ) -> Complex[np.ndarray, "band kind tap"]:
-    """Weights on the cells -14 ... 14 from a moment's own whose far field is that of the moment.
+    """Weights on the cells -20 ... 20 from a moment's own whose far field is that of the moment.
 
     The first three kinds are moments of degree 1, 2 and 3 of a cell, the others those of degree 0, 1 and 2 of a line
     about the lower border of its cell, sum of light times place^q with places in cells.
@@ -125,13 +128,13 @@ def moment_weights(
     (2q+1) (-i)^q j_q(pi u), the far field of moment q, and to exp(i pi u) (-2 pi i u)^q / q!, that of a line's moment,
     for wave numbers u from `low` to `high`, waves per cell: those of light to a pixel less that of the light on the
     cell. Any band narrower than 1 can be fitted, wherever it lies. `slope` is how much more obliquely each cell is lit
-    than the one before, waves per cell.
+    than the one before, waves per cell. Near the border of the grid only the cells `within` some places have weights.
 
     The weights of all kinds but a line's light itself, whose weights sum to 1, have no effect on the axis, so that they
     leave the mean of a plate alone; they are real for a band that is symmetric about it.
     """
     waves = (low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 200))[:, :, None]  # [band, node, place]
-    places = np.arange(-REACH, REACH + 1)
+    places = np.arange(within[0], within[1] + 1)
     seen = np.exp(-2j * np.pi * waves * places + 1j * np.pi * slope * places**2) * np.sinc(waves - slope * places)
     degrees, powers = np.arange(1, DEGREE + 1), np.arange(LINE_DEGREE + 1)
     cells = (2 * degrees + 1) * (-1j) ** degrees * spherical_jn(degrees, np.pi * waves)
@@ -142,4 +145,5 @@ def moment_weights(
     # As good as exact on the axis, and then exact.
     matrix = turned @ seen + 1e3 * np.ones((len(places), len(places))) + _RIDGE * np.eye(len(places))
     weights = np.linalg.solve(matrix, turned @ wanted + 1e3 * on_axis).swapaxes(1, 2)
-    return weights + ((on_axis - weights.sum(axis=2)) / len(places))[:, :, None]
+    weights = weights + ((on_axis - weights.sum(axis=2)) / len(places))[:, :, None]
+    return np.pad(weights, ((0, 0), (0, 0), (REACH + within[0], REACH - within[1])))

@@ -56,7 +56,7 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
     chosen = np.array([doe.wavelengths_m.index(wavelength) for wavelength in colour.wavelengths_m])
     seen = [doe.view(wavelength, depth_m) for wavelength in colour.wavelengths_m]
     whole = doe.transmission[np.array(seen)]
-    even = jnp.broadcast_to(jnp.asarray(mean_transmission(doe)[chosen], jnp.complex64)[:, None, None], whole.shape)
+    even = doe.coverage * jnp.asarray(mean_transmission(doe)[chosen], jnp.complex64)[:, None, None]
     one = replace(doe, camera=replace(doe.camera, colours=(colour,)))
     other = {
         "views": tuple(doe.views[k] for k in seen),

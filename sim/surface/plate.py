@@ -20,14 +20,16 @@ from sim.aperture import circle_coverage, displaced_circle_coverage
 from sim.camera import Camera, SpectralLine
 from sim.metrics import in_parts
 from sim.optic import ViewedOptic, height_transmission
+from sim.propagation.pupil import DoeRows, SourceColumns
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
 from sim.source import SourceMap, View
 from sim.surface.lines import wall_series
+from sim.surface.opening import Opening
 from sim.surface.pieces import TILE
 from sim.surface.relief import plan_of, relief_of, require_possible, view_weights
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
-from sim.tracing import is_traced, single
+from sim.tracing import is_traced, single, stacked
 
 _HEADROOM = 1.25  # of the sum of all depths, for errors
 
@@ -39,11 +41,12 @@ class FabricatedDoe(ViewedOptic):
         camera: lens, sensor and substrate. Its grid is that of the cells here: those of the DOE, or a whole number of
             parts of them where the sensor sees waves too oblique for moments.
         coverage: `[y, x]` open share of every cell.
-        transmission: `[view, y, x]` transmission of every cell without the chrome; its far field is the DOE's within
-            `sim.surface.cell`'s accuracy.
+        transmission: `[view, y, x]` transmission of every cell and of the chrome over it; its far field is the DOE's
+            within `sim.surface.cell`'s accuracy.
         views: wavelength and depths of sources for which each transmission holds. Several for a wavelength whose light
             on a near and on a far source's way takes too wide a band.
-        means: `[wavelength, y, x]` mean transmission of every cell, for overlaps with other DOEs.
+        means: `[wavelength, y, x]` mean transmission of every cell without the chrome, for overlaps with other DOEs; 0
+            far under it.
         wavelengths_m: vacuum wavelengths.
         height_m: `[y, x]` height of every cell of a DOE exactly as drawn, whose PSFs are those of its height map, bit
             for bit; otherwise None.
@@ -66,6 +69,11 @@ class FabricatedDoe(ViewedOptic):
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
         """Heights as drawn, or transmission in the source's view."""
         return super().cells(line, source) if self.height_m is None else (self.height_m, None)
+
+    def rows(self, line: SpectralLine, source: Any) -> tuple[DoeRows, SourceColumns]:
+        """As of other DOEs; the transmission has the chrome already."""
+        rows, columns = super().rows(line, source)
+        return (rows if self.height_m is not None else rows._replace(coverage=None)), columns
 
 
 def as_fabricated(
@@ -108,7 +116,7 @@ def as_fabricated(
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
         coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
         views = tuple(View(wavelength, 0.0, np.inf) for wavelength in lines)
-        return FabricatedDoe(camera, coverage, flat, views, flat, lines, height)
+        return FabricatedDoe(camera, coverage, coverage * flat, views, flat, lines, height)
     if not traced:
         require_possible(camera.grid, process, variation)
     plan, views = plan_of(camera, process, variation, lines, (min(depths_m), max(depths_m)), traced)
@@ -133,12 +141,16 @@ def as_fabricated(
         variance = rest * (2 * np.pi * waves * variation.roughness_m) ** 2
         left = (jnp if traced else np).exp(single(-0.5 * variance))
     weights = view_weights(camera, plan.parts, views, TILE)
-    transmission, means = transmission_of(plan, packed, widths, relief, rates, left, weights)
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
+    centre = stacked([single(variation.chrome_y_m), single(variation.chrome_x_m)])
+    opening = Opening(coverage, centre, single(camera.aperture_m + variation.chrome_diameter_m))
+    transmission, means = transmission_of(plan, packed, widths, relief, rates, left, opening, weights)
     found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
+    if camera.light == "scalar":
+        return found
     # Lines of light have no mean within a cell.
-    return replace(found, means=found.from_afar(lines)) if camera.light == "edges" else found
+    return replace(found, means=found.from_afar(lines) / jnp.where(coverage > 0, coverage, 1.0))
 
 
 def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
@@ -154,7 +166,7 @@ def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
 def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:
     """A DOE as drawn, with its light of walls."""
     own = [k for k, view in enumerate(optic.views) if view.wavelength_m in wavelengths_m]
-    light, views = optic.transmission[np.array(own)], tuple(optic.views[k] for k in own)
+    light, views = optic.coverage * optic.transmission[np.array(own)], tuple(optic.views[k] for k in own)
     return FabricatedDoe(optic.camera, optic.coverage, light, views, optic.from_afar(wavelengths_m), wavelengths_m)
 
 
@@ -178,7 +190,7 @@ def drawn_alike(
     means = jnp.asarray(in_parts(drawn.means, plan.parts))
     grid = _parted(camera.grid, plan.parts)
     coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
-    transmission = means[np.array([number for number, _ in plan.views])]
+    transmission = coverage * means[np.array([number for number, _ in plan.views])]
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, drawn.wavelengths_m)
 
 

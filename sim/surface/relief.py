@@ -28,7 +28,7 @@ jax.tree_util.register_dataclass(
 # Widest band of wave numbers, in waves per cell, that the weights of moments serve; the widest that the window alone
 # may take, so that some is left for sources at different depths; the highest wave number for which moments do, and that
 # for which second moments do.
-_WIDEST, _WIDEST_SEEN, _HIGHEST, _HIGHEST_SECOND = 0.965, 0.93, 0.7, 0.53
+_WIDEST, _WIDEST_SEEN, _HIGHEST, _HIGHEST_SECOND = 0.965, 0.93, 0.7, 0.4
 _NODES = 65  # from rim to rim, for which weights are fitted
 
 
@@ -137,18 +137,22 @@ def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int)
     """
     grid, size = camera.grid, tile * parts
     count, radius = -(-grid.shape[0] // tile), camera.aperture_m / 2 / grid.pitch_m * parts
-    place = (np.arange(count * size) - (grid.shape[0] * parts - 1) / 2) / radius
+    cells = grid.shape[0] * parts
+    place = (np.arange(count * size) - (cells - 1) / 2) / radius
     nodes = np.linspace(-1, 1, _NODES)
     found = []
     for view in views:
         waves = oblique_waves(camera, view.wavelength_m, (view.nearest_m, view.farthest_m)).over(parts)
         lit = nodes * waves.low, nodes * waves.high
         slope = (waves.low + waves.high) / 2 / radius
-        weights = moment_weights(-waves.seen - np.maximum(*lit), waves.seen - np.minimum(*lit), slope)
-        if camera.light == "scalar":
-            weights = weights[:, :DEGREE]
-        between = make_interp_spline(nodes, weights, k=1)
-        found.append(between(np.clip(place, -1, 1)))
+        bands = -waves.seen - np.maximum(*lit), waves.seen - np.minimum(*lit)
+        weights = moment_weights(*bands, slope)
+        every = make_interp_spline(nodes, weights, k=1)(np.clip(place, -1, 1))
+        # Within reach of the grid's border there are fewer cells around.
+        for cell in {*range(min(REACH, cells)), *range(max(cells - REACH, 0), cells)}:
+            low, high = (np.interp(place[cell : cell + 1], nodes, edge) for edge in bands)
+            every[cell] = moment_weights(low, high, slope, (max(-cell, -REACH), min(cells - 1 - cell, REACH)))[0]
+        found.append(every[:, : DEGREE if camera.light == "scalar" else None])
     weights = np.moveaxis(np.stack(found).reshape(len(views), count, size, *found[0].shape[1:]), 0, 1)
     spread = np.zeros((count, len(views), weights.shape[3], size, size + 2 * REACH), complex)
     for cell in range(size):

@@ -12,17 +12,18 @@ from jaxtyping import Array, Complex, Float, Int, UInt8
 from sim.surface.cell import DEGREE, DEGREES, LINE_DEGREE, REACH, axis_moments, cuts, plane_moments, whole_cell
 from sim.surface.edges import corners, walls
 from sim.surface.lines import LINE_DEGREES, line_moments
+from sim.surface.opening import Opening, through_opening
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
 from sim.tracing import in_jit, is_traced
 
 
 def transmission_of(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
-    """Transmission of every cell, tile by tile: with the far field of the whole plate in every view, and its mean.
+    """Transmission of every cell, tile by tile, with the far field of plate and chrome in every view; means without.
 
     The arrays, numpy's or jax's: etches of every cell, one bit each; widths of openings in cells, where etches lag;
     `relief`; waves per metre of height of every wavelength; the amplitude that roughness finer than a cell leaves of
-    each; and the `view_weights`.
+    each; the chrome's `Opening`; and the `view_weights`.
     """
     return (_compiled if is_traced(*arrays) or in_jit() else _compiled_quickly())(plan, *arrays)
 
@@ -34,6 +35,7 @@ def _transmission(
     relief: EtchParameters,
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
+    opening: Opening,
     weights: Float[Array, "tile view part kind s wide"],
 ) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     reach = REACH if plan.cut else 0
@@ -45,6 +47,7 @@ def _transmission(
     etched = jnp.pad(etched, halo)
     widths = None if widths is None else jnp.pad(widths, ((0, 0), *halo))
     rough = None if relief.rough_m is None else jnp.pad(relief.rough_m, [(0, after) for after in missing])
+    opening = opening._replace(coverage=jnp.pad(opening.coverage, [(0, after * plan.parts) for after in missing]))
 
     def tile(start_y: Array, start_x: Array, along_x: Array) -> tuple[Array, Array]:
         side = TILE + 2 * plan.reach + 1
@@ -56,11 +59,21 @@ def _transmission(
             lost = relief.lag * relief.depth_m[:, None, None] / (jnp.maximum(width, 1.0) * plan.grid.pitch_m)
             states = states * jnp.clip(1.0 - lost, 0.0, 1.0)
         bump = None if rough is None else jax.lax.dynamic_slice(rough, (start_y, start_x), (TILE, TILE))
-        moments, lines = _tile_moments(states, relief, bump, (start_y, start_x), rates, plan)
-        return _tile_rows(moments * left[:, None, None], lines * left[:, None, None], along_x, plan)
+        start = start_y, start_x
+        moments, lines, means = _tile_moments(states, relief, bump, opening, start, rates, plan)
+        moments, lines = (part * left[:, None, None] for part in (moments, lines))
+        return _tile_rows(moments, lines, along_x, plan), means * left[:, None, None, None]
+
+    def lit_tile(*at: Array) -> tuple[Array, Array]:
+        """Nothing under the chrome, where a fifth of the tiles of a square around a circle lie."""
+        size = TILE * plan.parts, TILE * plan.parts
+        corner = at[0] * plan.parts, at[1] * plan.parts
+        lit = jnp.any(jax.lax.dynamic_slice(opening.coverage, corner, size) > 0)
+        dark = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(tile, *at))
+        return jax.lax.cond(lit, lambda: tile(*at), lambda: dark)
 
     def strip(start_y: Array, along_y: Array) -> tuple[Array, Array]:
-        values = jax.checkpoint(lambda at: tile(start_y, *at))
+        values = jax.checkpoint(lambda at: lit_tile(start_y, *at))
         rows, means = jax.lax.map(values, (jnp.arange(count_x) * TILE, weights))
         rows = _joined(rows, 5, reach)
         if not plan.cut:
@@ -93,11 +106,15 @@ def _tile_moments(
     states: Float[Array, "mask side side"],
     relief: EtchParameters,
     bump: Float[Array, "t t"] | None,
+    opening: Opening,
     start: tuple[Array, Array],
     rates: Float[Array, " w"],
     plan: TilePlan,
-) -> tuple[Float[Array, "moment 2 w t t"], Float[Array, "axis kind 2 w t t"]]:
-    """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which), and of lines."""
+) -> tuple[Float[Array, "moment 2 w t t"], Float[Array, "axis kind 2 w t t"], Float[Array, "w 2 s s"]]:
+    """Moments of the transmission of one tile's cells (`sim.surface.cell.plane_moments` says which), and of lines.
+
+    Then the mean of every part of the cells, without the chrome.
+    """
     pitch, tile = plan.grid.pitch_m, TILE
     ny, nx = plan.grid.shape
     middle_y = (start[0] + (tile - ny) / 2) * pitch
@@ -137,7 +154,9 @@ def _tile_moments(
     lines = jnp.zeros((2, 0, *moments.shape[1:]))
     if plan.lines:
         lines = line_moments(states, uniform, 0.0 if bump is None else bump.reshape(-1), shift, relief, rates, plan)
-    return moments.reshape(*moments.shape[:-1], tile, tile), lines.reshape(*lines.shape[:-1], tile, tile)
+    moments, lines = (part.reshape(*part.shape[:-1], tile, tile) for part in (moments, lines))
+    means = _by_place(moments, plan)[0]
+    return *through_opening(moments, lines, light, (along_y, along_x), opening, start, plan), means
 
 
 def _kinds(most: int, along: int, plan: TilePlan) -> Int[np.ndarray, " kind"]:
@@ -151,18 +170,14 @@ def _tile_rows(
     lines: Float[Array, "axis line 2 w t t"],
     along_x: Float[Array, "view part kind s wide"],
     plan: TilePlan,
-) -> tuple[Float[Array, "view row 2 v u"], Float[Array, "w 2 s s"]]:
-    """Moments along y of a tile's rows in every view, with what spills to `REACH` cells at either end; and means.
+) -> Float[Array, "view row 2 v u"]:
+    """Moments along y of a tile's rows in every view, with what spills to `REACH` cells at either end.
 
     The first rows are moments of cells, by degree; the others those of lines across y.
     """
-    parts, count = plan.parts, moments.shape[2]
-    moments = moments.reshape(parts, parts, len(DEGREES), 2, count, TILE, TILE)
-    # [degree, w, 2, (row, part), (column, part)]
-    size = TILE * parts
-    values = jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(len(DEGREES), count, 2, size, size)
+    values = _by_place(moments, plan)
     if not plan.cut:
-        return values[:1, jnp.array([number for number, _ in plan.views])].swapaxes(0, 1), values[0]
+        return values[:1, jnp.array([number for number, _ in plan.views])].swapaxes(0, 1)
     across_y, across_x = (_line_values(lines[axis], axis, plan) for axis in (0, 1))
 
     def spread(first: Array, higher: list[Array], weights: Array) -> Array:
@@ -186,7 +201,15 @@ def _tile_rows(
             rows.append(spread(across_y[0, y][number], higher, weights[:, : len(higher)]))
         return jnp.stack(rows)
 
-    return jnp.stack([seen(*view, along_x[v]) for v, view in enumerate(plan.views)]), values[0]
+    return jnp.stack([seen(*view, along_x[v]) for v, view in enumerate(plan.views)])
+
+
+def _by_place(moments: Float[Array, "m 2 w t t"], plan: TilePlan) -> Float[Array, "degree w 2 s s"]:
+    """Moments by degree, on the parts of a tile's cells."""
+    parts, count, size = plan.parts, moments.shape[2], TILE * plan.parts
+    moments = moments.reshape(parts, parts, -1, 2, count, TILE, TILE)
+    # [degree, w, 2, (row, part), (column, part)]
+    return jnp.transpose(moments, (2, 4, 3, 5, 0, 6, 1)).reshape(-1, count, 2, size, size)
 
 
 def _line_values(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from doedesign.calibration.estimate import Calibration
 from doedesign.calibration.fit import search
-from doedesign.calibration.forward_model import DoeImages, ForwardModel, VariedDoe
+from doedesign.calibration.forward_model import DoeImages, ForwardModel, Transmission
 from doedesign.calibration.geometry import UPRIGHT, GeometryPrior
 from doedesign.calibration.measurement import Measurement
 from doedesign.calibration.objective import FitObjective
@@ -89,9 +89,9 @@ class AnalyticImages(DoeImages):
     def image_and_vjp(self, index: int, motion: Values) -> tuple[NDArray[np.float64], Any]:
         """One image and its derivative backwards."""
 
-        def back(gradient: NDArray[np.float64]) -> tuple[VariedDoe, Values]:
+        def back(gradient: NDArray[np.float64]) -> tuple[Transmission, Values]:
             each = np.tensordot(self.model.patterns[index], gradient, 2)
-            to_doe: Any = VariedDoe(each[1], each[2])
+            to_doe: Any = each[1:3]
             return to_doe, each[3:]
 
         return self.image(index, motion), back

@@ -196,10 +196,11 @@ def test_without_errors_it_is_the_drawn_doe_with_edges_bit_for_bit():
 
 def test_errors_that_vanish_lead_to_the_drawn_doe_with_edges():
     """Another sum than that of heights: lines keep second moments and a series of their widths, good to 0.2 nm."""
-    lens = small()
-    drawn = as_fabricated(level_map(), lens, Process(LEVELS), Variation())
-    made = as_fabricated(level_map(), lens, Process(LEVELS), Variation(common_depth_scale=1e-7))
-    thin = as_fabricated(level_map(), small(light="scalar"), Process(LEVELS), Variation())
+    lens = small(aperture_m=1.6 * 64 * CELL)  # no rim, whose cells have moments only where walls move
+    level = np.pad(level_map()[8:-8, 8:-8], 8, constant_values=15)  # and no walls at the border
+    drawn = as_fabricated(level, lens, Process(LEVELS), Variation())
+    made = as_fabricated(level, lens, Process(LEVELS), Variation(common_depth_scale=1e-7))
+    thin = as_fabricated(level, replace(lens, light="scalar"), Process(LEVELS), Variation())
     energies = [np.asarray(psf(doe).energy) for doe in (made, drawn, thin)]
     assert off(energies[0], energies[1]) < 0.01
     assert off(energies[2], energies[1]) > 0.05

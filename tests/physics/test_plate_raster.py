@@ -11,6 +11,7 @@ from bench.reference import relative_error
 from fab.grid import Grid
 from fab.levels import Levels, height_of
 from fab.process import Process, Variation
+from sim.aperture import circle_coverage
 from sim.camera import Camera, Colour
 from sim.surface import as_fabricated
 from tests.physics.plate_raster import far_field, raster_height_m
@@ -24,16 +25,19 @@ SIXTEEN = Levels(16, 75e-9)
 F = PITCH_M / 32  # all shifts are whole samples of the raster
 
 
-def camera(window: int = 500) -> Camera:
-    """The automotive optics before a small plate; a window of 500 pixels reaches to 0.33 and 0.44 waves per cell."""
+def camera(window: int = 500, cells: int = CELLS, open_share: float = 1.5) -> Camera:
+    """The automotive optics before a small plate; a window of 500 pixels reaches to 0.33 and 0.44 waves per cell.
+
+    The aperture is so much wider than the plate, or as wide (1).
+    """
     colours = (Colour("red", (RED_M,), (1.0,)), Colour("blue", (BLUE_M,), (1.0,)))
-    grid = Grid((CELLS, CELLS), PITCH_M)
-    return Camera(grid, 0.98 * CELLS * PITCH_M, "fused_silica", colours, FOCAL_M, PIXEL_M, window)
+    grid = Grid((cells, cells), PITCH_M)
+    return Camera(grid, open_share * cells * PITCH_M, "fused_silica", colours, FOCAL_M, PIXEL_M, window)
 
 
-def noise_map(levels: int) -> np.ndarray:
+def noise_map(levels: int, cells: int = CELLS) -> np.ndarray:
     """Smooth noise over two waves, blank at the border so that nothing is pushed over the edge."""
-    noise = gaussian_filter(np.random.default_rng(0).normal(size=(CELLS, CELLS)), 1.5, mode="wrap")
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(cells, cells)), 1.5, mode="wrap")
     level = np.mod(np.rint(noise / noise.std() * levels / 2), levels).astype(np.uint8)
     inner = np.zeros_like(level, bool)
     inner[6:-6, 6:-6] = True
@@ -67,23 +71,27 @@ def fields(
     depth_m: float = np.inf,
     depths_m: tuple[float, ...] = (),
     raster: Variation | None = None,
+    open_share: float = 1.5,
 ) -> list[Fields]:
     """Far fields within the window of a source at some depth, for both colours.
 
-    The plate is prepared for that depth, or for `depths_m`; `raster` has the errors of the raster if they differ.
+    The plate is prepared for that depth, or for `depths_m`; `raster` has the errors of the raster if they differ. Where
+    the aperture is not wider than the plate, the raster has a hard rim.
     """
-    optics = camera(window)
+    optics = camera(window, len(level), open_share)
     process = Process(levels, die_m=die_m)
     surface = as_fabricated(level, optics, process, variation, depths_m=depths_m or (depth_m,))
     parts = surface.grid.shape[0] // len(level)
     height = raster_height_m(level, levels, PITCH_M, samples, raster or variation, die_m)
+    y, x = ((np.arange(n) + 0.5 - n / 2) / samples for n in height.shape)
+    within = np.hypot(y[:, None], x[None, :]) <= optics.aperture_m / 2 / PITCH_M
     out = []
     for wavelength in (RED_M, BLUE_M):
         rate, band = optics.waves_per_metre(wavelength), window / 2 * PIXEL_M * PITCH_M / (wavelength * FOCAL_M)
         plates = (
             (np.asarray(surface.at(wavelength, depth_m)), parts),
-            (np.exp(2j * np.pi * rate * height), samples),
-            (np.exp(2j * np.pi * rate * height_of(level, levels)), 1),
+            (np.exp(2j * np.pi * rate * height) * within, samples),
+            (np.exp(2j * np.pi * rate * height_of(level, levels)) * circle_coverage(optics.grid, optics.aperture_m), 1),
         )
         slope = PITCH_M**2 / (wavelength * depth_m)
         out.append(Fields(*(far_field(plate, per_cell, band, 61, slope) for plate, per_cell in plates)))
@@ -163,26 +171,18 @@ def test_intensities_are_those_of_a_raster(name: str):
         assert colour.change() > 10 * case.limit
 
 
-# Before a plate as small as this one, cells at the rim are lit as obliquely as those of the automotive plate are from
+# From here, cells at the rim of a plate as small as this are lit as obliquely as those of the automotive plate are from
 # 5 cm: 0.17 waves per cell in blue.
-NEAR_M = 0.83e-3
+NEAR_M = 5e-2 * CELLS / 2400
+MANY = 200  # cells of a random plate: the share of its rim, and what cells there are off by, falls with them
 G = PITCH_M / 20  # a sample of the coarser raster
 
 
-def random_map() -> np.ndarray:
-    """A level of its own for every cell, up to a rim of blank ones."""
-    level = np.random.default_rng(3).integers(0, 16, (CELLS, CELLS)).astype(np.uint8)
-    inner = np.zeros_like(level, bool)
-    inner[6:-6, 6:-6] = True
-    return np.where(inner, level, np.uint8(15))
-
-
 class Random(NamedTuple):
-    """Errors of a random plate, how far its intensity may be off (measured, and half as much again), and samples."""
+    """Errors of a random plate, and how far its intensity may be off: what is promised at full size."""
 
     variation: Variation
-    limit: float
-    samples: int = 20
+    limit: float = 0.007
 
 
 SHIFTED: dict[str, Any] = {
@@ -190,53 +190,64 @@ SHIFTED: dict[str, Any] = {
     "overlay_y_m": (G, -5 * G, 2 * G, 2 * G),
 }
 RANDOM = {
-    "half a micrometre of overlay": Random(Variation(**SHIFTED), 0.005),
+    "half a micrometre of overlay": Random(Variation(**SHIFTED)),
+    # In blue from nearby 0.85 % of 200 cells, 0.72 of 300 and 0.63 of 400: the rim's share falls.
     "a micrometre of overlay": Random(
-        Variation(overlay_x_m=(0, 11 * G, -8 * G, 4 * G), overlay_y_m=(3 * G, -11 * G, 4 * G, 8 * G)), 0.0075
+        Variation(overlay_x_m=(0, 11 * G, -8 * G, 4 * G), overlay_y_m=(3 * G, -11 * G, 4 * G, 8 * G)), 0.0095
     ),
-    "wide openings": Random(Variation(common_cd_bias_m=2 * G), 0.0035),
-    "each mask its own": Random(Variation(cd_bias_m=(2 * G, -2 * G, 3 * G, -G)), 0.004),
-    # Walls of 5 degrees are 50 nm wide: the raster has to see into them.
-    "all together": Random(
+    "wide openings": Random(Variation(common_cd_bias_m=2 * G)),
+    "each mask its own": Random(Variation(cd_bias_m=(2 * G, -2 * G, 3 * G, -G))),
+    "all together but walls": Random(
         Variation(
             **SHIFTED,
             common_cd_bias_m=2 * G,
             depth_scale=(0.02, -0.01, 0.01, -0.02),
             etch_lag=0.02,
-            sidewall_rad=np.radians(5),
             corner_radius_m=2 * G,
         ),
-        0.009,
-        samples=120,
+        0.01,
     ),
 }
 
 
+def random_fields(cells: int, variation: Variation, depth_m: float, margin: int = 0, **given: Any) -> list[Fields]:
+    """Fields of a plate with random levels cell by cell up to a margin, in an aperture almost as wide as it is."""
+    level = np.random.default_rng(3).integers(0, 16, (cells - 2 * margin,) * 2).astype(np.uint8)
+    level = np.pad(level, margin, constant_values=15)
+    optics: dict[str, Any] = {"window": 512, "depths_m": (NEAR_M * cells / CELLS, np.inf), "open_share": 0.98}
+    given = optics | {"samples": 20} | given
+    return fields(level, SIXTEEN, variation, depth_m=depth_m, **given)
+
+
 @pytest.mark.parametrize("name", [n if "half" in n else pytest.param(n, marks=pytest.mark.slow) for n in RANDOM])
 def test_random_plates_are_those_of_a_raster_from_near_and_far(name: str):
-    """Every cell a level of its own, the automotive window of 512 pixels, one plate for 5 cm and for infinity."""
+    """Every cell a level of its own, a hard rim, the automotive window, one plate for 5 cm and for infinity."""
     case = RANDOM[name]
-    for depth_m in (NEAR_M, np.inf):
-        for colour in fields(
-            random_map(),
-            SIXTEEN,
-            case.variation,
-            samples=case.samples,
-            window=512,
-            depth_m=depth_m,
-            depths_m=(NEAR_M, np.inf),
-        ):
+    for depth_m in (NEAR_M * MANY / CELLS, np.inf):
+        for colour in random_fields(MANY, case.variation, depth_m):
             assert colour.error() < case.limit
+            assert colour.change() > 0.03
+
+
+@pytest.mark.slow
+def test_random_plates_with_tilted_walls_are_those_of_a_raster():
+    """Walls of 5 degrees are 50 nm wide: the raster has to see into them, so the plate is small, and has no rim."""
+    errors = {**SHIFTED, "common_cd_bias_m": 2 * G, "depth_scale": (0.02, -0.01, 0.01, -0.02), "etch_lag": 0.02}
+    variation = Variation(**errors, sidewall_rad=np.radians(5), corner_radius_m=2 * G)
+    for depth_m in (NEAR_M, np.inf):
+        for colour in random_fields(CELLS, variation, depth_m, 6, samples=120, open_share=1.5):
+            assert colour.error() < 0.01
             assert colour.change() > 0.03
 
 
 @pytest.mark.parametrize("depths_m", [(NEAR_M,), (NEAR_M, np.inf)], ids=["one depth", "near and far"])
 def test_smooth_plates_before_a_near_source_are_those_of_a_raster(depths_m: tuple[float, ...]):
-    """Measured 0.36 and 0.54 % in blue, where light to the window's corner is oblique by 0.6 waves per cell."""
+    """Measured 0.18 and 0.26 % in blue, where light to the window's corner is oblique by 0.6 waves per cell."""
+    depths_m = tuple(depth * MANY / CELLS for depth in depths_m)
+    optics: dict[str, Any] = {"samples": 20, "window": 512, "depths_m": depths_m, "open_share": 0.98}
     for depth_m in depths_m:
-        made = fields(noise_map(16), SIXTEEN, Variation(**OVERLAY), window=512, depth_m=depth_m, depths_m=depths_m)
-        for colour in made:
-            assert colour.error() < 8e-3
+        for colour in fields(noise_map(16, MANY), SIXTEEN, Variation(**SHIFTED), depth_m=depth_m, **optics):
+            assert colour.error() < 4e-3
             assert colour.change() > 0.05
 
 

@@ -17,7 +17,7 @@ from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 PITCH_M = 1.85e-6
-CELLS = 64
+CELLS = 96  # more than twice the reach of moments around the period in the middle
 FLOAT32 = 1e-5  # heights in waves, and the 4e-6 of the sine
 
 

@@ -122,7 +122,7 @@ def compiled() -> Compiled:
 
     def functional(variation: Variation) -> jax.Array:
         surface = as_fabricated(level, CAMERA, PROCESS, variation)
-        field = waves @ (surface.transmission[0] * surface.coverage) @ waves.T
+        field = waves @ surface.transmission[0] @ waves.T
         return jnp.sum(weights * (field.real**2 + field.imag**2))
 
     value, slopes = jax.jit(jax.value_and_grad(functional))(plate())

@@ -65,7 +65,7 @@ def test_the_zeroth_order_of_a_plate_as_drawn_is_that_of_its_height_map(level: n
 
 def test_a_flat_plate_leaks_everything(nominal: FabricatedDoe):
     even = jnp.full_like(nominal.transmission, jnp.exp(0.7j))
-    flat = dataclasses.replace(nominal, transmission=even, means=even, height_m=None)
+    flat = dataclasses.replace(nominal, transmission=nominal.coverage * even, means=even, height_m=None)
     np.testing.assert_allclose(zeroth_order(flat), 1.0, atol=1e-6)  # float32
     parts = split_psf(flat, DEPTH_M, GREEN)
     assert parts.diffracted.sum() < 1e-9
