@@ -16,6 +16,7 @@ TABLES = (
     "bench.capture",
     "bench.train",
     "bench.pipeline",
+    "bench.spots",
 )
 
 

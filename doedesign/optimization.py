@@ -1,9 +1,9 @@
 """Optimisation of a spec into a design, in memory or in a run folder."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, pattern_metrics
-from doedesign.design.objectives import Objective, source_digests
+from doedesign.design.objectives import Objective, Term, source_digests
 from doedesign.design.optimize import (
     OptimizationState,
     finished_design,
@@ -44,14 +44,18 @@ from fab.levels import Levels
 from fab.plots.height import plot_height
 from fab.units import NM
 from sim.aperture import circle_coverage
+from sim.camera import Camera
 from sim.metrics import without_infinities
-from sim.optic import HeightOptic
+from sim.optic import CellOptic, HeightOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
+
+if TYPE_CHECKING:
+    from doedesign.spots.orders import OrderTable
 
 log = logging.getLogger("doedesign")
 
@@ -88,9 +92,11 @@ def optimize(
     files = input_files(spec)
     if out is not None:
         return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)
+    if spec.spots is not None:
+        return _spots_design(spec)
     problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
-    state, history = _iterate(problem, sources, spec, state, [])
+    state, history = _iterate(steps(spec, problem, sources, state), spec, state, [])
     return finished_design(spec, problem, state, history)
 
 
@@ -108,15 +114,19 @@ def _optimize_in(
             log.info(f"{folder} already holds the finished run of this spec")
             return open_design(folder, False)
         log.info("preparing sources and propagation")
-        problem, sources = problem_of(spec, files, objectives)
-        state, history = _resume(run, problem, sources, files)
-        begin_run(run)
-        state, history = _iterate(problem, sources, spec, state, history, run)
+        terms: tuple[Term, ...] = ()
+        if spec.spots is not None:
+            design = _spots_design(spec, run)
+        else:
+            problem, sources = problem_of(spec, files, objectives)
+            state, history = _resume(run, problem, sources, files)
+            begin_run(run)
+            state, history = _iterate(steps(spec, problem, sources, state), spec, state, history, run)
+            design, terms = finished_design(spec, problem, state, history), problem.terms
         log.info("evaluating the design")
-        design = finished_design(spec, problem, state, history)
         if spec.process.chooses_depths:
             log.info(f"chosen: {design.levels}")
-        results = _write_results(run, problem, design)
+        results = _write_results(run, terms, design)
         finish_run(run, results, design.levels.depths_m)
     return open_design(folder, False)
 
@@ -141,29 +151,64 @@ def _resume(
     return OptimizationState(parameters, adam, step), history
 
 
+def _spots_design(spec: Spec, run: Run | None = None) -> Design:
+    """Design the spots of a spec; in a run, go on from its checkpoint."""
+    from doedesign.spots.design import SpotState, SpotTask
+
+    task, history = SpotTask.from_spec(spec), []
+    waves = [np.zeros(task.problem.spots.count)] * 4
+    stored = None if run is None else load_checkpoint(run, [*waves, np.zeros(1)])
+    if stored is None:
+        log.info(f"searching phases of {task.problem.spots.count} spots, {task.table.starts} starts")
+        state = task.initial_state()
+    else:
+        arrays, step, history = stored
+        log.info(f"resuming after step {step}")
+        state = SpotState.of(arrays, step)
+    if run is not None:
+        begin_run(run)
+    state, history = _iterate(task.steps(state), spec, state, history, run)
+    return task.finished(state, history)
+
+
+class _Resumable(Protocol):
+    """State of an optimisation, as a checkpoint keeps it."""
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        ...
+
+    @property
+    def arrays(self) -> Sequence[np.ndarray]:
+        """Everything else."""
+        ...
+
+
+_State = TypeVar("_State", bound=_Resumable)
+
+
 def _iterate(
-    problem: Problem,
-    sources: SourceSet,
+    work: Iterator[tuple[_State, dict[str, Any]]],
     spec: Spec,
-    state: OptimizationState,
+    state: _State,
     history: list[dict[str, Any]],
     run: Run | None = None,
-) -> tuple[OptimizationState, list[dict[str, Any]]]:
+) -> tuple[_State, list[dict[str, Any]]]:
     """Do the steps that are left; in a run, keep a checkpoint every so many, and after the last one."""
     last, every = spec.optimize.steps, spec.optimize.checkpoint_every
     with meter("optimising", last, state.step) as progress:
-        for state, record in steps(spec, problem, sources, state):  # noqa: B020 - the last state is the result
+        for state, record in work:
             history.append(record)
             progress.advance(state.step, f"loss {record['loss']:.4f}")
             if run is not None and (state.step % every == 0 or state.step == last):
-                arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((state.parameters, state.adam))]
-                save_checkpoint(run, arrays, state.step, history)
+                save_checkpoint(run, state.arrays, state.step, history)
     return state, history
 
 
-def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
+def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
     """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
-    camera, binary = problem.camera, Levels(design.levels.count, design.levels.step_m)
+    binary = Levels(design.levels.count, design.levels.step_m)
     area = circle_coverage(camera.grid, camera.aperture_m)
     heights = height_histogram(np.asarray(design.continuous_m), area, binary.period_m, camera)
     return {
@@ -173,8 +218,17 @@ def _etch_metrics(problem: Problem, design: Design) -> dict[str, Any]:
     }
 
 
-def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
-    spec, camera, height = run.spec, problem.camera, design.nominal_height_m
+def _order_table(spec: Spec, drawn: CellOptic, design: Design) -> "OrderTable":
+    from doedesign.spots.design import spots_from_spec
+    from doedesign.spots.orders import order_table
+
+    assert spec.spots is not None
+    spots, table = spots_from_spec(spec.spots, design.camera), spec.spots
+    return order_table(drawn, spots, period_m=table.period_m, count=table.count, levels=design.levels.count)
+
+
+def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[str]:
+    spec, camera, height = run.spec, design.camera, design.nominal_height_m
     near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.optics.propagation
     levels = None if spec.optimize.quantisation == "none" else design.levels
     names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
@@ -183,10 +237,10 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
     rows = design_metrics(drawn, bank, near, lens)
     metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light}
-    if patterns := pattern_metrics(spec, camera, bank, problem.terms):
+    if patterns := pattern_metrics(spec, camera, bank, terms):
         metrics["patterns"] = patterns
     if spec.process.chooses_depths:
-        metrics["etches"] = _etch_metrics(problem, design)
+        metrics["etches"] = _etch_metrics(camera, design)
     remark = ""
     if propagation == "far_field":
         ends = sorted({min(near + far), max(near + far)})
@@ -194,6 +248,13 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
         metrics["accuracy"] = without_infinities([one._asdict() for one in budget])
         remark = in_words(budget, camera)
         log.info(remark)
+    if spec.spots is not None:
+        table = _order_table(spec, drawn, design)
+        metrics["orders"] = table.summary()
+        log.info(table.describe())
+        write_atomic(run.path("orders.csv"), table.to_csv().encode())
+        save(table.plot(), run.path("orders.png"))
+        names += ["orders.csv", "orders.png"]
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, spec.doe.aperture_m), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far, remark=remark), run.path("psf.png"))
@@ -204,7 +265,7 @@ def _write_results(run: Run, problem: Problem, design: Design) -> list[str]:
     if design.history:
         save(plot_history(design.history), run.path("history.png"))
         names.append("history.png")
-    if targets := [term.target for term in problem.terms if term.target is not None]:
+    if targets := [term.target for term in terms if term.target is not None]:
         achieved = bank.energy[0, bank.depths_m.index(far[0])]
         efficiency, uniformity = (patterns[0][name] for name in ("efficiency", "uniformity"))
         picture = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)

@@ -41,6 +41,11 @@ class OptimizationState(NamedTuple):
     adam: optax.OptState
     step: int
 
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """Arrays that a checkpoint keeps."""
+        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam))]
+
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
     """Adam whose step size falls to a tenth along a cosine, so that levels settle."""

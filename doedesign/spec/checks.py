@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
+from doedesign.spec.target import spot_problems
 from doedesign.spec.training import training_problems
 from doedesign.spec.values import NEAR_OBJECTIVES, nearest
 from fab.errors import InputError
@@ -25,6 +26,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_light, _doe, _sensor, _lens, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
+    rules = (*rules, spot_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -143,7 +145,7 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
 
 
 def _objectives(spec: Spec) -> Iterator[InputError]:
-    if not spec.objectives and spec.optimize.steps > 0:
+    if not spec.objectives and spec.spots is None and spec.optimize.steps > 0:
         rule = "an optimisation must have something to improve"
         yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
     for index, objective in enumerate(spec.objectives):

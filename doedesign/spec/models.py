@@ -14,6 +14,7 @@ from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import SpecTable, optional
+from doedesign.spec.target import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
@@ -206,8 +207,8 @@ class ObjectiveSpec(SpecTable, frozen=True):
 class Spec(SpecTable, frozen=True):
     """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-    `objectives` are the terms of the loss and `limits` the conditions of a good DOE, `[[objective]]` and `[[limit]]` in
-    TOML.
+    `objectives` are the terms of the loss, unless `spots` say where light should go, and `limits` the conditions of a
+    good DOE; `[[objective]]` and `[[limit]]` in TOML.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -219,6 +220,7 @@ class Spec(SpecTable, frozen=True):
     obstruction: ObstructionSpec | None = optional()
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
+    spots: SpotsSpec | None = optional()
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
     order: OrderSpec = optional(OrderSpec())

@@ -1,0 +1,183 @@
+"""The table [spots]: where a DOE should send its light, spot by spot; its rules, and what may stand beside it."""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from doedesign.spec.table import SpecTable, optional, toml_key
+from doedesign.spec.values import Count, NotNegative, Positive, broken, length
+from fab.errors import InputError
+from fab.units import MM, UM, format_length
+from sim.camera import sines_at
+
+if TYPE_CHECKING:
+    from doedesign.spec.models import Spec
+
+Place = Annotated[float, length(-1.0, 1.0)]
+Arrangement = Literal["grid", "hexagonal", "ring", "list"]
+
+
+class SpotsSpec(SpecTable, frozen=True):
+    """Spots to be drawn with light, instead of objectives.
+
+    Attributes:
+        arrangement: "grid" (`count` and `spacing`, or `count` and `period`), "hexagonal" (`rings` around a middle spot,
+            `spacing`), "ring" (`number` on a circle of `radius`) or "list" (`places`).
+        count: spots along x and along y. The orders of an even count are the odd ones.
+        rings: hexagonal rings around the middle spot.
+        number: spots on the circle.
+        spacing_m: distance of neighbouring spots on the sensor.
+        radius_m: radius of the circle on the sensor.
+        places_m: [x, y] of every spot on the sensor.
+        period_m: side of a unit cell that is repeated over the DOE, a whole number of DOE cells; the spots are its
+            diffraction orders, wavelength / period apart in direction sine.
+        offset_m: [x, y] by which all spots are moved on the sensor, as far as they are not orders of a unit cell.
+        weights: light of every spot over that of the others, equal if left out; a grid goes row by row from the lowest.
+        uniformity: how much of the efficiency a uniformity error (max - min) / (max + min) is worth; 0 is for light
+            alone.
+        starts: random starts of the search for the spots' phases.
+    """
+
+    arrangement: Arrangement = "grid"
+    count: tuple[Count, Count] | None = optional()
+    rings: Annotated[int, Field(strict=True, ge=1, le=50)] | None = optional()
+    number: Annotated[int, Field(strict=True, ge=2, le=10_000)] | None = optional()
+    spacing_m: Annotated[float, length(0.1 * UM, 1.0)] | None = optional()
+    radius_m: Annotated[float, length(0.1 * UM, 1.0)] | None = optional()
+    places_m: tuple[tuple[Place, Place], ...] = optional(())
+    period_m: Annotated[float, length(0.02 * UM, 100 * MM)] | None = optional()
+    offset_m: tuple[Place, Place] = optional((0.0, 0.0))
+    weights: tuple[Positive, ...] = optional(())
+    uniformity: NotNegative = optional(1.0)
+    starts: Annotated[int, Field(strict=True, ge=1, le=100_000)] = optional(200)
+
+    @field_validator("count")
+    @classmethod
+    def _few(cls, count: tuple[int, int] | None) -> tuple[int, int] | None:
+        if count is not None and not 2 <= count[0] * count[1] <= 10_000:
+            raise broken("must be 2 to 10000 spots together", "For example count = [5, 5].")
+        return count
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Attributes that the arrangement needs."""
+        step = "spacing_m" if self.period_m is None else "period_m"
+        return {
+            "grid": ("count", step),
+            "hexagonal": ("rings", "spacing_m"),
+            "ring": ("number", "radius_m"),
+            "list": ("places_m",),
+        }[self.arrangement]
+
+    @property
+    def spot_count(self) -> int:
+        """Number of spots, of a table whose needed attributes are there."""
+        if self.arrangement == "grid":
+            assert self.count is not None
+            return self.count[0] * self.count[1]
+        if self.arrangement == "hexagonal":
+            assert self.rings is not None
+            return 1 + 3 * self.rings * (self.rings + 1)
+        return self.number or len(self.places_m)
+
+
+_PLACING = ("count", "rings", "number", "spacing_m", "radius_m", "places_m", "period_m")
+_FEWEST_CELLS = 4  # of a unit cell
+
+
+def spot_problems(spec: "Spec") -> Iterator[InputError]:
+    """Return every rule that the spots of a spec break."""
+    if spec.spots is None:
+        return
+    complete = True
+    for problem in _keys(spec):
+        complete = False
+        yield problem
+    yield from _beside(spec)
+    if complete:
+        yield from _reach(spec)
+
+
+def _keys(spec: "Spec") -> Iterator[InputError]:
+    spots: Any = spec.spots
+    for name in spots.needed:
+        if not getattr(spots, name):
+            cure = f"Add `{toml_key(name)}`, or choose another arrangement."
+            yield InputError(f"spots.{toml_key(name)}", f'arrangement "{spots.arrangement}" needs it', "nothing", cure)
+    for name in _PLACING:
+        if getattr(spots, name) and name not in spots.needed:
+            rule = f'arrangement "{spots.arrangement}" takes: {", ".join(map(toml_key, spots.needed))}'
+            yield InputError(f"spots.{toml_key(name)}", rule, toml_key(name), "Remove it.")
+    if spots.period_m is not None and any(spots.offset_m):
+        yield InputError("spots.offset", "orders of a unit cell cannot be moved", "an offset", "Remove it.")
+
+
+def _beside(spec: "Spec") -> Iterator[InputError]:
+    if spec.objectives:
+        yield InputError("spots", "takes the place of objectives", "both", "Remove [spots] or every [[objective]].")
+    if spec.scene.near_m or spec.scene.far_m != (math.inf,):
+        yield InputError("scene.far", 'spots are made of a collimated beam: far = ["inf"]', "others", "Change it.")
+    if spec.sensor.defocus_m:
+        got = format_length(spec.sensor.defocus_m)
+        yield InputError("sensor.defocus", "spots lie in the focal plane", got, "Leave it out.")
+    if spec.optics.propagation != "far_field":
+        got = f'"{spec.optics.propagation}"'
+        yield InputError("optics.propagation", "spots are computed by the far field", got, "Leave it out.")
+    if spec.process.chooses_depths:
+        yield InputError("process.etch_depths", "spots need known depths", '"optimize"', "Give them, or leave it out.")
+    for name, usual in (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through")):
+        if (got := getattr(spec.optimize, name)) != usual:
+            rule = "spots have starts and levels of their own"
+            yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
+
+
+def _reach(spec: "Spec") -> Iterator[InputError]:
+    """Rules of sizes, where all that places the spots is there."""
+    spots: Any = spec.spots
+    weights, count = len(spots.weights), spots.spot_count
+    if weights not in (0, count):
+        yield InputError("spots.weights", f"must be one per spot, {count}", f"{weights}", "Add or remove weights.")
+    wavelength, pitch = spec.optics.colours[0].wavelengths_m[0], spec.doe.pitch_m
+    most = wavelength / (2 * pitch)  # the direction sine at which a grating of two cells sends light
+    if spots.period_m is not None:
+        cells = spots.period_m / pitch
+        if abs(cells - round(cells)) > 1e-6 or not _FEWEST_CELLS <= round(cells) <= spec.doe.samples:
+            rule = f"must be a whole number of cells of {format_length(pitch)}, from {_FEWEST_CELLS} to doe.samples"
+            cure = f'For example period = "{format_length(max(_FEWEST_CELLS, round(cells)) * pitch)}".'
+            yield InputError("spots.period", rule, format_length(spots.period_m), cure)
+        highest = max((n - 1) // 2 if n % 2 else n - 1 for n in spots.count)
+        least = highest * wavelength / most
+        if highest * wavelength / spots.period_m > most:
+            rule = (
+                f"cells of {format_length(pitch)} steer light to the order {int(spots.period_m / (2 * pitch))} at most"
+            )
+            cure = f"Choose a period of at least {least / UM:.4g} um, or finer cells."
+            yield InputError("spots.period", rule, f"order {highest}", cure)
+        return
+    optics = spec.optics
+    farthest, sine = 0.0, 0.0
+    for y, x in _corners(spots):
+        share = (y / optics.focal_length_m, x / optics.focal_length_m)
+        sines = sines_at(optics.mapping, optics.distortion, *share)
+        if max(map(abs, sines)) > sine:
+            farthest, sine = max(abs(y), abs(x)), max(map(abs, sines))
+    if sine > most:
+        rule = f"cells of {format_length(pitch)} steer light {most * optics.focal_length_m / UM:.4g} um far at most"
+        finer = format_length(wavelength / (2 * sine))
+        cure = f"Bring the spots nearer to the axis, or choose a pitch of at most {finer}."
+        yield InputError("spots", rule, f"a spot {farthest / UM:.4g} um from the axis", cure)
+
+
+def _corners(spots: Any) -> Iterator[tuple[float, float]]:
+    """Places (y, x), metres, that are as far out as any spot is."""
+    across, up = spots.offset_m
+    if spots.arrangement == "list":
+        yield from ((y + up, x + across) for x, y in spots.places_m)
+        return
+    if spots.arrangement == "grid":
+        half_x, half_y = ((n - 1) / 2 * spots.spacing_m for n in spots.count)
+    else:
+        half_x = half_y = spots.radius_m or spots.rings * spots.spacing_m
+    yield from ((up + y, across + x) for y in (-half_y, half_y) for x in (-half_x, half_x))

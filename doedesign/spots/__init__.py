@@ -1,0 +1,9 @@
+"""Spots and diffraction orders: where light should go, the level map that sends it there, and the table of orders.
+
+spots          where spots lie and how much light each should have
+superposition  weighted Gerchberg-Saxton, levels in the loop
+search         phases of the spots, by many starts at once
+exchange       single cells of a small unit cell, changed one by one
+design         spec -> design, step by step
+orders         the table of orders that a DOE makes, and its ceiling
+"""

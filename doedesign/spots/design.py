@@ -1,0 +1,216 @@
+"""From a spec with spots to a design: search, weighted Gerchberg-Saxton with levels, exchange of cells."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from doedesign.build import camera_from_spec, levels_from_spec
+from doedesign.design.design import Design
+from doedesign.spec import Spec
+from doedesign.spec.target import SpotsSpec
+from doedesign.spots.exchange import exchange
+from doedesign.spots.search import search_phases, search_points
+from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
+from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, WaveSet
+from fab.grid import Grid
+from fab.level_map import LevelMap
+from fab.levels import Levels
+from sim.aperture import circle_coverage
+from sim.camera import Camera
+
+# Up to so many levels, phases are searched as the levels have them.
+_FEW_LEVELS = 4
+_TRIED, _TRIAL_STEPS = 4, 30  # candidates of the search, and steps with each before one is chosen
+_MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
+_SWEEPS, _OFFERS = 100, 2**20  # over such a cell: at least, and as many as make so many offers
+_HEATS = (3e-5, 2.5e-4)
+_NARROWEST = 32  # cells of a row at which random starts of an exchange begin
+_ROW_STARTS, _ROW_SWEEPS, _ROW_HEAT, _FINER_HEAT = 200, 1000, 0.05, 1e-4
+
+
+class SpotState(NamedTuple):
+    """Everything a step changes: the plane waves, the best ones so far with their merit, and the steps done."""
+
+    waves: WaveSet
+    best: WaveSet
+    merit: float
+    step: int
+
+    @property
+    def arrays(self) -> list[Float[np.ndarray, "*a"]]:
+        """Arrays that a checkpoint keeps."""
+        return [*self.waves, *self.best, np.array([self.merit])]
+
+    @classmethod
+    def of(cls, arrays: list[np.ndarray], step: int) -> "SpotState":
+        """The state of a checkpoint."""
+        return cls(WaveSet(*arrays[:2]), WaveSet(*arrays[2:4]), float(arrays[4][0]), step)
+
+
+@dataclass(frozen=True, eq=False)
+class SpotTask:
+    """The spots of a spec, and the cells that are free: those of the DOE, or of one unit cell.
+
+    Attributes:
+        spec: the spec.
+        table: its spots.
+        camera: its optics.
+        levels: its staircase.
+        problem: what is designed.
+    """
+
+    spec: Spec
+    table: SpotsSpec
+    camera: Camera
+    levels: Levels
+    problem: SpotProblem
+
+    @classmethod
+    def from_spec(cls, spec: Spec) -> "SpotTask":
+        """Prepare the task of a spec that has spots."""
+        assert spec.spots is not None
+        camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
+        spots = spots_from_spec(spec.spots, camera)
+        rate = camera.waves_per_metre(camera.lines[0].wavelength_m)
+        staircase = Staircase.of(2 * np.pi * rate * levels.heights_m())
+        grid, coverage = camera.grid, circle_coverage(camera.grid, camera.aperture_m)
+        if spec.spots.period_m is not None:
+            grid = unit_cell(spec.spots, camera)
+            coverage = np.ones(grid.shape, np.float32)
+        return cls(spec, spec.spots, camera, levels, SpotProblem.on(grid, coverage, spots, staircase))
+
+    @property
+    def periodic(self) -> bool:
+        """Whether a unit cell is repeated."""
+        return self.table.period_m is not None
+
+    def initial_state(self) -> SpotState:
+        """The most promising of the phases that a search finds, tried with levels on all cells."""
+        problem, table = self.problem, self.table
+        few = problem.staircase if self.levels.count <= _FEW_LEVELS else None
+        points = search_points(problem.spots, self.spec.optimize.seed, problem.extent_m)
+        found = search_phases(
+            problem.spots, points, starts=table.starts, seed=self.spec.optimize.seed, uniformity=table.uniformity,
+            staircase=few, keep=_TRIED,
+        )  # fmt: skip
+        tried = [self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS) for waves in found.waves]
+        return max(tried, key=lambda state: state.merit)._replace(step=0)
+
+    def _after(self, state: SpotState, steps: int) -> SpotState:
+        for _ in range(steps):
+            state, _ = self.step(state)
+        return state
+
+    def step(self, state: SpotState) -> tuple[SpotState, SpotLight]:
+        """One step, and the light before it."""
+        waves, light, _ = self.problem.step(state.waves)
+        merit = light.merit(self.table.uniformity)
+        best = (state.waves, merit) if merit > state.merit else (state.best, state.merit)
+        return SpotState(waves, *best, state.step + 1), light
+
+    def steps(self, state: SpotState) -> Iterator[tuple[SpotState, dict[str, Any]]]:
+        """Do the remaining steps one by one; yields the state, and the line of the history."""
+        names = ["efficiency", "uniformity_error"]
+        while state.step < self.spec.optimize.steps:
+            step = state.step
+            state, light = self.step(state)
+            loss = 1 - light.merit(self.table.uniformity)
+            yield state, {"step": step, "loss": loss, "terms": [float(part) for part in light], "names": names}
+
+    def finished(self, state: SpotState, history: list[dict[str, Any]]) -> Design:
+        """The design of the best plane waves; the cells of a unit cell are exchanged, and it is repeated."""
+        level = self.problem.level(state.best)
+        if self.periodic:
+            level = self._exchanged(level)
+            ny, nx = self.camera.grid.shape
+            level = np.tile(level, (-(-ny // level.shape[0]), -(-nx // level.shape[1])))[:ny, :nx]
+        spec, far_m = self.spec, self.spec.scene.far_m
+        level_map = LevelMap(level, self.levels, self.camera.grid, spec.doe.aperture_m, spec.name)
+        return Design(level_map, self.camera, (), far_m, spec=spec, history=tuple(history))
+
+    def _exchanged(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
+        problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
+        if level.size > _MOST_CELLS:
+            return level
+        # An exchange has another measure of how equal spots are.
+        sweeps = max(_SWEEPS, _OFFERS // level.size)
+        # Merit counts uniformity as often as its weight says, and so does heat.
+        heats = [heat * (1 + uniformity) for heat in _HEATS]
+        found = [level] + [
+            exchange(problem, level, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=heat) for heat in heats
+        ]
+        if 1 in level.shape and self.levels.count <= _FEW_LEVELS:
+            found.append(self._row())
+        lights = [problem.light(one).merit(uniformity) for one in found]
+        return found[int(np.argmax(lights))]
+
+    def _row(self) -> UInt8[np.ndarray, "y x"]:
+        """A row of few levels, from random ones by exchange, first in wide cells and then in narrower ones."""
+        problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
+        finer = [problem]
+        while max(shape := finer[-1].coverage.shape) % 2 == 0 and max(shape) // 2 >= _NARROWEST:
+            finer.append(finer[-1].coarser())
+        finer.reverse()
+        rng, found = np.random.default_rng((seed, 0xD077)), []
+        for start in range(_ROW_STARTS):
+            level = rng.integers(0, self.levels.count, finer[0].coverage.shape).astype(np.uint8)
+            level = exchange(finer[0], level, sweeps=_ROW_SWEEPS, seed=start, uniformity=uniformity, heat=_ROW_HEAT)
+            found.append((finer[0].light(level).merit(uniformity), start, level))
+        found.sort(key=lambda each: (-each[0], each[1]))
+        refined = [self._refined(level, finer[1:]) for _, _, level in found[: _ROW_STARTS // 10]]
+        return max(refined, key=lambda level: problem.light(level).merit(uniformity))
+
+    def _refined(self, level: UInt8[np.ndarray, "y x"], finer: list[SpotProblem]) -> UInt8[np.ndarray, "y x"]:
+        """A row in narrower and narrower cells."""
+        seed, uniformity = self.spec.optimize.seed, self.table.uniformity
+        for one in finer:
+            halves = np.repeat(level, 2, axis=int(np.argmax(level.shape)))
+            level = exchange(one, halves, sweeps=_ROW_SWEEPS // 2, seed=seed, uniformity=uniformity, heat=_FINER_HEAT)
+        return level
+
+
+def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:
+    """Grid of the unit cell of a grid of orders, one cell wide along an axis with one spot."""
+    assert table.count is not None
+    assert table.period_m is not None
+    count = round(table.period_m / camera.grid.pitch_m)
+    ny, nx = (count if spots > 1 else 1 for spots in reversed(table.count))
+    return Grid((ny, nx), camera.grid.pitch_m)
+
+
+def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
+    """Spots of a table, for the first wavelength of a camera."""
+    wavelength = camera.lines[0].wavelength_m
+    shares = shares_of(table.weights, table.spot_count)
+    if table.period_m is not None:
+        assert table.count is not None
+        orders, step = grid_orders(table.count), 1 / table.period_m
+        return Spots(orders * step, shares, orders, (step, step))
+    places, orders = _places_m(table)
+    middle = np.array(table.offset_m[::-1])
+    sines = np.stack(camera.sines_of(*(places + middle).T), axis=1)
+    regular = camera.is_sine and orders is not None and not middle.any()
+    step = float(table.spacing_m or 0) / camera.sensor_distance_m / wavelength
+    if orders is not None and regular and any(n % 2 == 0 for n in table.count or ()):
+        step /= 2  # odd orders of a lattice twice as fine
+    return Spots(sines / wavelength, shares, orders, (step, step)) if regular else Spots(sines / wavelength, shares)
+
+
+def _places_m(table: SpotsSpec) -> tuple[Float[np.ndarray, "m 2"], Any]:
+    """Places (y, x) on the sensor, and orders of a grid."""
+    if table.arrangement == "list":
+        return np.array([place[::-1] for place in table.places_m]), None
+    if table.arrangement == "hexagonal":
+        return hexagonal_places(table.rings or 0, table.spacing_m or 0.0), None
+    if table.arrangement == "ring":
+        return ring_places(table.number or 0, table.radius_m or 0.0), None
+    assert table.count is not None
+    orders = grid_orders(table.count)
+    # Orders of an even count are odd, two apart.
+    apart = np.array([1 if n % 2 else 2 for n in reversed(table.count)])
+    even = any(n % 2 == 0 for n in table.count)
+    lattice = orders * (2 if even else 1) // apart if even else orders
+    return orders / apart * (table.spacing_m or 0.0), lattice

@@ -1,0 +1,109 @@
+"""Exchange of single cells of a small unit cell: what is left to win where few cells make few levels."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from doedesign.spots.superposition import SpotProblem
+
+# (max - min) / (max + min) over the fourth root of the mean fourth power of relative deviations, which is smooth.
+_FLAT = 1.4
+_ANY = 0.1  # share of offers of any other level
+_COLD = 0.3  # share of the sweeps that take improvements alone
+
+
+def exchange(
+    problem: SpotProblem,
+    level: NDArray[np.uint8],
+    *,
+    sweeps: int,
+    seed: int,
+    uniformity: float,
+    heat: float = 2e-3,
+) -> NDArray[np.uint8]:
+    """Change cells of a level map one by one for efficiency less `uniformity` times the uniformity error.
+
+    Simulated annealing (S. Kirkpatrick et al., Science 220, 671, 1983): a change that costs merit is taken with the
+    probability exp(-cost / heat), and heat falls to zero over the first sweeps. A sweep offers every cell the level of
+    a neighbour, which moves a border between levels, or now and then any other. The best map that was met is returned;
+    it is never worse than the one given.
+    """
+    sums, shares = problem.sums, problem.spots.shares
+    waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(len(shares), -1).T.astype(np.complex128)
+    waves = waves / float(np.sum(problem.coverage, dtype=np.float64)) * problem.coverage.reshape(-1, 1)
+    rng = np.random.default_rng((seed, 0xE8C4))
+    own, count = level.reshape(-1).copy(), len(problem.staircase.light)
+    best = own.copy()
+    for sweep in range(sweeps):
+        warm = max(1.0 - sweep / max((1 - _COLD) * sweeps, 1), 0.0)
+        order, chance = rng.permutation(own.size), rng.random(own.size)
+        # A step up or down where there are many levels, or any other level.
+        others = rng.choice([1, count - 1], own.size) if count > 2 else np.ones(own.size, int)
+        others = np.where(rng.random(own.size) < 0.5, others, rng.integers(1, max(count, 2), own.size))
+        others = np.where(rng.random(own.size) < _ANY * (1 if count == 2 else 5), others, 0)
+        sides = rng.integers(0, 4, own.size)
+        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, level.shape, order, chance,
+               others, sides, heat * warm**2, uniformity)  # fmt: skip
+    return best.reshape(level.shape)
+
+
+@njit(cache=True, nogil=True)
+def _merit(light: Any, shares: Any, uniformity: float) -> float:
+    total, over = 0.0, 0.0
+    for k in range(len(light)):
+        power = light[k].real ** 2 + light[k].imag ** 2
+        total += power
+        over += power / shares[k]
+    mean, spread = max(over / len(light), 1e-300), 0.0
+    for k in range(len(light)):
+        off = (light[k].real ** 2 + light[k].imag ** 2) / shares[k] / mean - 1.0
+        spread += off**4
+    return total - uniformity * (spread / len(light)) ** 0.25 * _FLAT
+
+
+@njit(cache=True, nogil=True)
+def _sweep(
+    own: NDArray[np.uint8],
+    best: NDArray[np.uint8],
+    waves: NDArray[np.complex128],
+    light_of: NDArray[np.complex128],
+    shares: NDArray[np.float64],
+    shape: tuple[int, int],
+    order: Any,
+    chance: Any,
+    others: Any,
+    sides: Any,
+    heat: float,
+    uniformity: float,
+) -> None:
+    """Offer every cell another level, in place; `best` is the best map met so far."""
+    light, kept = np.zeros(len(shares), np.complex128), np.zeros(len(shares), np.complex128)
+    for cell in range(len(own)):
+        light += light_of[own[cell]] * waves[cell]
+        kept += light_of[best[cell]] * waves[cell]
+    merit, highest = _merit(light, shares, uniformity), _merit(kept, shares, uniformity)
+    ny, nx = shape
+    for cell, throw, other, side in zip(order, chance, others, sides):  # noqa: B905 - numba knows no strict
+        y, x = cell // nx, cell % nx
+        if side == 0:
+            y = (y + 1) % ny
+        elif side == 1:
+            y = (y - 1) % ny
+        elif side == 2:
+            x = (x + 1) % nx
+        else:
+            x = (x - 1) % nx
+        level = own[y * nx + x]
+        if other:
+            level = np.uint8((own[cell] + other) % len(light_of))
+        if level == own[cell]:
+            continue
+        tried = light + (light_of[level] - light_of[own[cell]]) * waves[cell]
+        found = _merit(tried, shares, uniformity)
+        if found >= merit or (heat > 0 and throw < np.exp((found - merit) / heat)):
+            own[cell], light, merit = level, tried, found
+            if merit > highest:
+                highest = merit
+                best[:] = own

@@ -1,0 +1,220 @@
+"""The table of spots or orders that a DOE makes: the light of each, how equal they are, and what light allows."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from doedesign.spots.spots import Spots
+from doedesign.spots.superposition import spot_light
+from fab.grid import Grid
+from sim.camera import Camera
+from sim.optic import CellOptic
+from sim.propagation.directions import efficiencies
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+_AROUND = 3  # orders beyond the spots among which stray light is looked for
+
+# Efficiency of equal spots by a DOE of any phase: the best that is known, columns by rows.
+_KNOWN = {
+    (2, 1): 0.8106,
+    (3, 1): 0.9256,
+    (4, 1): 0.9192,
+    (5, 1): 0.9212,
+    (6, 1): 0.8927,
+    (7, 1): 0.9684,
+    (9, 1): 0.9928,
+    (2, 2): 0.9186,
+    (3, 3): 0.9397,
+    (5, 5): 0.9514,
+    (7, 7): 0.9429,
+    (9, 9): 0.9425,
+}
+_SOURCE = "best of many searches with any phase; rows as L. A. Romero and F. M. Dickey, J. Opt. Soc. Am. A 24, 2280"
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Largest efficiency that light allows, as far as it is known, and who says so."""
+
+    efficiency: float | None
+    source: str
+
+
+def ceiling_of(count: tuple[int, int] | None, levels: int, *, equal: bool = True) -> Ceiling:
+    """The best known efficiency of a grid of equal spots in any phase, times sinc²(1 / levels) for their levels.
+
+    The second factor is the share that a phase rounded to equal levels keeps (J. W. Goodman, *Introduction to Fourier
+    Optics*); symmetric patterns of two levels are not bound by it.
+    """
+    known = None if count is None or not equal else _KNOWN.get((max(count), min(count)))
+    if known is None or levels == 2:
+        return Ceiling(None, "none known")
+    return Ceiling(known * float(np.sinc(1 / levels)) ** 2, f"{_SOURCE}; times sinc²(1/{levels})")
+
+
+@dataclass(frozen=True, eq=False)
+class OrderTable:
+    """Light of every spot of a DOE.
+
+    Attributes:
+        spots: where they are.
+        efficiency: `[spot]` share of the light on the aperture, Fresnel loss left out.
+        zeroth_order: the same of light that goes straight on.
+        strongest_stray: the same of the strongest order around the spots that should have none; None where spots lie on
+            no lattice.
+        fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
+        places_m: `[spot, (y, x)]` on the sensor.
+        ceiling: what light allows.
+        light: "scalar" or "edges", as the DOE was looked at.
+    """
+
+    spots: Spots
+    efficiency: Float[np.ndarray, " m"]
+    zeroth_order: float
+    strongest_stray: float | None
+    fresnel: float
+    places_m: Float[np.ndarray, "m 2"]
+    ceiling: Ceiling
+    light: str = "scalar"
+
+    @property
+    def total(self) -> float:
+        """Share of the light on all spots."""
+        return float(self.efficiency.sum())
+
+    @property
+    def uniformity_error(self) -> float:
+        """(max - min) / (max + min) of the light over what it should be."""
+        return spot_light(self.efficiency, self.spots.shares).uniformity_error
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the relative deviations from the wanted shares of the total."""
+        return float(np.sqrt(np.mean((self.efficiency / self.spots.shares / self.total - 1) ** 2)))
+
+    @property
+    def signal_to_noise(self) -> float | None:
+        """Mean spot over the strongest stray order."""
+        return None if not self.strongest_stray else self.total / self.spots.count / self.strongest_stray
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers, for metrics."""
+        return {
+            "efficiency": self.total,
+            "uniformity_error": self.uniformity_error,
+            "rmse": self.rmse,
+            "zeroth_order": self.zeroth_order,
+            "strongest_stray": self.strongest_stray,
+            "signal_to_noise": self.signal_to_noise,
+            "ceiling": self.ceiling.efficiency,
+            "ceiling_source": self.ceiling.source,
+            "fresnel_transmission": self.fresnel,
+            "light": self.light,
+            "spots": [float(one) for one in self.efficiency],
+        }
+
+    def describe(self) -> str:
+        """One line."""
+        bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
+        return (
+            f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
+            f"{100 * self.uniformity_error:.2f} %, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
+            f"{100 * (1 - self.fresnel):.1f} % apart"
+        )
+
+    def to_csv(self) -> str:
+        """The table: order or number, place in millimetres, efficiency, and its share over the wanted one."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(["order_x", "order_y", "x_mm", "y_mm", "efficiency", "over_wanted"])
+        orders = self.spots.orders if self.spots.orders is not None else np.full((self.spots.count, 2), -1)
+        over = self.efficiency / self.spots.shares / self.total
+        for order, place, one, share in zip(orders, self.places_m * 1e3, self.efficiency, over, strict=True):
+            names = ["", ""] if self.spots.orders is None else [int(order[1]), int(order[0])]
+            writer.writerow([*names, f"{place[1]:.9g}", f"{place[0]:.9g}", f"{one:.9g}", f"{share:.9g}"])
+        return out.getvalue()
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the light of every spot as bars, and where they lie; on `ax`, or on a new figure."""
+        from doedesign.report.spots import plot_orders
+
+        return plot_orders(self, ax)
+
+
+def order_table(
+    optic: CellOptic,
+    spots: Spots,
+    *,
+    period_m: float | None = None,
+    count: tuple[int, int] | None = None,
+    levels: int = 0,
+    depth_m: float = np.inf,
+) -> OrderTable:
+    """Look at the spots of a DOE: as drawn, as fabricated, with or without the light of its walls.
+
+    Args:
+        optic: the DOE; its first wavelength is looked at.
+        spots: where light should go.
+        period_m: side of a unit cell that is repeated. Only whole periods in a square within the aperture are looked
+            at, as if there were no end of them: behind a round aperture the feet of bright neighbours add to a peak.
+        count: columns and rows of a grid of equal spots, for the ceiling.
+        levels: levels of the DOE, for the ceiling.
+        depth_m: distance of the source.
+    """
+    camera, line = optic.camera, optic.camera.lines[0]
+    field, coverage, grid = np.asarray(optic.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
+    if period_m is not None:
+        field, coverage, grid = _whole_periods(field, coverage, grid, period_m)
+    asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
+    found = efficiencies(field, coverage, grid, np.concatenate(asked))
+    own, zeroth, rest = np.split(found, [spots.count, spots.count + 1])
+    equal = bool(np.ptp(spots.shares) < 1e-9)
+    return OrderTable(
+        spots,
+        own,
+        float(zeroth[0]),
+        float(rest.max()) if len(rest) else None,
+        camera.transmission(line.wavelength_m),
+        _places_m(spots, camera, line.wavelength_m),
+        ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
+        camera.light,
+    )
+
+
+def _whole_periods(
+    field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], grid: Grid, period_m: float
+) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid]:
+    """Field, open share and grid of as many whole periods as fit into the square within the opening, at least one."""
+    period = round(period_m / grid.pitch_m)
+    open_ = np.count_nonzero(coverage[len(coverage) // 2] == 1)
+    side = period * max(1, int(open_ / np.sqrt(2)) // period)
+    first = [(n - side) // 2 for n in grid.shape]
+    block = tuple(slice(at, at + side) for at in first)
+    return field[block], coverage[block], Grid((side, side), grid.pitch_m)
+
+
+def _stray(spots: Spots) -> Float[np.ndarray, "n 2"]:
+    """Directions of the lattice in and around the spots that should stay dark."""
+    if spots.orders is None or spots.lattice_per_m is None:
+        return np.empty((0, 2))
+    axes = [
+        np.arange(orders.min() - _AROUND, orders.max() + _AROUND + 1) if np.ptp(orders) else np.zeros(1, int)
+        for orders in spots.orders.T
+    ]
+    every: Sequence[tuple[int, int]] = [(int(y), int(x)) for y in axes[0] for x in axes[1]]
+    wanted = {(int(y), int(x)) for y, x in spots.orders}
+    dark = [one for one in every if one not in wanted]
+    return np.array(dark, float).reshape(-1, 2) * np.asarray(spots.lattice_per_m)
+
+
+def _places_m(spots: Spots, camera: Camera, wavelength_m: float) -> Float[np.ndarray, "m 2"]:
+    """Places (y, x) of the spots on the sensor."""
+    return np.stack(camera.image_m(*(spots.waves_per_m * wavelength_m).T), axis=1)

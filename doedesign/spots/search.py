@@ -1,0 +1,92 @@
+"""Phases of the spots: a search over many random starts at once, on few points.
+
+How much light a DOE can send into spots depends on the phases that they may have among each other, and on nothing else.
+Where spots lie on a lattice of directions, one period of the DOE says all; elsewhere, a few thousand random points
+stand for the cells. All starts take their steps together, as matrix products.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from doedesign.spots.spots import Spots
+from doedesign.spots.superposition import Staircase, WaveSet, spot_light
+
+_STEPS = 100
+_POINTS_PER_ORDER, _FEWEST, _SCATTERED = 8, 24, 4096
+_BATCH = 2**24  # values of the starts that are looked at together
+
+
+class FoundPhases(NamedTuple):
+    """Plane waves by merit, the best first, and the efficiency of the best with these points."""
+
+    waves: list[WaveSet]
+    efficiency: float
+
+
+def search_points(spots: Spots, seed: int, extent_m: tuple[float, float]) -> Float[np.ndarray, "point 2"]:
+    """Points (y, x), metres: a grid over one period of a lattice, or random ones over the extent of the DOE."""
+    if spots.orders is None or spots.lattice_per_m is None:
+        return (np.random.default_rng(seed).random((_SCATTERED, 2)) - 0.5) * np.asarray(extent_m)
+    axes = []
+    for orders, step in zip(spots.orders.T, spots.lattice_per_m, strict=True):
+        count = max(_FEWEST, _POINTS_PER_ORDER * int(np.ptp(orders))) if np.ptp(orders) else 1
+        axes.append((np.arange(count) + 0.5) / count / step)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def search_phases(
+    spots: Spots,
+    points_m: Float[np.ndarray, "point 2"],
+    *,
+    starts: int,
+    seed: int,
+    uniformity: float,
+    staircase: Staircase | None = None,
+    keep: int = 4,
+) -> FoundPhases:
+    """Search the plane waves whose sum is nearest to a phase alone.
+
+    Args:
+        spots: where light should go.
+        points_m: points (y, x) that stand for the cells, metres.
+        starts: random starts.
+        seed: of these.
+        uniformity: weight of the uniformity error beside the efficiency.
+        staircase: levels that the DOE may have; any phase if there is none.
+        keep: how many to return.
+    """
+    turns = spots.waves_per_m @ points_m.T
+    waves = np.exp(2j * np.pi * (turns - np.rint(turns))).astype(np.complex64)  # [spot, point]
+    rng, found = np.random.default_rng((seed, 0x57A7)), []
+    batch = max(1, min(starts, _BATCH // waves.shape[1]))
+    for first in range(0, starts, batch):
+        count = min(batch, starts - first)
+        sets = WaveSet(np.tile(np.sqrt(spots.shares), (count, 1)), rng.uniform(0, 2 * np.pi, (count, spots.count)))
+        light = _light(sets, waves, staircase)
+        for _ in range(_STEPS):
+            sets = _improved(sets, light, spots.shares)
+            light = _light(sets, waves, staircase)
+        for weights, phases, one in zip(*sets, light, strict=True):
+            result = spot_light(np.abs(one) ** 2, spots.shares)
+            found.append((result.merit(uniformity), result.efficiency, WaveSet(weights, phases)))
+    found.sort(key=lambda each: -each[0])
+    return FoundPhases([each[2] for each in found[:keep]], found[0][1])
+
+
+def _light(
+    sets: WaveSet, waves: Complex[np.ndarray, "m point"], staircase: Staircase | None
+) -> Complex[np.ndarray, "start m"]:
+    field = sets.amplitudes.astype(np.complex64) @ waves
+    if staircase is None:
+        field /= np.maximum(np.abs(field), 1e-12)
+    else:
+        field = staircase.light[staircase.level(field)]
+    return (field @ waves.conj().T).astype(np.complex128) / waves.shape[1]
+
+
+def _improved(sets: WaveSet, light: Complex[np.ndarray, "start m"], shares: Float[np.ndarray, " m"]) -> WaveSet:
+    """`WaveSet.improved` of every start."""
+    every = [WaveSet(*one).improved(seen, shares) for *one, seen in zip(*sets, light, strict=True)]
+    return WaveSet(np.stack([one.weights for one in every]), np.stack([one.phases for one in every]))

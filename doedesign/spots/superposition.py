@@ -1,0 +1,149 @@
+"""Weighted Gerchberg-Saxton for spots, with the levels in the loop.
+
+A DOE that sends light into M directions is the phase of a sum of M plane waves (L. A. Romero and F. M. Dickey, J. Opt.
+Soc. Am. A 24, 2280, 2007): all that is free are their M amplitudes and phases. A step takes the phase of that sum,
+rounds it to the nearest level that the process makes, looks at the light of every spot, takes over the phases that came
+out, and gives more weight to spots that are too dark (R. Di Leonardo et al., Opt. Express 15, 1913, 2007). Because the
+rounded plate is what is looked at, its errors are made up for, too.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, UInt8
+
+from doedesign.spots.spots import Spots
+from fab.grid import Grid
+from sim.propagation.directions import DirectionSum
+
+GAIN = 0.7  # of a weight, per relative error of its spot's amplitude
+
+
+class SpotLight(NamedTuple):
+    """Light of spots: its sum, and how unequal it is.
+
+    Attributes:
+        efficiency: share of the light on all spots.
+        uniformity_error: (max - min) / (max + min) of their light over their shares.
+    """
+
+    efficiency: float
+    uniformity_error: float
+
+    def merit(self, uniformity: float) -> float:
+        """Efficiency less `uniformity` times the uniformity error."""
+        return self.efficiency - uniformity * self.uniformity_error
+
+
+def spot_light(efficiencies: Float[np.ndarray, " m"], shares: Float[np.ndarray, " m"]) -> SpotLight:
+    """Sum and uniformity error of the light of spots that should have these shares."""
+    over = efficiencies / shares
+    return SpotLight(float(efficiencies.sum()), float((over.max() - over.min()) / max(over.max() + over.min(), 1e-300)))
+
+
+class WaveSet(NamedTuple):
+    """Plane waves whose sum has the phase of a DOE: weights and phases (radians) of their amplitudes `[..., spot]`."""
+
+    weights: Float[np.ndarray, "*start m"]
+    phases: Float[np.ndarray, "*start m"]
+
+    @property
+    def amplitudes(self) -> Complex[np.ndarray, "*start m"]:
+        """Complex amplitudes."""
+        return self.weights * np.exp(1j * self.phases)
+
+    def improved(
+        self, light: Complex[np.ndarray, " m"], shares: Float[np.ndarray, " m"], gain: float = GAIN
+    ) -> "WaveSet":
+        """The next ones, after a look at the amplitudes that came out."""
+        size = np.maximum(np.abs(light), 1e-9 * np.abs(light).max())
+        weights = self.weights * (np.sqrt(shares * np.sum(size**2)) / size) ** gain
+        return WaveSet(weights / np.linalg.norm(weights), np.angle(light))
+
+
+class Staircase(NamedTuple):
+    """Levels as light sees them: `light[level]`, and the levels in the order of their phases around the circle.
+
+    Attributes:
+        light: `[level]` transmission.
+        edges: `[level]` phases, radians from 0 to 2 pi, where the nearest level changes.
+        nearest: `[level + 1]` the nearest level before the first edge, between edges, and behind the last.
+    """
+
+    light: Complex[np.ndarray, " level"]
+    edges: Float[np.ndarray, " level"]
+    nearest: UInt8[np.ndarray, " level_1"]
+
+    @classmethod
+    def of(cls, phases: Float[np.ndarray, " level"]) -> "Staircase":
+        """Levels of these phases, radians."""
+        wrapped = np.mod(phases, 2 * np.pi)
+        order = np.argsort(wrapped, kind="stable")
+        places = wrapped[order]
+        after = np.append(places[1:], places[0] + 2 * np.pi)
+        edges = (places + after) / 2
+        nearest = np.append(order, order[0])
+        if edges[-1] >= 2 * np.pi:  # the last level reaches over the turn
+            edges, nearest = np.append(edges[-1] - 2 * np.pi, edges[:-1]), np.append(order[-1], order)
+        return cls(np.exp(1j * phases).astype(np.complex64), edges, nearest.astype(np.uint8))
+
+    def level(self, field: Complex[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
+        """The level nearest to the phase of a field."""
+        phase = np.angle(field)
+        phase = np.where(phase < 0, phase + np.float32(2 * np.pi), phase)
+        return self.nearest[np.searchsorted(self.edges, phase, side="right")]
+
+
+@dataclass(frozen=True, eq=False)
+class SpotProblem:
+    """A DOE to be designed for spots.
+
+    Attributes:
+        spots: where light should go.
+        staircase: its levels.
+        coverage: `[y, x]` open share of every cell.
+        sums: the sum over its cells, for the spots' directions.
+        grid: its cells.
+    """
+
+    spots: Spots
+    staircase: Staircase
+    coverage: Float[np.ndarray, "y x"]
+    sums: DirectionSum
+    grid: Grid
+
+    @classmethod
+    def on(cls, grid: Grid, coverage: Float[np.ndarray, "y x"], spots: Spots, staircase: Staircase) -> "SpotProblem":
+        """The problem on the cells of a grid."""
+        return cls(spots, staircase, coverage, DirectionSum(grid, spots.waves_per_m), grid)
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Height and width of the cells together, metres."""
+        return self.grid.extent_m
+
+    def coarser(self) -> "SpotProblem":
+        """The same with cells twice as wide along every axis that has several."""
+        ny, nx = (n // 2 if n > 1 else 1 for n in self.grid.shape)
+        grid = Grid((ny, nx), 2 * self.grid.pitch_m)
+        return SpotProblem.on(grid, np.ones(grid.shape, np.float32), self.spots, self.staircase)
+
+    def light(self, level: UInt8[np.ndarray, "y x"]) -> SpotLight:
+        """Sum and uniformity error of the spots' light."""
+        return spot_light(np.abs(self.amplitudes(level)) ** 2, self.spots.shares)
+
+    def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
+        """Level map of a sum of plane waves."""
+        return self.staircase.level(self.sums.superposition(waves.amplitudes))
+
+    def amplitudes(self, level: UInt8[np.ndarray, "y x"]) -> Complex[np.ndarray, " m"]:
+        """Amplitude of every spot, its square an efficiency."""
+        field = self.coverage * self.staircase.light[level]
+        return self.sums.amplitudes(field) / float(np.sum(self.coverage, dtype=np.float64))
+
+    def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight, UInt8[np.ndarray, "y x"]]:
+        """The next plane waves, and light and level map of these."""
+        level = self.level(waves)
+        light = self.amplitudes(level)
+        return waves.improved(light, self.spots.shares), spot_light(np.abs(light) ** 2, self.spots.shares), level

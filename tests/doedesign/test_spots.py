@@ -1,0 +1,224 @@
+"""Spots and orders: sums over cells in closed form, the search against known ceilings, and a judge of its own."""
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from doedesign.spots.exchange import exchange
+from doedesign.spots.orders import ceiling_of, order_table
+from doedesign.spots.search import search_phases, search_points
+from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
+from doedesign.spots.superposition import SpotProblem, Staircase, WaveSet, spot_light
+from fab.grid import Grid
+from sim.camera import Camera, Colour
+from sim.optic import HeightOptic
+from sim.propagation.directions import DirectionSum, efficiencies
+
+PITCH_M, GREEN_M = 2e-6, 532e-9
+
+
+def orders_of(count: tuple[int, int], cells: int) -> Spots:
+    """Orders of a unit cell of so many cells."""
+    orders, step = grid_orders(count), 1 / (cells * PITCH_M)
+    return Spots(orders * step, shares_of((), len(orders)), orders, (step, step))
+
+
+def even(count: int) -> Staircase:
+    """Levels in equal parts of a turn."""
+    return Staircase.of(2 * np.pi * np.arange(count) / count)
+
+
+def problem(count: tuple[int, int], cells: int, levels: int) -> SpotProblem:
+    shape = (cells if count[1] > 1 else 1, cells if count[0] > 1 else 1)
+    return SpotProblem.on(Grid(shape, PITCH_M), np.ones(shape, np.float32), orders_of(count, cells), even(levels))
+
+
+# --- sums over cells --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("levels", "percent"), [(2, 40.5), (4, 81.1), (8, 95.0), (16, 98.7)])
+def test_a_blazed_grating_has_its_efficiency_in_the_first_order(levels: int, percent: float):
+    """sinc²(1/L), where a level is as wide as a cell: the cell's sinc is then all that the levels cost."""
+    field = np.tile(even(levels).light, (1, 8))
+    step = 1 / (levels * PITCH_M)
+    found = efficiencies(field, np.ones(field.shape), Grid(field.shape, PITCH_M), step * np.array([[0, 1], [0, 0]]))
+    assert found[0] == pytest.approx(np.sinc(1 / levels) ** 2, abs=1e-6)  # single precision
+    assert 100 * found[0] == pytest.approx(percent, abs=0.06)
+    assert found[1] == pytest.approx(0, abs=1e-10)
+
+
+def test_directions_have_the_projects_signs():
+    """Glass that thickens toward +y sends light to +y."""
+    wedge = np.exp(2j * np.pi * np.arange(16) / 4)[:, None] * np.ones((16, 16))
+    up = 1 / (4 * PITCH_M)
+    found = efficiencies(wedge, np.ones((16, 16)), Grid((16, 16), PITCH_M), np.array([[up, 0], [-up, 0], [0, up]]))
+    assert found[0] == pytest.approx(np.sinc(0.25) ** 2, abs=1e-5)
+    assert found[1:] == pytest.approx(0, abs=1e-9)
+
+
+def test_superposition_is_the_adjoint_of_the_sum():
+    rng, grid = np.random.default_rng(1), Grid((12, 20), PITCH_M)
+    sums = DirectionSum(grid, rng.normal(0, 5e4, (7, 2)))
+    field = rng.normal(size=(12, 20)) + 1j * rng.normal(size=(12, 20))
+    waves = rng.normal(size=7) + 1j * rng.normal(size=7)
+    assert np.vdot(waves, sums.amplitudes(field)) == pytest.approx(np.vdot(sums.superposition(waves), field), rel=1e-5)
+
+
+@pytest.mark.parametrize("phases", [[0.0, 1.5, 3.1, 4.4], [5.0, 0.2, 2.9], [7.0, -1.0], [0.0]])
+def test_every_phase_gets_the_nearest_level(phases: list[float]):
+    field = np.exp(1j * np.linspace(-9, 9, 801))
+    staircase = Staircase.of(np.array(phases))
+    away = np.abs(field[:, None] - staircase.light[None, :])
+    chosen = away[np.arange(801), staircase.level(field)]
+    np.testing.assert_allclose(chosen, away.min(axis=1), atol=1e-6)
+
+
+# --- where spots lie --------------------------------------------------------------------------------------------------
+
+
+def test_orders_of_odd_and_even_counts():
+    np.testing.assert_array_equal(grid_orders((3, 1)), [[0, -1], [0, 0], [0, 1]])
+    np.testing.assert_array_equal(grid_orders((2, 2)), [[-1, -1], [-1, 1], [1, -1], [1, 1]])
+
+
+def test_hexagons_and_rings():
+    places = hexagonal_places(2, 3.0)
+    assert len(places) == 19
+    between = np.hypot(*(places[:, None] - places[None]).T)
+    assert np.sort(between[between > 0])[0] == pytest.approx(3.0)
+    assert sum(np.isclose(between, 3.0).sum(axis=0) == 6) == 7  # all but the outer ring has six neighbours
+    ring = ring_places(5, 2.0)
+    assert np.hypot(*ring.T) == pytest.approx(2.0)
+    assert ring[0] == pytest.approx([0.0, 2.0])
+
+
+# --- the search -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("count", "known"),
+    # Romero and Dickey's optima of any phase; 8 / pi² for two beams.
+    [((2, 1), 8 / np.pi**2), ((3, 1), 0.9256), ((5, 1), 0.9212), ((7, 1), 0.9684)],
+)
+def test_the_search_finds_the_known_optimum(count: tuple[int, int], known: float):
+    spots = orders_of(count, 64)
+    points = search_points(spots, 0, (1.0, 1.0))
+    found = search_phases(spots, points, starts=40, seed=0, uniformity=1.0)
+    # Some two dozen points stand for a period: 0.6 % for two beams, whose phase jumps.
+    assert found.efficiency == pytest.approx(known, abs=6e-3)
+
+
+def test_a_step_evens_out_what_levels_spoil():
+    """Four levels of 5 x 5 orders: beams that begin off by 33 % end off by 3.3 %, with as much light."""
+    task = problem((5, 5), 40, 4)
+    spots = task.spots
+    waves = search_phases(spots, search_points(spots, 0, (1, 1)), starts=20, seed=0, uniformity=1.0).waves[0]
+    lights = []
+    for _ in range(40):
+        waves, light, _ = task.step(waves)
+        lights.append(light)
+    best = max(lights, key=lambda light: light.merit(1.0))
+    assert best.uniformity_error < lights[0].uniformity_error / 7
+    assert best.efficiency > lights[0].efficiency
+
+
+def test_exchange_finds_dammanns_grating_and_never_spoils():
+    """Three equal beams of two levels: 66.4 % (H. Dammann and E. Klotz, Optica Acta 24, 505, 1977)."""
+    task = problem((3, 1), 64, 2)
+
+    def start(seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).integers(0, 2, (1, 64)).astype(np.uint8)
+
+    found = [exchange(task, start(k), sweeps=1000, seed=k, uniformity=0.5, heat=0.05) for k in range(10)]
+    lights = [task.light(level) for level in found]
+    best = max(lights, key=lambda light: light.merit(0.5))
+    assert best.efficiency == pytest.approx(0.664, abs=0.01)  # edges lie on 64 places
+    assert best.uniformity_error < 0.03
+    np.testing.assert_array_equal(exchange(task, start(3), sweeps=1000, seed=3, uniformity=0.5, heat=0.05), found[3])
+    for level, light in zip(found[:3], lights, strict=False):
+        again = exchange(task, level, sweeps=20, seed=9, uniformity=0.0, heat=0.05)
+        assert task.light(again).efficiency >= light.efficiency * (1 - 1e-6)
+
+
+def test_weights_are_obeyed():
+    spots = Spots(orders_of((3, 1), 64).waves_per_m, shares_of((1, 2, 1), 3))
+    task = SpotProblem.on(Grid((1, 64), PITCH_M), np.ones((1, 64), np.float32), spots, even(64))
+    waves = WaveSet(np.sqrt(spots.shares), np.array([0.0, np.pi / 2, 0.0]))
+    for _ in range(60):
+        waves, _, _ = task.step(waves)
+    found = np.abs(task.amplitudes(task.level(waves))) ** 2
+    assert found / found.sum() == pytest.approx(spots.shares, abs=0.01)  # 64 cells of 64 levels
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def camera(cells: int) -> Camera:
+    colour = Colour("green", (GREEN_M,), (1.0,))
+    grid = Grid((cells, cells), PITCH_M)
+    return Camera(grid, cells * PITCH_M, "fused_silica", (colour,), 20e-3, 3.45e-6, 64)
+
+
+def judged(height_m: np.ndarray, optics: Camera, orders: np.ndarray, period: int) -> np.ndarray:
+    """Orders by a transform of a raster of 8 x 8 samples per cell, in double precision: another way than the table's.
+
+    The samples' own sinc is put in by hand.
+    """
+    rate, fine = optics.waves_per_metre(GREEN_M), 8
+    cell = np.kron(np.exp(2j * np.pi * rate * height_m[:period, :period]), np.ones((fine, fine)))
+    waves = np.fft.fft2(cell, norm="forward")
+    y, x = orders.T
+    sinc = np.sinc(y / (period * fine)) * np.sinc(x / (period * fine))
+    return np.abs(waves[y, x] * sinc) ** 2
+
+
+def test_the_table_of_a_repeated_cell_is_that_of_a_transform():
+    period, count = 16, (5, 3)
+    height = np.tile(np.random.default_rng(3).uniform(0, 1.2e-6, (period, period)), (5, 5))
+    optics = camera(5 * period)
+    spots = orders_of(count, period)
+    table = order_table(HeightOptic.of(optics, height), spots, period_m=period * PITCH_M, levels=8, count=count)
+    assert spots.orders is not None
+    wanted = judged(height, optics, spots.orders, period)
+    np.testing.assert_allclose(table.efficiency, wanted, rtol=1e-4)  # single precision of heights and sums
+    assert table.zeroth_order == pytest.approx(judged(height, optics, np.array([[0, 0]]), period)[0], rel=1e-4)
+    every = [(y, x) for y in range(-4, 5) for x in range(-5, 6) if abs(y) > 1 or abs(x) > 2]
+    assert table.strongest_stray == pytest.approx(judged(height, optics, np.array(every), period).max(), rel=1e-4)
+    assert table.total == pytest.approx(wanted.sum(), rel=1e-4)
+    assert table.uniformity_error == pytest.approx(spot_light(wanted, spots.shares).uniformity_error, rel=1e-3)
+    assert table.rmse == pytest.approx(np.std(wanted) / np.mean(wanted), rel=1e-3)
+    assert table.signal_to_noise == pytest.approx(wanted.mean() / (table.strongest_stray or 1), rel=1e-3)
+    assert table.fresnel == pytest.approx(optics.transmission(GREEN_M))
+
+
+def test_places_and_text_of_a_table():
+    spots = orders_of((3, 1), 16)
+    table = order_table(HeightOptic.of(camera(64)), spots, period_m=16 * PITCH_M, levels=2, count=(3, 1))
+    # A flat plate sends all light straight on.
+    assert table.efficiency == pytest.approx([0, 1, 0], abs=1e-6)
+    assert table.places_m[:, 1] == pytest.approx(np.array([-1, 0, 1]) * GREEN_M * 20e-3 / (16 * PITCH_M))
+    lines = table.to_csv().splitlines()
+    assert lines[0] == "order_x,order_y,x_mm,y_mm,efficiency,over_wanted"
+    assert lines[2].startswith("0,0,0,0,1")
+    assert "none known" in table.describe()
+
+
+def test_ceilings_name_their_source():
+    assert ceiling_of((7, 1), 16).efficiency == pytest.approx(0.9684 * np.sinc(1 / 16) ** 2)
+    assert "Romero" in ceiling_of((1, 7), 16).source
+    for other in (
+        ceiling_of((8, 3), 16),
+        ceiling_of(None, 16),
+        ceiling_of((7, 1), 2),
+        ceiling_of((7, 1), 8, equal=False),
+    ):
+        assert (other.efficiency, other.source) == (None, "none known")
+
+
+def test_a_picture_of_a_table():
+    table = order_table(
+        HeightOptic.of(camera(64)), orders_of((3, 3), 16), period_m=16 * PITCH_M, levels=8, count=(3, 3)
+    )
+    bars = cast(Any, table.plot()).axes[0].containers[0]
+    assert [bar.get_height() for bar in bars] == pytest.approx(100 * table.efficiency, abs=1e-4)

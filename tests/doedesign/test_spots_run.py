@@ -1,0 +1,193 @@
+"""Specs with spots: from the file to a run that can be stopped, its table, and a mask order."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import doedesign.optimization as optimization
+from doedesign.lab.order import write_masks
+from doedesign.optimization import optimize
+from doedesign.spec import Spec, load_spec, spec_to_toml
+from doedesign.spots.design import SpotTask, spots_from_spec
+from fab.errors import InputError
+from fab.order.verify import verify
+from tests.pictures import leave_out_pictures
+
+SPEC = """
+name = "fan"
+
+[optics]
+focal_length = "20 mm"
+wavelengths = ["532 nm"]
+design_wavelength = "532 nm"
+
+[doe]
+samples = 96
+pitch = "2 um"
+aperture = "192 um"
+material = "fused_silica"
+
+[process]
+levels = 8
+level_step = "144 nm"
+
+[scene]
+far = ["inf"]
+
+[sensor]
+pitch = "3.45 um"
+resolution = [1440, 1080]
+window = 64
+
+[spots]
+count = [3, 3]
+period = "48 um"
+starts = 8
+
+[optimize]
+steps = 12
+checkpoint_every = 5
+"""
+
+
+def spec_of(tmp_path: Path, *overrides: str) -> Spec:
+    path = tmp_path / "fan.toml"
+    path.write_text(SPEC)
+    return load_spec(path, overrides)
+
+
+LIST = ["spots.arrangement=list", 'spots.places=[["0.1 mm", "-0.2 mm"], ["0.3 mm", "0 mm"]]']
+
+
+@pytest.fixture
+def free(tmp_path: Path) -> Path:
+    """The same spec without a unit cell."""
+    path = tmp_path / "free.toml"
+    path.write_text(SPEC.replace('period = "48 um"', 'spacing = "120 um"'))
+    return path
+
+
+def test_a_design_of_orders_repeats_its_cell(tmp_path: Path):
+    design = optimize(spec_of(tmp_path))
+    level = design.level_map.level
+    inner = level[24:72, 24:72]
+    np.testing.assert_array_equal(inner[:24, :24], inner[24:, 24:])
+    assert len(design.history) == 12
+    assert design.history[-1]["names"] == ["efficiency", "uniformity_error"]
+    # Of 0.940 x 0.950: nine beams of 24 cells.
+    assert design.history[-1]["terms"][0] > 0.85
+
+
+def test_a_run_holds_its_table_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    leave_out_pictures(monkeypatch)
+    spec = spec_of(tmp_path)
+    whole = tmp_path / "whole"
+    optimize(spec, whole)
+    metrics = json.loads((whole / "metrics.json").read_text())["orders"]
+    assert metrics["efficiency"] > 0.85
+    assert metrics["efficiency"] == pytest.approx(sum(metrics["spots"]))
+    assert metrics["efficiency"] < metrics["ceiling"]
+    assert metrics["uniformity_error"] < 0.03
+    assert (whole / "orders.csv").read_text().count("\n") == 10
+
+    saved = optimization.save_checkpoint
+
+    def stop(run, arrays, step, history):
+        saved(run, arrays, step, history)
+        if step == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimization, "save_checkpoint", stop)
+    with pytest.raises(KeyboardInterrupt):
+        optimize(spec, tmp_path / "stopped")
+    monkeypatch.setattr(optimization, "save_checkpoint", saved)
+    optimize(spec, tmp_path / "stopped")
+    for name in ("level_map.npz", "history.jsonl", "orders.csv", "metrics.json"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_masks_of_a_run_are_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    leave_out_pictures(monkeypatch)
+    optimize(spec_of(tmp_path), tmp_path / "run")
+    done = write_masks(tmp_path / "run", tmp_path / "order")
+    assert done.report.passed
+    assert verify(tmp_path / "order").passed
+
+
+def test_free_spots_are_where_they_should_be(free: Path):
+    """Behind an aperture of 96 cells peaks are 90 um wide; the table knows no pixels, so they count apart."""
+    spec = load_spec(free, ["doe.samples=192", "doe.aperture=0.384 mm", "optimize.steps=30"])
+    design = optimize(spec)
+    assert spec.spots is not None
+    from doedesign.spots.orders import order_table
+
+    table = order_table(design.as_optic(), spots_from_spec(spec.spots, design.camera))
+    assert table.total > 0.8
+    assert table.uniformity_error < 0.02
+    assert sorted(set(np.round(table.places_m[:, 0] * 1e6, 6))) == [-120, 0, 120]
+
+
+def test_offset_hexagon_ring_and_list(free: Path):
+    def places(*overrides: str) -> np.ndarray:
+        text = free.read_text().replace("count = [3, 3]\n", "").replace('spacing = "120 um"\n', "")
+        path = free.with_name("other.toml")
+        path.write_text(text)
+        spec = load_spec(path, ["doe.samples=256", "doe.aperture=0.512 mm", *overrides])
+        task = SpotTask.from_spec(spec)
+        sines = task.problem.spots.waves_per_m * 532e-9
+        return np.stack(task.camera.image_m(*sines.T), axis=1) * 1e3
+
+    np.testing.assert_allclose(places(*LIST), [[-0.2, 0.1], [0, 0.3]], atol=1e-9)
+    moved = places("spots.count=[1,2]", "spots.spacing=0.2 mm", 'spots.offset=["0.1 mm", "0.3 mm"]')
+    np.testing.assert_allclose(moved, [[0.2, 0.1], [0.4, 0.1]], atol=1e-9)
+    assert len(places("spots.arrangement=hexagonal", "spots.rings=1", "spots.spacing=0.2 mm")) == 7
+    ring = places("spots.arrangement=ring", "spots.number=4", "spots.radius=0.3 mm")
+    np.testing.assert_allclose(ring, [[0, 0.3], [0.3, 0], [0, -0.3], [-0.3, 0]], atol=1e-9)
+
+
+def test_a_lattice_of_even_counts_is_twice_as_fine(free: Path):
+    spec = load_spec(free, ["spots.count=[2, 3]"])
+    assert spec.spots is not None
+    task = SpotTask.from_spec(spec)
+    spots = task.problem.spots
+    assert spots.orders is not None
+    np.testing.assert_allclose(spots.orders * np.array(spots.lattice_per_m), spots.waves_per_m, rtol=1e-12)
+
+
+def test_the_table_of_spots_is_written_as_it_was_read(tmp_path: Path):
+    spec = spec_of(tmp_path)
+    path = tmp_path / "again.toml"
+    path.write_text(spec_to_toml(spec))
+    assert load_spec(path) == spec
+
+
+@pytest.mark.parametrize(
+    ("overrides", "where", "rule"),
+    [
+        (["spots.period=0.5 um"], "spots.period", "must be a whole number of cells"),
+        (["spots.period=47 um"], "spots.period", "must be a whole number of cells"),
+        (["spots.count=[30, 1]"], "spots.period", "steer light to the order 12 at most"),
+        (["spots.count=[1, 1]"], "spots.count", "2 to 10000 spots"),
+        (["spots.weights=[1.0, 2.0]"], "spots.weights", "one per spot, 9"),
+        (["spots.arrangement=ring"], "spots.number", 'arrangement "ring" needs it'),
+        (["spots.rings=2"], "spots.rings", 'arrangement "grid" takes: count, period'),
+        (['spots.offset=["1 um", "0 um"]'], "spots.offset", "cannot be moved"),
+        (['scene.far=["5 m"]'], "scene.far", "collimated beam"),
+        (["sensor.defocus=1 mm"], "sensor.defocus", "focal plane"),
+        (["optimize.start=random"], "optimize.start", "starts and levels of their own"),
+        (['objective=[{name = "far_spot"}]'], "spots", "takes the place of objectives"),
+        (["process.etch_depths=optimize"], "process.etch_depths", "known depths"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, overrides: list[str], where: str, rule: str):
+    with pytest.raises(InputError) as refused:
+        spec_of(tmp_path, *overrides)
+    assert where in str(refused.value)
+    assert rule in str(refused.value)
+
+
+def test_spots_beyond_what_cells_steer_are_told_the_pitch_that_would_do(free: Path):
+    with pytest.raises(InputError, match=r"steer light 2660 um far at most.*choose a pitch of at most 0\.\d+ um|pitch"):
+        load_spec(free, ["spots.spacing=4 mm"])
