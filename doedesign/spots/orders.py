@@ -26,16 +26,19 @@ _AROUND = 3  # orders beyond the spots among which stray light is looked for
 _KNOWN = {
     (2, 1): 0.8106,
     (3, 1): 0.9256,
-    (4, 1): 0.9192,
     (5, 1): 0.9212,
-    (6, 1): 0.8927,
+    (6, 1): 0.8908,
     (7, 1): 0.9684,
+    (8, 1): 0.9597,
     (9, 1): 0.9928,
-    (2, 2): 0.9186,
-    (3, 3): 0.9397,
-    (5, 5): 0.9514,
-    (7, 7): 0.9429,
-    (9, 9): 0.9425,
+    (2, 2): 0.9179,
+    (3, 3): 0.9394,
+    (4, 4): 0.9546,
+    (5, 5): 0.9510,
+    (6, 6): 0.9432,
+    (7, 7): 0.9400,
+    (8, 8): 0.9389,
+    (9, 9): 0.9415,
 }
 _SOURCE = "best of many searches with any phase; rows as L. A. Romero and F. M. Dickey, J. Opt. Soc. Am. A 24, 2280"
 
@@ -51,8 +54,9 @@ class Ceiling:
 def ceiling_of(count: tuple[int, int] | None, levels: int, *, equal: bool = True) -> Ceiling:
     """The best known efficiency of a grid of equal spots in any phase, times sinc²(1 / levels) for their levels.
 
-    The second factor is the share that a phase rounded to equal levels keeps (J. W. Goodman, *Introduction to Fourier
-    Optics*); symmetric patterns of two levels are not bound by it.
+    The second factor is the share that phases of all values keep when they are rounded to equal levels (J. W. Goodman,
+    *Introduction to Fourier Optics*). Patterns that keep to few phases lose less, and those of two levels are not bound
+    by it at all.
     """
     known = None if count is None or not equal else _KNOWN.get((max(count), min(count)))
     if known is None or levels == 2:
