@@ -29,6 +29,9 @@ from .runs.level_maps import open_design as open_design
 from .runs.psfs import psfs as psfs
 from .spec import Spec as Spec
 from .spec import load_spec as load_spec
+from .spots.orders import OrderTable as OrderTable
+from .spots.orders import order_table as order_table
+from .spots.spots import Spots as Spots
 from .tolerancing.results import ToleranceResult as ToleranceResult
 from .tolerancing.results import tolerance as tolerance
 from .tolerancing.studies import study as study

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -46,16 +46,13 @@ from fab.units import NM
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.metrics import without_infinities
-from sim.optic import CellOptic, HeightOptic
+from sim.optic import HeightOptic
 from sim.plots.curves import plot_encircled, plot_mtf
 from sim.plots.pattern import plot_pattern
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
-
-if TYPE_CHECKING:
-    from doedesign.spots.orders import OrderTable
 
 log = logging.getLogger("doedesign")
 
@@ -218,15 +215,6 @@ def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
     }
 
 
-def _order_table(spec: Spec, drawn: CellOptic, design: Design) -> "OrderTable":
-    from doedesign.spots.design import spots_from_spec
-    from doedesign.spots.orders import order_table
-
-    assert spec.spots is not None
-    spots, table = spots_from_spec(spec.spots, design.camera), spec.spots
-    return order_table(drawn, spots, period_m=table.period_m, count=table.count, levels=design.levels.count)
-
-
 def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[str]:
     spec, camera, height = run.spec, design.camera, design.nominal_height_m
     near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.optics.propagation
@@ -249,7 +237,9 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
         remark = in_words(budget, camera)
         log.info(remark)
     if spec.spots is not None:
-        table = _order_table(spec, drawn, design)
+        from doedesign.spots.design import orders_of_design
+
+        table = orders_of_design(design, drawn)
         metrics["orders"] = table.summary()
         log.info(table.describe())
         write_atomic(run.path("orders.csv"), table.to_csv().encode())

@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,17 @@ from fab.process import Process, Variation
 from sim.metrics import without_infinities
 from sim.plots.leakage import plot_split
 from sim.plots.psfs import plot_psfs
+from sim.propagation.farfield import TOLERANCE
 from sim.psf_bank import PsfBank, psf
 from sim.store import write_bank
-from sim.surface import as_fabricated
+from sim.surface import FabricatedDoe, as_fabricated
 from sim.surface.leakage import SplitPsf, split_psf
 
-# Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand.
-_MOST_EXCESS = 1e-3
+if TYPE_CHECKING:
+    from doedesign.spots.orders import OrderTable
+
+# Interference beyond what two fields can do is the transform's own error: of sharp spots more than of speckle.
+_MOST_EXCESS = 2 * TOLERANCE
 
 log = logging.getLogger("doedesign")
 
@@ -41,6 +45,7 @@ class FabricatedPsfs(NamedTuple):
         rows: metrics of both, "nominal" and "fabricated", a row per depth and colour (`doedesign.prediction`); those of
             the DOE with "split", the energy in the window by origin, whose three parts sum to the throughput.
         variation: errors of the DOE.
+        orders: tables of both where the spec has spots, under the same names as the rows; empty otherwise.
     """
 
     bank: PsfBank
@@ -48,6 +53,7 @@ class FabricatedPsfs(NamedTuple):
     splits: dict[tuple[int, int], SplitPsf]
     rows: dict[str, list[dict[str, Any]]]
     variation: Variation
+    orders: "dict[str, OrderTable]"
 
 
 def fabricated(
@@ -111,7 +117,17 @@ def _computed(design: Design, process: Process, errors: Variation) -> Fabricated
         split = splits[bank.colours.index(row["colour"]), d]
         parts = {"leaked": split.leaked, "diffracted": split.diffracted, "interference": split.interference}
         row["split"] = {name: float(part.sum(dtype=np.float64)) for name, part in parts.items()}
-    return FabricatedPsfs(bank, nominal, splits, rows, errors)
+    return FabricatedPsfs(
+        bank, nominal, splits, rows, errors, _orders(design, {"nominal": drawn, "fabricated": surface})
+    )
+
+
+def _orders(design: Design, does: dict[str, FabricatedDoe]) -> "dict[str, OrderTable]":
+    if design.spec is None or design.spec.spots is None:
+        return {}
+    from doedesign.spots.design import orders_of_design
+
+    return {name: orders_of_design(design, doe) for name, doe in does.items()}
 
 
 def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> None:
@@ -119,7 +135,14 @@ def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> N
         folder / "fabricated.exr", found.bank, {"design": design.name, "plate": words, "lens": design.camera.lens_text}
     )
     (folder / "variation.toml").write_text(variation_to_toml(found.variation, [words]), encoding="utf-8")
-    (folder / "metrics.json").write_bytes(canonical_json({**found.rows, "lens": design.camera.lens_text}))
+    metrics: dict[str, Any] = {**found.rows, "lens": design.camera.lens_text}
+    if found.orders:
+        metrics["orders"] = {name: table.summary() for name, table in found.orders.items()}
+        made = found.orders["fabricated"]
+        log.info(made.describe())
+        (folder / "orders.csv").write_text(made.to_csv(), encoding="utf-8")
+        save(made.plot(), folder / "orders.png")
+    (folder / "metrics.json").write_bytes(canonical_json(metrics))
     save(plot_psfs(found.bank, design.camera, design.near_m, design.far_m), folder / "fabricated_psf.png")
     orders = [
         tuple(

@@ -12,6 +12,7 @@ from doedesign.design.design import Design
 from doedesign.spec import Spec
 from doedesign.spec.target import SpotsSpec
 from doedesign.spots.exchange import exchange
+from doedesign.spots.orders import OrderTable, order_table
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
 from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, WaveSet
@@ -20,6 +21,7 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from sim.aperture import circle_coverage
 from sim.camera import Camera
+from sim.optic import CellOptic
 
 # Up to so many levels, phases are searched as the levels have them.
 _FEW_LEVELS = 4
@@ -170,6 +172,15 @@ class SpotTask:
             halves = np.repeat(level, 2, axis=int(np.argmax(level.shape)))
             level = exchange(one, halves, sweeps=_ROW_SWEEPS // 2, seed=seed, uniformity=uniformity, heat=_FINER_HEAT)
         return level
+
+
+def orders_of_design(design: Design, doe: CellOptic) -> OrderTable:
+    """Table of the spots of a design's spec, of the design as drawn or as fabricated."""
+    assert design.spec is not None
+    table = design.spec.spots
+    assert table is not None
+    spots = spots_from_spec(table, design.camera)
+    return order_table(doe, spots, period_m=table.period_m, count=table.count, levels=design.levels.count)
 
 
 def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:

@@ -198,7 +198,7 @@ def _whole_periods(
 ) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid]:
     """Field, open share and grid of as many whole periods as fit into the square within the opening, at least one."""
     period = round(period_m / grid.pitch_m)
-    open_ = np.count_nonzero(coverage[len(coverage) // 2] == 1)
+    open_ = np.count_nonzero(coverage[len(coverage) // 2] > 0.999)
     side = period * max(1, int(open_ / np.sqrt(2)) // period)
     first = [(n - side) // 2 for n in grid.shape]
     block = tuple(slice(at, at + side) for at in first)
