@@ -33,7 +33,7 @@ Motion = Float[np.ndarray, "7"]
 
 
 # Of the cells and the chrome over them, at the probe's wavelength in every view.
-Transmission = Complex[Array, "view y x"]
+Transmission = Complex[Array, "view cell_y cell_x"]
 
 
 class _MovedColumns(NamedTuple):
