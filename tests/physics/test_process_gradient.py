@@ -59,8 +59,8 @@ PLATE = {
 }
 # Half the distance between the two plates of a difference. The functional is rounded to 1e-7 or so of itself, so a step
 # must change it by some 1e-4; and the edges that it moves, 10 nm, must not pass each other (they are 20 nm apart or
-# more here), nor the rim of the chrome a corner of the squares that cells there are cut into. Turns and growths act over
-# 20 mm, so 4e-7 of them are 8 nm. What is smooth takes longer steps.
+# more here), nor the rim of the chrome a corner of the squares that cells there are cut into. Turns and growths act
+# over 20 mm, so 4e-7 of them are 8 nm. What is smooth takes longer steps.
 STEPS = {
     "common_depth_scale": 2e-3,
     "depth_scale": 4e-3,
