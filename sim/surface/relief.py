@@ -29,6 +29,7 @@ jax.tree_util.register_dataclass(
 # may take, so that some is left for sources at different depths; the highest wave number for which moments do, and that
 # for which second moments do.
 _WIDEST, _WIDEST_SEEN, _HIGHEST, _HIGHEST_SECOND = 0.965, 0.93, 0.7, 0.4
+_STILL_M = 1e-13  # an edge that moved by less than this has not
 _NODES = 65  # from rim to rim, for which weights are fitted
 
 
@@ -94,7 +95,9 @@ def plan_of(
     if not traced:
         corners, walls = variation.corner_radius_m > 0, variation.sidewall_rad > 0
         shifts = np.abs(_corner_shifts_m(grid, process, variation))
-        widened = bool(variation.common_cd_bias_m) or any(variation.cd_bias_m)
+        # Masks may be drawn against the bias: what is left then is rounding, and no edge has moved.
+        left = [abs(variation.common_cd_bias_m + own) for own in variation.cd_bias_m or (0.0,)]
+        widened = max(left) > _STILL_M
         cut = bool(shifts.max() > 0 or widened or corners or walls or lines)
         # Half a cell for the bias, and a cell more for corners seen from the next one.
         reach = max(_USUAL_REACH, int(np.ceil(shifts.max() / grid.pitch_m)) + 2)
