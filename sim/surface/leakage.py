@@ -42,13 +42,14 @@ class SplitPsf(NamedTuple):
         return float(np.max(np.abs(self.interference) - most) / np.max(self.total))
 
 
-def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
+def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour, *, sampling: float | None = None) -> SplitPsf:
     """Split the PSF of one colour and depth (metres) of a `doe` into the light that leaked and that was diffracted.
 
     Args:
         doe: the DOE, with the wavelengths of `colour`.
         depth_m: source depth, metres.
         colour: colour channel.
+        sampling: intensity samples per lambda d / D; see `sim.propagation.farfield.plan_far_field`.
 
     Energies per unit power incident on the clear aperture, Fresnel loss included, by three independent transforms: that
     they fit (`SplitPsf.excess`) is a check, not an assumption.
@@ -65,4 +66,4 @@ def split_psf(doe: FabricatedDoe, depth_m: float, colour: Colour) -> SplitPsf:
         "height_m": None,
     }
     parts = (replace(one, transmission=part, **other) for part in (even, whole - even))
-    return SplitPsf(*(psf(part, depths=depth_m).energy[0, 0] for part in (one, *parts)))
+    return SplitPsf(*(psf(part, depths=depth_m, sampling=sampling).energy[0, 0] for part in (one, *parts)))
