@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +53,9 @@ from sim.plots.psfs import plot_psfs
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
+
+if TYPE_CHECKING:
+    from doedesign.spots.design import SpotState
 
 log = logging.getLogger("doedesign")
 
@@ -168,21 +171,7 @@ def _spots_design(spec: Spec, run: Run | None = None) -> Design:
     return task.finished(state, history)
 
 
-class _Resumable(Protocol):
-    """State of an optimisation, as a checkpoint keeps it."""
-
-    @property
-    def step(self) -> int:
-        """Steps done."""
-        ...
-
-    @property
-    def arrays(self) -> Sequence[np.ndarray]:
-        """Everything else."""
-        ...
-
-
-_State = TypeVar("_State", bound=_Resumable)
+_State = TypeVar("_State", OptimizationState, "SpotState")
 
 
 def _iterate(

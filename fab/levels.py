@@ -176,8 +176,17 @@ def wrapped_cells(levels: Levels) -> tuple[NDArray[np.float64], NDArray[np.uint8
     Returns ascending edges, metres, ``(count,)``, and the level below, between and above them, ``(count + 1,)``; the
     first and the last are the same, since the wave begins within that level's share.
     """
-    period = np.float64(levels.period_m)
-    places = np.mod(levels.heights_m(), period)
+    return nearest_around(levels.heights_m(), levels.period_m)
+
+
+def nearest_around(places: NDArray[np.float64], period: float) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Divide a circle of some period among places on it, each of which gets what is nearest to it.
+
+    Returns ascending edges from 0 to the period, ``(count,)``, and the number of the place below, between and above
+    them, ``(count + 1,)``.
+    """
+    period = np.float64(period)
+    places = np.mod(places, period)
     order = np.argsort(places, kind="stable").astype(np.uint8)
     places = places[order]
     edges = np.append((places[1:] + places[:-1]) / 2, (places[-1] + places[0] + period) / 2)

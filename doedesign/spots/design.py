@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
+from doedesign.design.patterns import spot_centres_m
 from doedesign.spec import Spec
 from doedesign.spec.target import SpotsSpec
 from doedesign.spots.exchange import exchange
@@ -28,7 +29,7 @@ _FEW_LEVELS = 4
 _TRIED, _TRIAL_STEPS = 4, 30  # candidates of the search, and steps with each before one is chosen
 _MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
 _SWEEPS, _OFFERS = 100, 2**20  # over such a cell: at least, and as many as make so many offers
-_HEATS = (3e-5, 2.5e-4)
+_HEATS = (3e-5, 2.5e-4)  # of exchanges of which the best is taken
 _NARROWEST = 32  # cells of a row at which random starts of an exchange begin
 _ROW_STARTS, _ROW_SWEEPS, _ROW_HEAT, _FINER_HEAT = 200, 1000, 0.05, 1e-4
 
@@ -93,7 +94,7 @@ class SpotTask:
         """The most promising of the phases that a search finds, tried with levels on all cells."""
         problem, table = self.problem, self.table
         few = problem.staircase if self.levels.count <= _FEW_LEVELS else None
-        points = search_points(problem.spots, self.spec.optimize.seed, problem.extent_m)
+        points = search_points(problem.spots, self.spec.optimize.seed, problem.grid.extent_m)
         found = search_phases(
             problem.spots, points, starts=table.starts, seed=self.spec.optimize.seed, uniformity=table.uniformity,
             staircase=few, keep=_TRIED,
@@ -108,7 +109,7 @@ class SpotTask:
 
     def step(self, state: SpotState) -> tuple[SpotState, SpotLight]:
         """One step, and the light before it."""
-        waves, light, _ = self.problem.step(state.waves)
+        waves, light = self.problem.step(state.waves)
         merit = light.merit(self.table.uniformity)
         best = (state.waves, merit) if merit > state.merit else (state.best, state.merit)
         return SpotState(waves, *best, state.step + 1), light
@@ -137,11 +138,12 @@ class SpotTask:
         problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
         if level.size > _MOST_CELLS:
             return level
-        # An exchange has another measure of how equal spots are.
         sweeps = max(_SWEEPS, _OFFERS // level.size)
         # Merit counts uniformity as often as its weight says, and so does heat.
         heats = [heat * (1 + uniformity) for heat in _HEATS]
-        found = [level] + [
+        # An exchange has a smooth measure of its own of how equal spots are, so it may spoil the one that is asked for.
+        found = [level]
+        found += [
             exchange(problem, level, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=heat) for heat in heats
         ]
         if 1 in level.shape and self.levels.count <= _FEW_LEVELS:
@@ -200,28 +202,25 @@ def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
         assert table.count is not None
         orders, step = grid_orders(table.count), 1 / table.period_m
         return Spots(orders * step, shares, orders, (step, step))
-    places, orders = _places_m(table)
+    places = _places_m(table)
     middle = np.array(table.offset_m[::-1])
     sines = np.stack(camera.sines_of(*(places + middle).T), axis=1)
-    regular = camera.is_sine and orders is not None and not middle.any()
-    step = float(table.spacing_m or 0) / camera.sensor_distance_m / wavelength
-    if orders is not None and regular and any(n % 2 == 0 for n in table.count or ()):
-        step /= 2  # odd orders of a lattice twice as fine
-    return Spots(sines / wavelength, shares, orders, (step, step)) if regular else Spots(sines / wavelength, shares)
+    if table.arrangement != "grid" or middle.any() or not camera.is_sine:
+        return Spots(sines / wavelength, shares)
+    assert table.spacing_m is not None
+    # An even count has no middle: its spots are the odd ones of a lattice twice as fine.
+    spacing = table.spacing_m / (2 if any(n % 2 == 0 for n in table.count or ()) else 1)
+    step = spacing / camera.sensor_distance_m / wavelength
+    return Spots(sines / wavelength, shares, np.rint(places / spacing).astype(int), (step, step))
 
 
-def _places_m(table: SpotsSpec) -> tuple[Float[np.ndarray, "m 2"], Any]:
-    """Places (y, x) on the sensor, and orders of a grid."""
+def _places_m(table: SpotsSpec) -> Float[np.ndarray, "m 2"]:
+    """Places (y, x) on the sensor, about the middle of the arrangement."""
     if table.arrangement == "list":
-        return np.array([place[::-1] for place in table.places_m]), None
+        return np.array([place[::-1] for place in table.places_m])
     if table.arrangement == "hexagonal":
-        return hexagonal_places(table.rings or 0, table.spacing_m or 0.0), None
+        return hexagonal_places(table.rings or 0, table.spacing_m or 0.0)
     if table.arrangement == "ring":
-        return ring_places(table.number or 0, table.radius_m or 0.0), None
+        return ring_places(table.number or 0, table.radius_m or 0.0)
     assert table.count is not None
-    orders = grid_orders(table.count)
-    # Orders of an even count are odd, two apart.
-    apart = np.array([1 if n % 2 else 2 for n in reversed(table.count)])
-    even = any(n % 2 == 0 for n in table.count)
-    lattice = orders * (2 if even else 1) // apart if even else orders
-    return orders / apart * (table.spacing_m or 0.0), lattice
+    return spot_centres_m(table.count, table.spacing_m or 0.0)

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from doedesign.spots.superposition import SpotProblem
 
-# (max - min) / (max + min) over the fourth root of the mean fourth power of relative deviations, which is smooth.
-_FLAT = 1.4
-_ANY = 0.1  # share of offers of any other level
+_FLAT = 1.4  # (max - min) / (max + min) over that root, about
+_ANY, _ANY_OF_TWO = 0.5, 0.1  # share of offers of another level than a neighbour's
 _COLD = 0.3  # share of the sweeps that take improvements alone
 
 
@@ -23,12 +22,15 @@ def exchange(
     uniformity: float,
     heat: float = 2e-3,
 ) -> NDArray[np.uint8]:
-    """Change cells of a level map one by one for efficiency less `uniformity` times the uniformity error.
+    """Change cells of a level map one by one for efficiency less `uniformity` times how unequal spots are.
+
+    That is the fourth root of the mean fourth power of their relative deviations, times 1.4: about as large as the
+    uniformity error (max - min) / (max + min), and smoother.
 
     Simulated annealing (S. Kirkpatrick et al., Science 220, 671, 1983): a change that costs merit is taken with the
     probability exp(-cost / heat), and heat falls to zero over the first sweeps. A sweep offers every cell the level of
-    a neighbour, which moves a border between levels, or now and then any other. The best map that was met is returned;
-    it is never worse than the one given.
+    a neighbour, which moves a border between levels, or now and then another, most often the next. The best map that
+    was met is returned; by this measure it is never worse than the one given.
     """
     sums, shares = problem.sums, problem.spots.shares
     waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(len(shares), -1).T.astype(np.complex128)
@@ -42,7 +44,7 @@ def exchange(
         # A step up or down where there are many levels, or any other level.
         others = rng.choice([1, count - 1], own.size) if count > 2 else np.ones(own.size, int)
         others = np.where(rng.random(own.size) < 0.5, others, rng.integers(1, max(count, 2), own.size))
-        others = np.where(rng.random(own.size) < _ANY * (1 if count == 2 else 5), others, 0)
+        others = np.where(rng.random(own.size) < (_ANY_OF_TWO if count == 2 else _ANY), others, 0)
         sides = rng.integers(0, 4, own.size)
         _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, level.shape, order, chance,
                others, sides, heat * warm**2, uniformity)  # fmt: skip

@@ -66,7 +66,7 @@ def search_phases(
         sets = WaveSet(np.tile(np.sqrt(spots.shares), (count, 1)), rng.uniform(0, 2 * np.pi, (count, spots.count)))
         light = _light(sets, waves, staircase)
         for _ in range(_STEPS):
-            sets = _improved(sets, light, spots.shares)
+            sets = sets.improved(light, spots.shares)
             light = _light(sets, waves, staircase)
         for weights, phases, one in zip(*sets, light, strict=True):
             result = spot_light(np.abs(one) ** 2, spots.shares)
@@ -84,9 +84,3 @@ def _light(
     else:
         field = staircase.light[staircase.level(field)]
     return (field @ waves.conj().T).astype(np.complex128) / waves.shape[1]
-
-
-def _improved(sets: WaveSet, light: Complex[np.ndarray, "start m"], shares: Float[np.ndarray, " m"]) -> WaveSet:
-    """`WaveSet.improved` of every start."""
-    every = [WaveSet(*one).improved(seen, shares) for *one, seen in zip(*sets, light, strict=True)]
-    return WaveSet(np.stack([one.weights for one in every]), np.stack([one.phases for one in every]))

@@ -15,6 +15,7 @@ from jaxtyping import Complex, Float, UInt8
 
 from doedesign.spots.spots import Spots
 from fab.grid import Grid
+from fab.levels import nearest_around
 from sim.propagation.directions import DirectionSum
 
 GAIN = 0.7  # of a weight, per relative error of its spot's amplitude
@@ -54,16 +55,17 @@ class WaveSet(NamedTuple):
         return self.weights * np.exp(1j * self.phases)
 
     def improved(
-        self, light: Complex[np.ndarray, " m"], shares: Float[np.ndarray, " m"], gain: float = GAIN
+        self, light: Complex[np.ndarray, "*start m"], shares: Float[np.ndarray, " m"], gain: float = GAIN
     ) -> "WaveSet":
-        """The next ones, after a look at the amplitudes that came out."""
-        size = np.maximum(np.abs(light), 1e-9 * np.abs(light).max())
-        weights = self.weights * (np.sqrt(shares * np.sum(size**2)) / size) ** gain
-        return WaveSet(weights / np.linalg.norm(weights), np.angle(light))
+        """The next weights and phases, from the amplitudes of the spots that these ones gave."""
+        size = np.abs(light)
+        size = np.maximum(size, 1e-9 * size.max(axis=-1, keepdims=True))
+        weights = self.weights * (np.sqrt(shares * np.sum(size**2, axis=-1, keepdims=True)) / size) ** gain
+        return WaveSet(weights / np.linalg.norm(weights, axis=-1, keepdims=True), np.angle(light))
 
 
 class Staircase(NamedTuple):
-    """Levels as light sees them: `light[level]`, and the levels in the order of their phases around the circle.
+    """Levels as light sees them, and which of them is nearest to a phase (`fab.levels.nearest_around`).
 
     Attributes:
         light: `[level]` transmission.
@@ -78,15 +80,7 @@ class Staircase(NamedTuple):
     @classmethod
     def of(cls, phases: Float[np.ndarray, " level"]) -> "Staircase":
         """Levels of these phases, radians."""
-        wrapped = np.mod(phases, 2 * np.pi)
-        order = np.argsort(wrapped, kind="stable")
-        places = wrapped[order]
-        after = np.append(places[1:], places[0] + 2 * np.pi)
-        edges = (places + after) / 2
-        nearest = np.append(order, order[0])
-        if edges[-1] >= 2 * np.pi:  # the last level reaches over the turn
-            edges, nearest = np.append(edges[-1] - 2 * np.pi, edges[:-1]), np.append(order[-1], order)
-        return cls(np.exp(1j * phases).astype(np.complex64), edges, nearest.astype(np.uint8))
+        return cls(np.exp(1j * phases).astype(np.complex64), *nearest_around(phases, 2 * np.pi))
 
     def level(self, field: Complex[np.ndarray, "*s"]) -> UInt8[np.ndarray, "*s"]:
         """The level nearest to the phase of a field."""
@@ -118,13 +112,8 @@ class SpotProblem:
         """The problem on the cells of a grid."""
         return cls(spots, staircase, coverage, DirectionSum(grid, spots.waves_per_m), grid)
 
-    @property
-    def extent_m(self) -> tuple[float, float]:
-        """Height and width of the cells together, metres."""
-        return self.grid.extent_m
-
     def coarser(self) -> "SpotProblem":
-        """The same with cells twice as wide along every axis that has several."""
+        """The same of an open unit cell, with cells twice as wide along every axis that has several."""
         ny, nx = (n // 2 if n > 1 else 1 for n in self.grid.shape)
         grid = Grid((ny, nx), 2 * self.grid.pitch_m)
         return SpotProblem.on(grid, np.ones(grid.shape, np.float32), self.spots, self.staircase)
@@ -142,8 +131,7 @@ class SpotProblem:
         field = self.coverage * self.staircase.light[level]
         return self.sums.amplitudes(field) / float(np.sum(self.coverage, dtype=np.float64))
 
-    def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight, UInt8[np.ndarray, "y x"]]:
-        """The next plane waves, and light and level map of these."""
-        level = self.level(waves)
-        light = self.amplitudes(level)
-        return waves.improved(light, self.spots.shares), spot_light(np.abs(light) ** 2, self.spots.shares), level
+    def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight]:
+        """The next plane waves, and the light of these."""
+        light = self.amplitudes(self.level(waves))
+        return waves.improved(light, self.spots.shares), spot_light(np.abs(light) ** 2, self.spots.shares)

@@ -9,5 +9,6 @@ places      those maps: the lens's mapping and distortion, a sensor that is turn
 field_weights  the sensor's field between its samples
 farfield    the default path (eqs. 7-9 of the paper)
 hankel      the same for rotationally symmetric pupils
+directions  the far field in single directions: spots and orders
 fresnel     the direct path (eq. 5): reference for the other two
 """

@@ -18,12 +18,13 @@ of a small part of a small term).
 * light of walls, where the camera's light has edges: a line of light along the wall of every mask, wherever it lies.
 * roughness: a random height for every cell with the given rms and correlation length; what varies within a cell is
   light lost to angles beyond the sensor, exp(-variance / 2) of the amplitude.
-* particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, and pinholes.
+* particles keep an etch off the mask's pixels whose centres they cover. Chrome: the opening's circle, which
+  cuts cells as masks do where edges moved, and pinholes.
 
 Reading order: `cell` (where lines cut a cell, and what a lens sees of its pieces), `roughness`, `relief` (the errors as
-numbers), `pieces` (what is open where, and its light), `edges` (tilted walls and corners), `lines` (the
-light of walls), `tiles` (the whole plate), `plate`
-(the way in), `leakage` (where its light goes).
+numbers), `pieces` (what is open where, and its light), `edges` (tilted walls and corners), `lines` (the light of
+walls), `opening` (the rim of the chrome), `tiles` (the whole plate), `plate` (the way in), `leakage` (where its light
+goes).
 """
 
 from sim.surface.plate import FabricatedDoe, as_fabricated, drawn_alike

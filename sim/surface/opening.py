@@ -1,9 +1,10 @@
 """Cells on the rim of the chrome's opening: where within the cell it is open.
 
 Light that the rim lets through a cell comes from its open side. A cell that passes the mean of its open part, as if it
-came from everywhere in it, has the wrong moments: PSFs of random plates of 128 cells, lit from nearby, are off by 3 %,
-and one of 2400 cells by a quarter of that. Here the moments of what is open are taken, as those of the masks' pieces
-are (`sim.surface.cell`), before light is given to the cells around, so that none of it is cut off by the rim.
+came from everywhere in it, has the wrong moments: the light of random plates of 128 cells, lit from nearby, is off by
+2.5 % in red and 3.4 % in blue, that of 256 cells by 1.6 and 2.2 %. Here the moments of what is open are taken, as those
+of the masks' pieces are (`sim.surface.cell`), before light is given to the cells around, so that none of it is cut off
+by the rim.
 """
 
 from typing import NamedTuple

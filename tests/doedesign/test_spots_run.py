@@ -12,6 +12,7 @@ from doedesign.optimization import optimize
 from doedesign.runs.fabricated import fabricated
 from doedesign.spec import Spec, load_spec, spec_to_toml
 from doedesign.spots.design import SpotTask, spots_from_spec
+from doedesign.spots.orders import order_table
 from fab.errors import InputError
 from fab.order.verify import verify
 from fab.process import Variation
@@ -136,12 +137,10 @@ def test_masks_of_a_run_are_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_free_spots_are_where_they_should_be(free: Path):
-    """Behind an aperture of 96 cells peaks are 90 um wide; the table knows no pixels, so they count apart."""
+    """Three by three 120 um apart, behind an aperture of 192 cells."""
     spec = load_spec(free, ["doe.samples=192", "doe.aperture=0.384 mm", "optimize.steps=30"])
     design = optimize(spec)
     assert spec.spots is not None
-    from doedesign.spots.orders import order_table
-
     table = order_table(design.as_optic(), spots_from_spec(spec.spots, design.camera))
     assert table.total > 0.8
     assert table.uniformity_error < 0.02
