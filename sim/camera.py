@@ -12,11 +12,12 @@ from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.units import format_length
+from sim.illumination import Beam, beam_amplitude, beam_irradiance
 from sim.material import fresnel_transmission, refractive_index
 
 Mapping = Literal["sine", "tangent"]
@@ -41,12 +42,14 @@ class Colour:
 class SpectralLine(NamedTuple):
     """One wavelength of the colour channel of that number.
 
-    `factor` is its weight in the channel times the power that passes the substrate's two faces.
+    `factor` is its weight in the channel times the power that passes the substrate's two faces; of a beam of several
+    modes times the share of the mode of that number (`sim.illumination`).
     """
 
     colour: int
     wavelength_m: float
     factor: float
+    mode: int = 0
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ class Camera:
             all light that passes the aperture: nothing is vignetted.
         light: "scalar" for a thin element, "edges" for one whose walls add their light (`sim.rigorous.edge_optic`).
         polarisation: "unpolarised", or "x" or "y", the axis along which the electric field lies; for light with edges.
+        beam: the beam that lights the DOE, of whose power energies are shares; None for plane or spherical waves, whose
+            power is that on the clear aperture.
     """
 
     grid: Grid
@@ -88,6 +93,7 @@ class Camera:
     doe_distance_m: float = 0.0
     light: str = "scalar"
     polarisation: str = "unpolarised"
+    beam: Beam | None = None
 
     def __post_init__(self) -> None:
         """Refuse a lens that cannot image the window, and words that mean nothing here."""
@@ -124,12 +130,33 @@ class Camera:
 
     @property
     def lines(self) -> tuple[SpectralLine, ...]:
-        """Every wavelength of every colour, colour by colour."""
+        """Every wavelength of every colour, colour by colour, and of each every mode of the beam."""
+        shares = (1.0,) if self.beam is None else self.beam.shares
         return tuple(
-            SpectralLine(number, wavelength, weight * self.transmission(wavelength))
+            SpectralLine(number, wavelength, weight * self.transmission(wavelength) * share, mode)
             for number, colour in enumerate(self.colours)
             for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
+            for mode, share in enumerate(shares)
         )
+
+    def chief_rad(self, field_rad: tuple[float, float]) -> tuple[float, float]:
+        """Angles (y, x) of the chief ray at field angles about the axis of the beam, or about that of the lens."""
+        if self.beam is None:
+            return field_rad
+        (y, x), (beam_y, beam_x) = field_rad, self.beam.angle_rad
+        return y + beam_y, x + beam_x
+
+    def incident(self, line: SpectralLine) -> Complex[np.ndarray, "y x"] | None:
+        """Amplitude of a mode of the beam on the cells, whose square is 1 for plane light; None without a beam."""
+        if self.beam is None:
+            return None
+        return beam_amplitude(self.beam, self.grid, self.aperture_m, line.wavelength_m, line.mode)
+
+    def irradiance(self, wavelength_m: float) -> Float[np.ndarray, "y x"] | None:
+        """Irradiance on the cells, 1 for plane light; None without a beam."""
+        if self.beam is None:
+            return None
+        return beam_irradiance(self.beam, self.grid, self.aperture_m, wavelength_m)
 
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""
@@ -164,7 +191,7 @@ class Camera:
         (n - 1) / lambda on axis (eq. 2); for an oblique chief ray of direction sine s,
         (sqrt(n^2 - s^2) - sqrt(1 - s^2)) / lambda, the thin-element path difference.
         """
-        square = float(np.sum(np.square(direction_sines(field_rad))))
+        square = float(np.sum(np.square(direction_sines(self.chief_rad(field_rad)))))
         index = refractive_index(self.material, wavelength_m)
         return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
 

@@ -24,7 +24,7 @@ from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
 from sim.propagation.hankel import Hankel, plan_hankel, radial_profile, revolve, ring_count, ring_source_waves
 from sim.propagation.pupil import DoeRows, SourceColumns, cis, doe_field
-from sim.source import SeparableSource, SourceMap, View, ViewedSource
+from sim.source import LitSource, SeparableSource, SourceMap, View, ViewedSource, light_of
 
 if TYPE_CHECKING:  # to a type checker, what subclasses define is no argument of a constructor here
     from typing import ClassVar as AbstractVar
@@ -32,7 +32,7 @@ else:
     from equinox import AbstractVar
 
 Propagation = Literal["far_field", "fresnel", "angular_spectrum"]
-CellSource = SourceMap | SeparableSource | ViewedSource
+CellSource = SourceMap | SeparableSource | LitSource | ViewedSource
 ON_AXIS = (0.0, 0.0)
 
 
@@ -146,18 +146,20 @@ class CellOptic(CameraOptic):
                 line.wavelength_m,
                 depth_m=depth_m,
                 sampling=sampling,
-                field_rad=ON_AXIS if self.camera.is_sine else field_rad,
+                field_rad=ON_AXIS if self.camera.is_sine else self.camera.chief_rad(field_rad),
             )
         return plan_direct(self.camera, line.wavelength_m, propagation)
 
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> CellSource:
-        """The path to every cell; the window follows the chief ray."""
-        return self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad)
+        """The path to every cell, and the beam on it; the window follows the chief ray."""
+        path = self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad)
+        light = self.camera.incident(line)
+        return path if light is None else LitSource(path, jnp.asarray(light))
 
     def rows(self, line: SpectralLine, source: CellSource) -> tuple[DoeRows, SourceColumns]:
         """The two arguments of `doe_field`."""
         rows, columns = source.over(self.camera.grid)
-        return DoeRows(self.coverage, *self.cells(line, source), rows), columns
+        return DoeRows(self.coverage, *self.cells(line, source), rows, light_of(source)), columns
 
     def energy(self, line: SpectralLine, plan: FarField | DirectPath, source: CellSource) -> Float[Array, "v u"]:
         """Energy in every pixel."""
@@ -202,7 +204,8 @@ class ViewedOptic(CellOptic):
     def source(self, line: SpectralLine, depth_m: float, field_rad: tuple[float, float] = ON_AXIS) -> ViewedSource:
         """The path to every cell, and the view from there or from the nearest depth that there is a view for."""
         view = jnp.int32(self.view(line.wavelength_m, depth_m))
-        return ViewedSource(self.source_kind.at(self.camera, line.wavelength_m, depth_m, field_rad), view)
+        path: Any = super().source(line, depth_m, field_rad)
+        return ViewedSource(path, view)
 
     def cells(self, line: SpectralLine, source: Any) -> tuple[Array | None, Array | None]:
         """Transmission in the source's view."""

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from fab.grid import Grid
 from sim.camera import Camera, direction_sines, source_path_m, wrapped_waves
@@ -114,6 +114,17 @@ class SeparableSource(NamedTuple):
         return (y_m, waves_y), SeparableColumns(x_m, waves_x, curvature, sines, *scales)
 
 
+class LitSource(eqx.Module):
+    """A point source, and the amplitude `[y, x]` of the beam that lights a DOE beside that of its wave."""
+
+    path: SourceMap | SeparableSource
+    light: Complex[Array, "y x"]
+
+    def over(self, grid: Grid) -> tuple[Any, Any]:
+        """The same as of its path."""
+        return self.path.over(grid)
+
+
 class View(NamedTuple):
     """One wavelength and a range of depths, metres, from which a DOE looks like certain values of its cells."""
 
@@ -134,9 +145,15 @@ class View(NamedTuple):
 class ViewedSource(eqx.Module):
     """A point source, and by its number how a DOE looks from there (`sim.optic.ViewedOptic.views`)."""
 
-    path: SourceMap | SeparableSource
+    path: SourceMap | SeparableSource | LitSource
     view: Int[Array, ""]
 
     def over(self, grid: Grid) -> tuple[Any, Any]:
         """The same as of its path."""
         return self.path.over(grid)
+
+
+def light_of(source: Any) -> Complex[Array, "y x"] | None:
+    """Amplitude of the beam of a source, or None for a wave that is as bright everywhere."""
+    path = source.path if isinstance(source, ViewedSource) else source
+    return path.light if isinstance(path, LitSource) else None

@@ -1,6 +1,8 @@
 """The field behind the DOE, written for a block of rows so that it never has to exist as a whole."""
 
+import operator
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -41,12 +43,13 @@ class DoeRows(NamedTuple):
     height_m: Float[Array, "y x"] | None  # DOE height, metres, or None
     transmission: Complex[Array, "y x"] | None  # transmission besides that of the height, or None for 1
     source: Any  # rows of the source (`sim.source`)
+    light: Complex[Array, "y x"] | None = None  # amplitude of the beam, or None for 1
 
     @property
     def amplitude(self) -> Array:
-        """Open share times transmission; one of them must be there."""
-        given = [part for part in (self.coverage, self.transmission) if part is not None]
-        return given[0] if len(given) == 1 else given[0] * given[1]
+        """Open share times transmission times the beam's amplitude; one of the first two must be there."""
+        given = [part for part in (self.coverage, self.transmission, self.light) if part is not None]
+        return reduce(operator.mul, given)
 
 
 @runtime_checkable

@@ -1,0 +1,167 @@
+"""Beams that light a DOE: their amplitude on its cells, for a power of one.
+
+A Gaussian beam of quality M² is an incoherent sum of Hermite-Gaussian modes, those of a Gaussian Schell-model source
+(A. Starikov and E. Wolf, J. Opt. Soc. Am. 72, 923, 1982): the shares of the modes fall like q^n with
+q = (M² - 1) / (M² + 1), and all modes share a waist that is M times smaller than the beam's. A measured beam is a
+picture of its intensity and has a plane wavefront.
+
+Powers count from the whole beam: what misses the opening of the chrome is lost.
+"""
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.ndimage import map_coordinates
+
+from fab.grid import Grid
+
+_REST = 1e-3  # share of the weakest modes that is left out
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class GaussianBeam:
+    """A Gaussian beam.
+
+    Attributes:
+        radius_m: radii (y, x) at the waist where the intensity is 1/e² of that in the middle, of the whole beam.
+        waist_distance_m: distance of the waist before the DOE, negative behind it.
+        m_squared: beam quality M² (y, x), at least 1.
+        centre_m: place (y, x) of its axis on the DOE.
+        angle_rad: angles (y, x) between its axis and that of the DOE, positive where light travels toward +y or +x.
+    """
+
+    radius_m: Pair
+    waist_distance_m: float = 0.0
+    m_squared: Pair = (1.0, 1.0)
+    centre_m: Pair = (0.0, 0.0)
+    angle_rad: Pair = (0.0, 0.0)
+
+    @cached_property
+    def _modes(self) -> list[tuple[float, int, int]]:
+        """Share and numbers (y, x) of every mode, the strongest first."""
+        axes = []
+        for quality in self.m_squared:
+            ratio = (quality - 1) / (quality + 1)
+            axes.append([(1 - ratio) * ratio**n for n in range(1 if ratio == 0 else 200)])
+        every = [(p * q, m, n) for m, p in enumerate(axes[0]) for n, q in enumerate(axes[1])]
+        every.sort(key=lambda each: (-each[0], each[1:]))
+        total = np.cumsum([share for share, _, _ in every])
+        count = 1 + int(np.searchsorted(total, 1 - _REST))
+        kept = every[:count]
+        return [(share / total[count - 1], m, n) for share, m, n in kept]
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Power of every mode; the weakest, together a thousandth, are left out and theirs is the others'."""
+        return tuple(share for share, _, _ in self._modes)
+
+    def _at_doe(self, axis: int, wavelength_m: float) -> Pair:
+        """Radius of the lowest mode, metres, and curvature of the wavefront, 1/m, along an axis."""
+        radius, distance = self.radius_m[axis] / np.sqrt(self.m_squared[axis]), self.waist_distance_m
+        rayleigh = np.pi * radius**2 / wavelength_m
+        return radius * np.sqrt(1 + (distance / rayleigh) ** 2), distance / (distance**2 + rayleigh**2)
+
+    def curvature_per_m(self, wavelength_m: float) -> float:
+        """Curvature of its wavefront at the DOE, the mean of both axes."""
+        return sum(self._at_doe(axis, wavelength_m)[1] for axis in (0, 1)) / 2
+
+    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+        """Amplitude `[y, x]` of a mode in the middle of every cell; its square times area sums to 1 over the plane."""
+        parts = []
+        for axis, name, number in ((0, "y", self._modes[mode][1]), (1, "x", self._modes[mode][2])):
+            radius, curvature = self._at_doe(axis, wavelength_m)
+            at = grid.axis_m(name) - self.centre_m[axis]  # pyright: ignore[reportArgumentType]
+            waves = curvature * at**2 / 2 / wavelength_m
+            parts.append(_hermite_gaussian(number, at, radius) * np.exp(2j * np.pi * (waves - np.rint(waves))))
+        return parts[0][:, None] * parts[1]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBeam:
+    """A beam with a plane wavefront, by a picture of its intensity. Beams of the same content are equal.
+
+    Attributes:
+        intensity: `[y, x]` intensity, not negative, in any unit.
+        pixel_m: distance of its pixels.
+        centre_m: place (y, x) of the picture's middle on the DOE.
+        angle_rad: angles (y, x) of its axis.
+    """
+
+    intensity: Float[np.ndarray, "y x"] = field(repr=False)
+    pixel_m: float
+    centre_m: Pair = (0.0, 0.0)
+    angle_rad: Pair = (0.0, 0.0)
+
+    @cached_property
+    def _key(self) -> tuple[object, ...]:
+        picture = np.ascontiguousarray(self.intensity, np.float64)
+        return picture.shape, hashlib.sha256(picture).hexdigest(), self.pixel_m, self.centre_m, self.angle_rad
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all is the same, pixel by pixel."""
+        return isinstance(other, MeasuredBeam) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """Hash of the content."""
+        return hash(self._key)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """One mode."""
+        return (1.0,)
+
+    def curvature_per_m(self, wavelength_m: float) -> float:
+        """None."""
+        return 0.0
+
+    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+        """Root of the intensity between its pixels, in the middle of every cell; dark beyond the picture."""
+        places = [
+            (grid.axis_m(name) - centre) / self.pixel_m + (count - 1) / 2
+            for name, centre, count in zip(("y", "x"), self.centre_m, self.intensity.shape, strict=True)
+        ]
+        at = np.stack(np.meshgrid(*places, indexing="ij"))
+        seen = map_coordinates(np.asarray(self.intensity, np.float64), at, order=1, mode="constant")
+        return np.sqrt(seen / (self.intensity.sum(dtype=np.float64) * self.pixel_m**2)).astype(complex)
+
+
+def _hermite_gaussian(number: int, at_m: Float[np.ndarray, " n"], radius_m: float) -> Float[np.ndarray, " n"]:
+    """Hermite-Gaussian function of unit norm, 1/sqrt(m), by its recurrence; the lowest has the radius 1/e²."""
+    place = np.sqrt(2) * at_m / radius_m
+    below, here = np.zeros_like(place), (2 / np.pi) ** 0.25 / np.sqrt(radius_m) * np.exp(-(place**2) / 2)
+    for n in range(number):
+        below, here = here, place * np.sqrt(2 / (n + 1)) * here - np.sqrt(n / (n + 1)) * below
+    return here
+
+
+# `shares` are the powers of the modes of which a beam is an incoherent sum; together 1.
+Beam = GaussianBeam | MeasuredBeam
+
+
+@lru_cache(maxsize=8)
+def beam_amplitude(
+    beam: Beam, grid: Grid, aperture_m: float, wavelength_m: float, mode: int
+) -> Complex[np.ndarray, "y x"]:
+    """Amplitude `[y, x]` of a mode of a beam on the cells of a DOE, complex64 and read-only.
+
+    Its mean square over a clear aperture of that diameter would be 1 if the beam were to end at its rim: plane light
+    has the amplitude 1, and PSFs count energies over the power of the beam.
+    """
+    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(np.pi) * aperture_m / 2
+    found = found.astype(np.complex64)
+    found.setflags(write=False)
+    return found
+
+
+@lru_cache(maxsize=4)
+def beam_irradiance(beam: Beam, grid: Grid, aperture_m: float, wavelength_m: float) -> Float[np.ndarray, "y x"]:
+    """Irradiance `[y, x]` on the cells, the sum over all modes, of which 1 is that of plane light of the same power."""
+    shown = np.zeros(grid.shape)
+    for mode, share in enumerate(beam.shares):
+        shown += share * np.abs(beam_amplitude(beam, grid, aperture_m, wavelength_m, mode)) ** 2
+    shown.setflags(write=False)
+    return shown
