@@ -5,16 +5,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from doedesign.spec import DefectsSpec, OrderSpec, ProcessSpec, Spec, WaferSpec, load_process, process_from_json
+import numpy as np
+
+from doedesign.spec import (
+    DefectsSpec,
+    OrderSpec,
+    ProcessSpec,
+    Spec,
+    WaferSpec,
+    input_files,
+    load_process,
+    process_from_json,
+)
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME
 from fab.grid import Grid
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.order.terms import OrderTerms
+from fab.pictures import read_pixels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, process_from
 from sim.camera import Camera, Colour
+from sim.illumination import Beam, GaussianBeam, MeasuredBeam
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
 _SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m")
@@ -39,7 +52,36 @@ def camera_from_spec(spec: Spec) -> Camera:
         doe_distance_m=spec.optics.doe_distance_m,
         light=spec.optics.light,
         polarisation=spec.optics.polarisation,
+        beam=beam_from_spec(spec),
     )
+
+
+def beam_from_spec(spec: Spec) -> Beam | None:
+    """Return the beam that lights the DOE, or None; its picture is read from the file that the spec names.
+
+    Raises:
+        InputError: the picture is missing, cannot be read, or is dark.
+    """
+    light = spec.illumination
+    if light is None:
+        return None
+    centre_m, angle_rad = light.centre_m[::-1], light.angles_rad[::-1]
+    if light.picture is None:
+        radius_m = tuple(diameter / 2 for diameter in _both(light.diameters_m)[::-1])
+        return GaussianBeam(radius_m, light.waist_distance_m, _both(light.m_squared)[::-1], centre_m, angle_rad)
+    path = input_files(spec)["illumination.picture"]
+    picture = read_pixels(path, others="RGBA")
+    if picture.ndim == 3:
+        picture = picture[..., : 3 if picture.shape[2] > 2 else 1].mean(axis=2)
+    if not picture.any():
+        raise InputError(str(path), "a beam must have some light", "a black picture", "Give another picture.")
+    assert light.pixel_m is not None
+    return MeasuredBeam(picture.astype(np.float64), light.pixel_m, centre_m, angle_rad)
+
+
+def _both(values: Sequence[float]) -> tuple[float, float]:
+    """One number for both axes, or [x, y]."""
+    return values[0], values[-1]
 
 
 def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:

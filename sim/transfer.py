@@ -92,11 +92,14 @@ def mtf(
     frequencies = np.linspace(0.0, 0.5 / camera.pixel_m, count)
     otf = np.zeros((len(camera.colours), len(depths_m), count), np.complex128)
     lags = np.arange(camera.grid.shape[1])
+    shares = (1.0,) if camera.beam is None else camera.beam.shares
     weights = [weight for colour in camera.colours for weight in colour.weights]
     for d, depth in enumerate(depths_m):
-        for line, weight in zip(camera.lines, weights, strict=True):
-            power = np.asarray(_row_spectra(*doe.rows(line, doe.source(line, depth))), np.float64)
-            correlation = np.fft.ifft(power)[: len(lags)] / power.mean()
+        for k, weight in enumerate(weights):
+            modes = camera.lines[k * len(shares) : (k + 1) * len(shares)]  # they add up as they pass the opening
+            spectra = [_row_spectra(*doe.rows(line, doe.source(line, depth))) for line in modes]
+            power = np.sum([share * np.asarray(one, np.float64) for share, one in zip(shares, spectra, strict=True)], 0)
+            correlation, line = np.fft.ifft(power)[: len(lags)] / power.mean(), modes[0]
             lag = line.wavelength_m * camera.sensor_distance_m * frequencies / camera.grid.pitch_m
             otf[line.colour, d] += weight * np.interp(lag, lags, correlation.real, right=0.0)
             otf[line.colour, d] += 1j * weight * np.interp(lag, lags, correlation.imag, right=0.0)

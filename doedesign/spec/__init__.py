@@ -10,7 +10,7 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     values      the types of value in a spec: lengths, names, options; the built-in objectives and starts
     table       common ground of all tables
     models      the tables, one per section of the TOML
-    scene       the tables of scene, obstruction and sensor
+    scene       the tables of scene, illumination, obstruction and sensor
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good DOE
     target      the table of spots
@@ -180,7 +180,12 @@ def input_files(spec: Spec) -> dict[str, Path]:
     for index, objective in enumerate(spec.objectives):
         if "image" in objective.options:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
+    beam = spec.illumination
+    if beam is not None and beam.picture is not None:
+        named["illumination.picture"] = beam.picture
     folder = Path() if spec.file is None else spec.file.parent
+    if (copy := beam_copy(spec)) and (folder / copy).is_file():
+        named["illumination.picture"] = copy
     files = {key: folder / name for key, name in named.items()}
     missing = [
         InputError(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
@@ -190,6 +195,12 @@ def input_files(spec: Spec) -> dict[str, Path]:
     if missing:
         raise spec_error(str(spec.file or spec.name), missing)
     return files
+
+
+def beam_copy(spec: Spec) -> str:
+    """Name under which a run keeps the picture of its beam, so that it needs nothing outside its folder."""
+    beam = spec.illumination
+    return "" if beam is None or beam.picture is None else f"illumination{Path(beam.picture).suffix.lower()}"
 
 
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
+from doedesign.spec.table import toml_key
 from doedesign.spec.target import spot_problems
 from doedesign.spec.training import training_problems
-from doedesign.spec.values import NEAR_OBJECTIVES, nearest
+from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.camera import check_lens, image_place
@@ -20,13 +21,18 @@ from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_
 _WAVE_TOLERANCE = 0.02
 
 
+# Keys of a beam of each kind: those that it needs, and those that it may have besides.
+_BEAM_KEYS = {
+    "gaussian": (("diameters_m",), ("waist_distance_m", "m_squared")),
+    "picture": (("picture", "pixel_m"), ()),
+}
 _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all others exist at every depth
 
 
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_light, _doe, _sensor, _lens, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
-    rules = (*rules, spot_problems)
+    rules = (*rules, spot_problems, _illumination)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -126,6 +132,37 @@ def _nyquist_length_m(spec: Spec) -> float:
 def _rounded(length_m: float) -> str:
     """Write a derived length with four digits."""
     return format_length(float(f"{length_m:.4g}"))
+
+
+def _illumination(spec: Spec) -> Iterator[InputError]:
+    beam = spec.illumination
+    if beam is None:
+        return
+    needed, allowed = _BEAM_KEYS[beam.kind]
+    given = beam.given()
+    for name in needed:
+        if name not in given:
+            cure = f"Add `{toml_key(name)}`."
+            yield InputError(
+                f"illumination.{toml_key(name)}", f'a beam of kind "{beam.kind}" needs it', "nothing", cure
+            )
+    for name in sorted({key for keys in _BEAM_KEYS.values() for one in keys for key in one} - {*needed, *allowed}):
+        if name in given:
+            rule = f'a beam of kind "{beam.kind}" takes: {", ".join(map(toml_key, (*needed, *allowed)))}'
+            yield InputError(f"illumination.{toml_key(name)}", rule, toml_key(name), "Remove it.")
+    for name in ("diameters_m", "m_squared"):
+        if len(getattr(beam, name)) > 2:
+            count = f"{len(getattr(beam, name))}"
+            yield InputError(f"illumination.{toml_key(name)}", "must be one number or [x, y]", count, "Remove some.")
+    if beam.picture is not None and not beam.picture.lower().endswith(BEAM_FILES):
+        rule, got = f"must be a file of {', '.join(BEAM_FILES)}", f'"{beam.picture}"'
+        yield InputError("illumination.picture", rule, got, "Save the picture as one of these.")
+    if spec.scene.near_m or spec.scene.far_m != (math.inf,):
+        cure = 'Write far = ["inf"]; the curvature of the beam is that of its waist_distance.'
+        yield InputError("scene.far", "a beam takes the place of sources at depths", "depths", cure)
+    if spec.optimize.parametrization == "radial":
+        rule = "rings are computed for even light"
+        yield InputError("optimize.parametrization", rule, '"radial"', 'Use "freeform".')
 
 
 def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:

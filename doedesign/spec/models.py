@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 
 from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
-from doedesign.spec.scene import ObstructionSpec, SceneSpec, SensorSpec
+from doedesign.spec.scene import IlluminationSpec, ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.target import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
@@ -216,6 +216,7 @@ class Spec(SpecTable, frozen=True):
     doe: DoeSpec
     process: ProcessSpec
     scene: SceneSpec
+    illumination: IlluminationSpec | None = optional()
     sensor: SensorSpec
     obstruction: ObstructionSpec | None = optional()
     optimize: OptimizeSpec = OptimizeSpec()

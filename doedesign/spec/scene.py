@@ -1,4 +1,4 @@
-"""Scene, sensor and obstruction: the tables [scene], [sensor] and [obstruction].
+"""Scene, light, sensor and obstruction: the tables [scene], [illumination], [sensor] and [obstruction].
 
 What only `simulate` and `train` need may be left out; a spec without it stays what it was. The occlusion model has no
 default, so that nobody uses one unawares: those two commands ask for it.
@@ -19,10 +19,12 @@ from doedesign.spec.values import (
     OptionsTable,
     Pitch,
     Positive,
+    bounded,
     known,
     length,
+    share,
 )
-from fab.units import MM
+from fab.units import MM, NM, UM
 
 # The same names as in `sim`, which would bring jax along.
 Occlusion = Literal["radiometric", "reciprocal", "paper", "paper_release"]
@@ -56,6 +58,39 @@ class SceneSpec(SpecTable, frozen=True):
     near_m: tuple[NearDepth, ...] = ()
     far_m: tuple[FarDepth, ...] = Field(min_length=1, examples=['["5 m", "10 m"]'])
     occlusion: Occlusion | None = optional()
+
+
+Axis = Annotated[float, length(-1.0, 1.0)]
+Tilt = Annotated[float, bounded("rad", -1.2, 1.2)]
+Diameter = Annotated[float, length(1 * UM, 1.0)]
+Quality = Annotated[float, share(1.0, 3.0)]
+
+
+class IlluminationSpec(SpecTable, frozen=True):
+    """The beam that lights the DOE, instead of a source at a depth. Energies are shares of its power.
+
+    Attributes:
+        kind: "gaussian", or "picture" for a measured beam with a plane wavefront.
+        diameters_m: one diameter or [x, y] at the waist, between the places where the intensity is 1/e² of that in the
+            middle.
+        waist_distance_m: distance of the waist before the DOE, negative behind it.
+        m_squared: beam quality M², one number or [x, y], up to 3: modes of which a beam is the incoherent sum grow in
+            number with its square, and the time of a PSF with them.
+        picture: a file with the beam's intensity, linear: PNG or TIFF, relative to the spec file.
+        pixel_m: distance of its pixels on the DOE.
+        centre_m: [x, y] of the beam's axis, or of the picture's middle, on the DOE.
+        angles_rad: [x, y] between the beam's axis and that of the DOE, positive where light travels toward +x or +y.
+            Images lie about the axis of the beam.
+    """
+
+    kind: Literal["gaussian", "picture"] = Field(examples=['"gaussian"'])
+    diameters_m: Annotated[tuple[Diameter, ...], BeforeValidator(_as_list)] = optional(())
+    waist_distance_m: Annotated[float, length(-100.0, 100.0)] = optional(0.0)
+    m_squared: Annotated[tuple[Quality, ...], BeforeValidator(_as_list)] = optional((1.0,))
+    picture: str | None = optional()
+    pixel_m: Annotated[float, length(10 * NM, 10 * MM)] | None = optional()
+    centre_m: tuple[Axis, Axis] = optional((0.0, 0.0))
+    angles_rad: tuple[Tilt, Tilt] = optional((0.0, 0.0))
 
 
 class ObstructionSpec(SpecTable, frozen=True):

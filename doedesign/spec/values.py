@@ -19,6 +19,7 @@ from fab.units import MM, NM, UM, format_length, parse_angle, parse_length
 
 FROM_TOML = "toml"
 HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
+BEAM_FILES = (".png", ".tif", ".tiff")
 
 
 # The built-in objectives, each a function of the same name in `doedesign.design.objectives`, and those of them that

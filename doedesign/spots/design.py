@@ -80,6 +80,8 @@ class SpotTask:
         rate = camera.waves_per_metre(camera.lines[0].wavelength_m)
         staircase = Staircase.of(2 * np.pi * rate * levels.heights_m())
         grid, coverage = camera.grid, circle_coverage(camera.grid, camera.aperture_m)
+        if camera.beam is not None:
+            coverage = (coverage * camera.irradiance(camera.lines[0].wavelength_m)).astype(np.float32)
         if spec.spots.period_m is not None:
             grid = unit_cell(spec.spots, camera)
             coverage = np.ones(grid.shape, np.float32)

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -174,7 +174,11 @@ def order_table(
         depth_m: distance of the source.
     """
     camera, line = optic.camera, optic.camera.lines[0]
-    field, coverage, grid = np.asarray(optic.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
+    plain = optic if camera.beam is None else replace(optic, camera=replace(camera, beam=None))
+    field, coverage, grid = np.asarray(plain.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
+    if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
+        light = camera.irradiance(line.wavelength_m)
+        field, coverage = field * light, coverage * light
     if period_m is not None:
         field, coverage, grid = _whole_periods(field, coverage, grid, period_m)
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]

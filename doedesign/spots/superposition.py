@@ -96,7 +96,7 @@ class SpotProblem:
     Attributes:
         spots: where light should go.
         staircase: its levels.
-        coverage: `[y, x]` open share of every cell.
+        coverage: `[y, x]` open share of every cell, times the irradiance of the beam that lights it.
         sums: the sum over its cells, for the spots' directions.
         grid: its cells.
     """
