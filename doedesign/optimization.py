@@ -23,6 +23,7 @@ from doedesign.design.optimize import (
     steps,
 )
 from doedesign.design.problem import Problem, SourceSet, problem_of
+from doedesign.prediction import on_target
 from doedesign.report.history import plot_history
 from doedesign.runs.folder import (
     Run,
@@ -55,6 +56,7 @@ from sim.rigorous.edge_optic import optic_as_drawn
 from sim.transfer import mtf
 
 if TYPE_CHECKING:
+    from doedesign.areas.design import AreaState
     from doedesign.spots.design import SpotState
 
 log = logging.getLogger("doedesign")
@@ -92,8 +94,8 @@ def optimize(
     files = input_files(spec)
     if out is not None:
         return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)
-    if spec.spots is not None:
-        return _spots_design(spec)
+    if (aimed := _aimed_design(spec)) is not None:
+        return aimed
     problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(steps(spec, problem, sources, state), spec, state, [])
@@ -115,9 +117,8 @@ def _optimize_in(
             return open_design(folder, False)
         log.info("preparing sources and propagation")
         terms: tuple[Term, ...] = ()
-        if spec.spots is not None:
-            design = _spots_design(spec, run)
-        else:
+        design = _aimed_design(spec, run)
+        if design is None:
             problem, sources = problem_of(spec, files, objectives)
             state, history = _resume(run, problem, sources, files)
             begin_run(run)
@@ -151,27 +152,37 @@ def _resume(
     return OptimizationState(parameters, adam, step), history
 
 
-def _spots_design(spec: Spec, run: Run | None = None) -> Design:
-    """Design the spots of a spec; in a run, go on from its checkpoint."""
-    from doedesign.spots.design import SpotState, SpotTask
+def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
+    """Design what the spots or the area of a spec ask for; in a run, go on from its checkpoint.
 
-    task, history = SpotTask.from_spec(spec), []
-    waves = [np.zeros(task.problem.spots.count)] * 4
-    stored = None if run is None else load_checkpoint(run, [*waves, np.zeros(1)])
+    None for a spec that has neither.
+    """
+    if spec.spots is not None:
+        from doedesign.spots.design import SpotTask
+
+        task = SpotTask.from_spec(spec)
+    elif spec.area is not None:
+        from doedesign.areas.design import AreaTask
+
+        task = AreaTask.from_spec(spec)
+    else:
+        return None
+    stored, history = None if run is None else load_checkpoint(run, task.template), []
     if stored is None:
-        log.info(f"searching phases of {task.problem.spots.count} spots, {task.table.starts} starts")
-        state = task.initial_state()
+        log.info(task.begins)
+        state: Any = task.initial_state()
     else:
         arrays, step, history = stored
         log.info(f"resuming after step {step}")
-        state = SpotState.of(arrays, step)
+        state = task.state_of(arrays, step)
     if run is not None:
         begin_run(run)
-    state, history = _iterate(task.steps(state), spec, state, history, run)
+    work: Any = task.steps(state)
+    state, history = _iterate(work, spec, state, history, run)
     return task.finished(state, history)
 
 
-_State = TypeVar("_State", OptimizationState, "SpotState")
+_State = TypeVar("_State", OptimizationState, "SpotState", "AreaState")
 
 
 def _iterate(
@@ -225,15 +236,12 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
         metrics["accuracy"] = without_infinities([one._asdict() for one in budget])
         remark = in_words(budget, camera)
         log.info(remark)
-    if spec.spots is not None:
-        from doedesign.spots.design import orders_of_design
-
-        table = orders_of_design(design, drawn)
-        metrics["orders"] = table.summary()
-        log.info(table.describe())
-        write_atomic(run.path("orders.csv"), table.to_csv().encode())
-        save(table.plot(), run.path("orders.png"))
-        names += ["orders.csv", "orders.png"]
+    if (aimed := on_target(design, drawn)) is not None:
+        metrics[aimed.name] = aimed.summary()
+        log.info(aimed.describe())
+        write_atomic(run.path(f"{aimed.name}.csv"), aimed.to_csv().encode())
+        save(aimed.plot(), run.path(f"{aimed.name}.png"))
+        names += [f"{aimed.name}.csv", f"{aimed.name}.png"]
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
     save(plot_height(HeightMap(height, camera.grid, spec.doe.aperture_m), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far, remark=remark), run.path("psf.png"))

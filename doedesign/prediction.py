@@ -4,15 +4,20 @@
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from doedesign.design.design import Design
 from fab.level_map import LevelMap
 from fab.process import Process, Variation
 from sim.camera import Camera
 from sim.metrics import metric_rows
+from sim.optic import CellOptic
 from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
+
+if TYPE_CHECKING:
+    from doedesign.areas.shape import AreaTable
+    from doedesign.spots.orders import OrderTable
 
 
 class Prediction(NamedTuple):
@@ -36,8 +41,25 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
 
 def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[dict[str, Any]]:
     """Numbers of a DOE as fabricated, one row per depth and colour (`sim.metrics.METRICS`, table "fabricated")."""
-    nominal = as_drawn(design.camera, design.level_map, design.depths_m)
-    return metric_rows(bank.metric_inputs(design.near_m, surface, nominal), "fabricated")
+    nominal, found = as_drawn(design.camera, design.level_map, design.depths_m), on_target(design, surface)
+    aimed = None if found is None else found.measures()
+    return metric_rows(bank.metric_inputs(design.near_m, surface, nominal, aimed=aimed), "fabricated")
+
+
+def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | None":
+    """Light on what a design should draw, spots or an area, of the design as drawn or as fabricated.
+
+    None for a design that should draw neither.
+    """
+    if design.spec is None or (design.spec.spots is None and design.spec.area is None):
+        return None
+    if design.spec.spots is not None:
+        from doedesign.spots.design import orders_of_design
+
+        return orders_of_design(design, doe)
+    from doedesign.areas.shape import area_of_design
+
+    return area_of_design(design, doe)
 
 
 @lru_cache(maxsize=1)

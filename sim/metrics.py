@@ -256,6 +256,7 @@ class MetricInputs:
     doe: CellOptic | None = None  # the DOE
     nominal: CellOptic | None = None  # the DOE exactly as drawn, to compare with
     lens: Any = None  # PSFs of the bare lens, to compare with
+    aimed: Mapping[str, float] | None = None  # numbers of what the DOE should draw, for the first colour
 
     def of_colours(self, values: Any) -> list[Any]:
         """Values for `doe.wavelengths_m` as their weighted sums for every colour."""
@@ -328,6 +329,7 @@ class Metric:
     # On which side a DOE is bad, for limits and yield; None for a number without limits
     worse: Literal["high", "low"] | None = None
     unit: Literal["1", "%", "m"] = "1"  # "1", "m", or "%" for a share, which is shown in per cent
+    aimed: bool = False  # whether it is known only of a DOE that should draw something
 
     @property
     def share(self) -> bool:
@@ -336,6 +338,11 @@ class Metric:
 
 
 _BOTH = ("design", "fabricated")
+
+
+def _aimed_metric(name: str, label: str, worse: Literal["high", "low"]) -> Metric:
+    return Metric(label, lambda e, c, d: (e.aimed or {})[name], ("fabricated",), "far", worse, "%", aimed=True)
+
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
@@ -378,6 +385,9 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             "far",
             unit="m",
         ),
+        "on_target": _aimed_metric("on_target", "light on the target", "low"),
+        "uniformity_error": _aimed_metric("uniformity_error", "uniformity error", "high"),
+        "contrast": _aimed_metric("contrast", "contrast", "high"),
     }
 )
 
@@ -393,6 +403,8 @@ def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) ->
         for c, colour in enumerate(inputs.camera.colours):
             row: dict[str, Any] = {"colour": colour.name, "depth_m": None if np.isinf(depth) else depth}
             for name, metric in METRICS.items():
+                if metric.aimed and (c > 0 or name not in (inputs.aimed or {})):
+                    continue
                 if table in metric.tables and metric.depths in shown:
                     value = metric.of(inputs, c, d)
                     row[name] = None if value is None else float(value)

@@ -3,7 +3,7 @@
 # Abstract fields become fields, or properties, of subclasses.
 # pyright: reportIncompatibleVariableOverride=false
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -67,14 +67,17 @@ class PsfBank(eqx.Module):
         doe: CellOptic | None = None,
         nominal: CellOptic | None = None,
         lens: "PsfBank | None" = None,
+        aimed: Mapping[str, float] | None = None,
     ) -> MetricInputs:
         """These PSFs for metrics, with the DOE that makes them, as it is and as drawn, and those of the bare lens.
+
+        `aimed` are numbers of what the DOE should draw (`sim.metrics.METRICS`).
 
         A ValueError where the camera is not known.
         """
         if self.camera is None:
             raise ValueError("`bank.camera` must be known for metrics, but it is None; give it by `bank.with_camera`")
-        return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy)
+        return MetricInputs(self.energy, self.depths_m, self.camera, near_m, doe, nominal, lens and lens.energy, aimed)
 
     def metric(self, name: str) -> Table:
         """A metric of `sim.metrics.METRICS` that needs nothing but PSFs and their camera, `[wavelength, depth]`."""

@@ -79,17 +79,23 @@ _PATTERNS: dict[str, tuple[Callable[[Camera, dict[str, Any], str], np.ndarray], 
 }
 
 
-def _picture(camera: Camera, path: Path) -> Image:
-    """A picture's luminance in linear light, resized to the window, top row at the highest y."""
+def picture_light(path: Path) -> Image:
+    """A picture's luminance in linear light, from 0 to 1, top row at the highest y."""
     from skimage.color import rgb2gray
-    from skimage.transform import resize
 
     exact = path.suffix.lower() in (".png", *TIFF_FILES)
     values = read_pixels(path, others="RGBA") if exact else read_display(path)
     light = linear_from_srgb(values / (np.iinfo(values.dtype).max if values.dtype.kind in "ui" else 1.0))
     if light.ndim == 3:
         light = rgb2gray(light[..., :3]) if light.shape[2] > 2 else light[..., 0]
-    return np.asarray(resize(light, (camera.window, camera.window), anti_aliasing=True))
+    return np.asarray(light)
+
+
+def _picture(camera: Camera, path: Path) -> Image:
+    """A picture's light, resized to the window."""
+    from skimage.transform import resize
+
+    return np.asarray(resize(picture_light(path), (camera.window, camera.window), anti_aliasing=True))
 
 
 def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, where: str) -> Image:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from doedesign.design.design import Design
-from doedesign.prediction import plate_rows
+from doedesign.prediction import on_target, plate_rows
 from doedesign.runs.folder import Run
 from doedesign.runs.level_maps import open_design
 from doedesign.runs.results import results_folder
@@ -22,10 +22,11 @@ from sim.plots.leakage import plot_split
 from sim.plots.psfs import plot_psfs
 from sim.psf_bank import PsfBank, psf
 from sim.store import write_bank
-from sim.surface import FabricatedDoe, as_fabricated
+from sim.surface import as_fabricated
 from sim.surface.leakage import SplitPsf, split_psf
 
 if TYPE_CHECKING:
+    from doedesign.areas.shape import AreaTable
     from doedesign.spots.orders import OrderTable
 
 # Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand; of sharp
@@ -45,7 +46,7 @@ class FabricatedPsfs(NamedTuple):
         rows: metrics of both, "nominal" and "fabricated", a row per depth and colour (`doedesign.prediction`); those of
             the DOE with "split", the energy in the window by origin, whose three parts sum to the throughput.
         variation: errors of the DOE.
-        orders: tables of both where the spec has spots, under the same names as the rows; empty otherwise.
+        aimed: tables of both where the spec has spots or an area, under the same names as the rows; empty otherwise.
     """
 
     bank: PsfBank
@@ -53,7 +54,7 @@ class FabricatedPsfs(NamedTuple):
     splits: dict[tuple[int, int], SplitPsf]
     rows: dict[str, list[dict[str, Any]]]
     variation: Variation
-    orders: "dict[str, OrderTable]"
+    aimed: "dict[str, OrderTable | AreaTable]"
 
 
 def fabricated(
@@ -120,17 +121,8 @@ def _computed(design: Design, process: Process, errors: Variation) -> Fabricated
         split = splits[bank.colours.index(row["colour"]), d]
         parts = {"leaked": split.leaked, "diffracted": split.diffracted, "interference": split.interference}
         row["split"] = {name: float(part.sum(dtype=np.float64)) for name, part in parts.items()}
-    return FabricatedPsfs(
-        bank, nominal, splits, rows, errors, _orders(design, {"nominal": drawn, "fabricated": surface})
-    )
-
-
-def _orders(design: Design, does: dict[str, FabricatedDoe]) -> "dict[str, OrderTable]":
-    if design.spec is None or design.spec.spots is None:
-        return {}
-    from doedesign.spots.design import orders_of_design
-
-    return {name: orders_of_design(design, doe) for name, doe in does.items()}
+    aimed = {name: on_target(design, doe) for name, doe in (("nominal", drawn), ("fabricated", surface))}
+    return FabricatedPsfs(bank, nominal, splits, rows, errors, {k: v for k, v in aimed.items() if v is not None})
 
 
 def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> None:
@@ -139,12 +131,12 @@ def _write(folder: Path, design: Design, found: FabricatedPsfs, words: str) -> N
     )
     (folder / "variation.toml").write_text(variation_to_toml(found.variation, [words]), encoding="utf-8")
     metrics: dict[str, Any] = {**found.rows, "lens": design.camera.lens_text}
-    if found.orders:
-        metrics["orders"] = {name: table.summary() for name, table in found.orders.items()}
-        made = found.orders["fabricated"]
+    if found.aimed:
+        made = found.aimed["fabricated"]
+        metrics[made.name] = {name: table.summary() for name, table in found.aimed.items()}
         log.info(made.describe())
-        (folder / "orders.csv").write_text(made.to_csv(), encoding="utf-8")
-        save(made.plot(), folder / "orders.png")
+        (folder / f"{made.name}.csv").write_text(made.to_csv(), encoding="utf-8")
+        save(made.plot(), folder / f"{made.name}.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))
     save(plot_psfs(found.bank, design.camera, design.near_m, design.far_m), folder / "fabricated_psf.png")
     orders = [

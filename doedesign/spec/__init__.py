@@ -13,7 +13,7 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     scene       the tables of scene, illumination, obstruction and sensor
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good DOE
-    target      the table of spots
+    targets/    the tables of spots and areas
     wafer       the table of the wafer: dies, mask blanks, chrome
     order       the table of what a mask shop is asked for
     training    the tables of the network and its training
@@ -180,6 +180,8 @@ def input_files(spec: Spec) -> dict[str, Path]:
     for index, objective in enumerate(spec.objectives):
         if "image" in objective.options:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
+    if spec.area is not None and spec.area.picture is not None:
+        named["area.picture"] = spec.area.picture
     beam = spec.illumination
     if beam is not None and beam.picture is not None:
         named["illumination.picture"] = beam.picture

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
 from doedesign.spec.table import toml_key
-from doedesign.spec.target import spot_problems
+from doedesign.spec.targets.areas import area_problems
+from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
 from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
 from fab.errors import InputError
@@ -32,7 +33,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_light, _doe, _sensor, _lens, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
-    rules = (*rules, spot_problems, _illumination)
+    rules = (*rules, spot_problems, area_problems, _illumination)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -182,7 +183,7 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
 
 
 def _objectives(spec: Spec) -> Iterator[InputError]:
-    if not spec.objectives and spec.spots is None and spec.optimize.steps > 0:
+    if not (spec.objectives or spec.spots or spec.area) and spec.optimize.steps > 0:
         rule = "an optimisation must have something to improve"
         yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
     for index, objective in enumerate(spec.objectives):

@@ -14,7 +14,8 @@ from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import IlluminationSpec, ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.table import SpecTable, optional
-from doedesign.spec.target import SpotsSpec
+from doedesign.spec.targets.areas import AreaSpec
+from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
     FROM_TOML,
@@ -207,8 +208,8 @@ class ObjectiveSpec(SpecTable, frozen=True):
 class Spec(SpecTable, frozen=True):
     """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-    `objectives` are the terms of the loss, unless `spots` say where light should go, and `limits` the conditions of a
-    good DOE; `[[objective]]` and `[[limit]]` in TOML.
+    `objectives` are the terms of the loss, unless `spots` or an `area` say where light should go, and `limits` the
+    conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -222,6 +223,7 @@ class Spec(SpecTable, frozen=True):
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
     spots: SpotsSpec | None = optional()
+    area: AreaSpec | None = optional()
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
     order: OrderSpec = optional(OrderSpec())

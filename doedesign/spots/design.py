@@ -11,7 +11,7 @@ from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
 from doedesign.design.patterns import spot_centres_m
 from doedesign.spec import Spec
-from doedesign.spec.target import SpotsSpec
+from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import OrderTable, order_table
 from doedesign.spots.search import search_phases, search_points
@@ -46,11 +46,6 @@ class SpotState(NamedTuple):
     def arrays(self) -> list[Float[np.ndarray, "*a"]]:
         """Arrays that a checkpoint keeps."""
         return [*self.waves, *self.best, np.array([self.merit])]
-
-    @classmethod
-    def of(cls, arrays: list[np.ndarray], step: int) -> "SpotState":
-        """The state of a checkpoint."""
-        return cls(WaveSet(*arrays[:2]), WaveSet(*arrays[2:4]), float(arrays[4][0]), step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +98,20 @@ class SpotTask:
         )  # fmt: skip
         tried = [self._after(SpotState(waves, waves, -np.inf, 0), _TRIAL_STEPS) for waves in found.waves]
         return max(tried, key=lambda state: state.merit)._replace(step=0)
+
+    @property
+    def template(self) -> list[np.ndarray]:
+        """Arrays of the shapes and kinds of a checkpoint's."""
+        return [*[np.zeros(self.problem.spots.count)] * 4, np.zeros(1)]
+
+    def state_of(self, arrays: list[np.ndarray], step: int) -> SpotState:
+        """The state of a checkpoint."""
+        return SpotState(WaveSet(*arrays[:2]), WaveSet(*arrays[2:4]), float(arrays[4][0]), step)
+
+    @property
+    def begins(self) -> str:
+        """How a design begins, in words."""
+        return f"searching phases of {self.problem.spots.count} spots, {self.table.starts} starts"
 
     def _after(self, state: SpotState, steps: int) -> SpotState:
         for _ in range(steps):

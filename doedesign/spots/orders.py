@@ -109,6 +109,11 @@ class OrderTable:
         """Mean spot over the strongest stray order."""
         return None if not self.strongest_stray else self.total / self.spots.count / self.strongest_stray
 
+    @property
+    def name(self) -> str:
+        """Name of its files and of its entry among metrics."""
+        return "orders"
+
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
         return {
@@ -124,6 +129,10 @@ class OrderTable:
             "light": self.light,
             "spots": [float(one) for one in self.efficiency],
         }
+
+    def measures(self) -> dict[str, float]:
+        """What a tolerance study follows."""
+        return {"on_target": self.total, "uniformity_error": self.uniformity_error}
 
     def describe(self) -> str:
         """One line."""

@@ -1,12 +1,12 @@
 """The table [spots]: where a DOE should send its light, spot by spot; its rules, and what may stand beside it."""
 
-import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
 from doedesign.spec.table import SpecTable, optional, toml_key
+from doedesign.spec.targets.beside import beside_problems, no_defocus
 from doedesign.spec.values import Count, NotNegative, Positive, broken, length
 from fab.errors import InputError
 from fab.units import MM, UM, format_length
@@ -95,7 +95,8 @@ def spot_problems(spec: "Spec") -> Iterator[InputError]:
     for problem in _keys(spec):
         complete = False
         yield problem
-    yield from _beside(spec)
+    yield from beside_problems(spec, "spots")
+    yield from no_defocus(spec)
     if complete:
         yield from _reach(spec)
 
@@ -112,25 +113,6 @@ def _keys(spec: "Spec") -> Iterator[InputError]:
             yield InputError(f"spots.{toml_key(name)}", rule, toml_key(name), "Remove it.")
     if spots.period_m is not None and any(spots.offset_m):
         yield InputError("spots.offset", "orders of a unit cell cannot be moved", "an offset", "Remove it.")
-
-
-def _beside(spec: "Spec") -> Iterator[InputError]:
-    if spec.objectives:
-        yield InputError("spots", "takes the place of objectives", "both", "Remove [spots] or every [[objective]].")
-    if spec.scene.near_m or spec.scene.far_m != (math.inf,):
-        yield InputError("scene.far", 'spots are made of a collimated beam: far = ["inf"]', "others", "Change it.")
-    if spec.sensor.defocus_m:
-        got = format_length(spec.sensor.defocus_m)
-        yield InputError("sensor.defocus", "spots lie in the focal plane", got, "Leave it out.")
-    if spec.optics.propagation != "far_field":
-        got = f'"{spec.optics.propagation}"'
-        yield InputError("optics.propagation", "spots are computed by the far field", got, "Leave it out.")
-    if spec.process.chooses_depths:
-        yield InputError("process.etch_depths", "spots need known depths", '"optimize"', "Give them, or leave it out.")
-    for name, usual in (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through")):
-        if (got := getattr(spec.optimize, name)) != usual:
-            rule = "spots have starts and levels of their own"
-            yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
 
 
 def _reach(spec: "Spec") -> Iterator[InputError]:

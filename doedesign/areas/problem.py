@@ -1,0 +1,123 @@
+"""Light of a phase on the lattice of an area: two matrix products, exact for square cells, and its gradient.
+
+All that lies off the lattice is left free. What is asked of a design is its merit: the share of light on the area, less
+so many times its contrast, to which a border in the wrong place is added.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from doedesign.areas.target import AreaTarget
+from sim.camera import Camera, path_at_m
+
+
+class AreaLight(NamedTuple):
+    """Light of an area.
+
+    Attributes:
+        efficiency: share of the incident light on it, Fresnel loss left out.
+        contrast: root of the mean square of light over the light wanted less 1, where it should be flat; of a picture,
+            of the difference from what is wanted, over its mean.
+        misplaced: root of the mean square by which the light on the border is not half of that inside.
+    """
+
+    efficiency: Float[Array, ""]
+    contrast: Float[Array, ""]
+    misplaced: Float[Array, ""]
+
+
+class AreaProblem(eqx.Module):
+    """A DOE to be designed for an area.
+
+    Attributes:
+        amplitudes: `[mode, y, x]` wave on every cell by mode of the beam, its open share and the root of its power
+            included; its squares sum to the light that passes the opening.
+        along_y: `[v, y]` factors of the rows, exp(-2 pi i u y) with the cell's sinc, for the rows of the lattice.
+        along_x: `[u, x]` the same of the columns.
+        wanted: `[v, u]` light wanted, its mean over the flat part 1.
+        lit: where light counts as that of the area.
+        even: `[v, u]` weights of squared differences in the contrast.
+        border: `[place, v]` and `[place, u]` weights for the light at places on the border.
+    """
+
+    amplitudes: Complex[Array, "mode y x"]
+    along_y: Complex[Array, "v y"]
+    along_x: Complex[Array, "u x"]
+    wanted: Float[Array, "v u"]
+    lit: Bool[Array, "v u"]
+    even: Float[Array, "v u"]
+    border: tuple[Float[Array, "n v"], Float[Array, "n u"]]
+
+    @classmethod
+    def of(cls, target: AreaTarget, camera: Camera, coverage: Float[np.ndarray, "y x"]) -> "AreaProblem":
+        """The problem of a target for the first wavelength of a camera."""
+        rows, columns = lattice_factors(target, camera)
+        flat, even = target.flat, (target.flat | target.dark).astype(float)
+        return cls(
+            jnp.asarray(incident_amplitudes(camera, coverage)),
+            jnp.asarray(rows, jnp.complex64),
+            jnp.asarray(columns, jnp.complex64),
+            jnp.asarray(target.wanted / target.wanted[flat].mean(), jnp.float32),
+            jnp.asarray(target.lit),
+            jnp.asarray(even / flat.sum(), jnp.float32),
+            (jnp.asarray(target.border[0], jnp.float32), jnp.asarray(target.border[1], jnp.float32)),
+        )
+
+    def light(self, phase: Float[Array, "y x"]) -> Float[Array, "v u"]:
+        """Share of the incident light on every sample of the lattice."""
+        wave = jnp.exp(1j * phase)
+
+        def of_mode(amplitude: Array) -> Array:
+            field = self.along_y @ (amplitude * wave) @ self.along_x.T
+            return field.real**2 + field.imag**2
+
+        return jnp.sum(jax.lax.map(of_mode, self.amplitudes), axis=0)
+
+    def judge(self, light: Float[Array, "v u"]) -> AreaLight:
+        """Efficiency and contrast of light on the lattice."""
+        efficiency = jnp.sum(jnp.where(self.lit, light, 0.0))
+        weights = self.even * self.wanted
+        mean = jnp.sum(weights * light) / jnp.sum(weights * self.wanted)  # of the scale that fits best
+        over = light / jnp.maximum(mean, 1e-30)
+        missed = jnp.sum(self.even * (over - self.wanted) ** 2)
+        rows, columns = self.border
+        misplaced = jnp.sum((jnp.sum(rows @ over * columns, axis=1) - 0.5) ** 2) / max(1, len(rows))
+        return AreaLight(efficiency, jnp.sqrt(missed + 1e-12), jnp.sqrt(misplaced + 1e-12))
+
+    def loss(self, phase: Float[Array, "y x"], uniformity: float) -> tuple[Array, AreaLight]:
+        """One less the merit, and the numbers that it is made of."""
+        light = self.judge(self.light(phase))
+        uneven = jnp.sqrt(light.contrast**2 + light.misplaced**2)
+        return 1.0 - light.efficiency + uniformity * uneven, light
+
+
+def incident_amplitudes(camera: Camera, coverage: Float[np.ndarray, "y x"]) -> Complex[np.ndarray, "mode y x"]:
+    """Wave `[mode, y, x]` behind the opening for the first wavelength, curvature of lens and sensor included."""
+    first = camera.lines[0]
+    waves = path_at_m(camera, camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x"), np.inf) / first.wavelength_m
+    waves = np.broadcast_to(waves, camera.grid.shape)
+    power = camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
+    wave = coverage * np.sqrt(power) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+    if camera.beam is None:
+        return wave[None].astype(np.complex64)
+    own = [line for line in camera.lines if line[:2] == first[:2]]
+    modes = [np.sqrt(share) * camera.incident(line) * wave for share, line in zip(camera.beam.shares, own, strict=True)]
+    return np.stack(modes).astype(np.complex64)
+
+
+def lattice_factors(
+    target: AreaTarget, camera: Camera
+) -> tuple[Complex[np.ndarray, "v y"], Complex[np.ndarray, "u x"]]:
+    """Factors of rows and columns from cells to the lattice; the square of a sum of unit power is a share of light."""
+    found, wavelength, pitch = [], camera.lines[0].wavelength_m, camera.grid.pitch_m
+    for axis, sines in (("y", target.sines_y), ("x", target.sines_x)):
+        turns = np.outer(sines / wavelength, camera.grid.axis_m(axis))  # pyright: ignore[reportArgumentType]
+        # A cell sends |sinc|² pitch² into the square of sines (wavelength)²; a sample stands for a step of sines.
+        share = np.sqrt(pitch * (sines[1] - sines[0]) / wavelength) * np.sinc(sines * pitch / wavelength)
+        found.append(share[:, None] * np.exp(-2j * np.pi * (turns - np.rint(turns))))
+    return found[0], found[1]

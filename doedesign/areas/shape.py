@@ -1,0 +1,251 @@
+"""Shape of the light that a DOE makes of an area: how much lies on it, how even, how wide, how sharp its edges are."""
+
+import csv
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from doedesign.areas.problem import lattice_factors
+from doedesign.areas.target import FLAT, OUTER, AreaTarget
+from doedesign.design.design import Design
+from doedesign.spec import input_files
+from sim.camera import Camera
+from sim.metrics import zeroth_order
+from sim.optic import CellOptic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+_SAMPLES = 6.0  # per lambda d / D, twice as many as the optimiser has
+# Profiles are means over so much of a side, on either side of the middle: straight sides bear more than round ones.
+_STRAIGHT, _ROUND = 0.1, 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Light along a line through the middle of an area, over the mean of its flat part.
+
+    Attributes:
+        place_m: places from the middle.
+        light: light there.
+        wanted: light wanted.
+        size_m: distance between the outermost places with half the light; None without them.
+        edge_m: mean of the distances from 90 to 13.5 % on both sides; None where there is no such fall.
+    """
+
+    place_m: Float[np.ndarray, " n"]
+    light: Float[np.ndarray, " n"]
+    wanted: Float[np.ndarray, " n"]
+
+    @property
+    def size_m(self) -> float | None:
+        """Distance between the outermost places with half the light."""
+        ends = [self._half(side) for side in (-1, 1)]
+        return None if None in ends else float(ends[1] - ends[0])  # pyright: ignore[reportOptionalOperand]
+
+    @property
+    def edge_m(self) -> float | None:
+        """Mean of the distances from 90 to 13.5 % of the light on both sides."""
+        widths = []
+        for side in (-1, 1):
+            half = self._half(side)
+            if half is None:
+                return None
+            place, light = side * self.place_m[::side], self.light[::side]
+            outside, inside = place >= side * half, place <= side * half
+            low = _crossing(place[outside], light[outside], OUTER)
+            high = _crossing(-place[inside][::-1], light[inside][::-1], FLAT)
+            if low is None or high is None:
+                return None
+            widths.append(low + high)
+        return float(np.mean(widths))
+
+    def _half(self, side: int) -> float | None:
+        """Outermost place with half the light on a side."""
+        found = _crossing(self.place_m[::-side], self.light[::-side], 0.5)
+        return None if found is None or self.place_m[::-side][0] * side <= 0 else found
+
+
+def _crossing(place: Float[np.ndarray, " n"], light: Float[np.ndarray, " n"], level: float) -> float | None:
+    """The first place where light crosses a level."""
+    above = light >= level
+    changes = np.flatnonzero(above[1:] != above[:-1])
+    if not len(changes):
+        return None
+    k = changes[0]
+    return float(place[k] + (place[k + 1] - place[k]) * (level - light[k]) / (light[k + 1] - light[k]))
+
+
+@dataclass(frozen=True, eq=False)
+class AreaTable:
+    """Light on the area of a design.
+
+    Attributes:
+        target: the area, on a lattice finer than that of the optimiser.
+        light: `[y, x]` light on the lattice over the mean of the flat part.
+        camera: optics and sensor.
+        efficiency: share of the incident light where at least 13.5 % is wanted, Fresnel loss left out.
+        contrast: root mean square of light over what is wanted less 1, where at least 90 % is.
+        pixel_contrast: standard deviation over mean of the sensor's pixels that lie in the flat part, an edge away
+            from its border; None without such pixels, and for pictures.
+        zeroth_order: share of the light that passes as if the DOE were flat.
+        side_lobe: strongest light where less than 13.5 % is wanted, over the mean of the flat part.
+        fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
+        along_x: profile along x; None for a picture.
+        along_y: profile along y; None for a picture.
+    """
+
+    target: AreaTarget
+    light: Float[np.ndarray, "v u"]
+    camera: Camera
+    efficiency: float
+    contrast: float
+    pixel_contrast: float | None
+    zeroth_order: float
+    side_lobe: float
+    fresnel: float
+    along_x: Profile | None
+    along_y: Profile | None
+
+    @property
+    def name(self) -> str:
+        """Name of its files and of its entry among metrics."""
+        return "area"
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers, for metrics."""
+        profiles = (("x", self.along_x), ("y", self.along_y))
+        sizes = {f"size_{name}_m": p and p.size_m for name, p in profiles}
+        edges = {f"edge_{name}_m": p and p.edge_m for name, p in profiles}
+        return {
+            "efficiency": self.efficiency,
+            "contrast": self.contrast,
+            "pixel_contrast": self.pixel_contrast,
+            "zeroth_order": self.zeroth_order,
+            "side_lobe": self.side_lobe,
+            **sizes,
+            **edges,
+            "ceiling": None,
+            "ceiling_source": "none known",
+            "fresnel_transmission": self.fresnel,
+            "light": self.camera.light,
+        }
+
+    def measures(self) -> dict[str, float]:
+        """What a tolerance study follows."""
+        return {"on_target": self.efficiency, "contrast": self.contrast}
+
+    def describe(self) -> str:
+        """One line."""
+        size = ""
+        if self.along_x is not None and self.along_y is not None:
+            wide = [p.size_m for p in (self.along_x, self.along_y)]
+            size = ", {} x {} um at half the light".format(*("?" if w is None else f"{w * 1e6:.5g}" for w in wide))
+        pixels = "" if self.pixel_contrast is None else f" ({100 * self.pixel_contrast:.2f} % on pixels)"
+        return (
+            f"{self.target.shape}: {100 * self.efficiency:.2f} % of the light (ceiling: none known), contrast "
+            f"{100 * self.contrast:.2f} %{pixels}{size}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
+            f"{100 * (1 - self.fresnel):.1f} % apart"
+        )
+
+    def to_csv(self) -> str:
+        """Both profiles: axis, place in millimetres, light and light wanted."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(["axis", "place_mm", "light", "wanted"])
+        for axis, profile in (("x", self.along_x), ("y", self.along_y)):
+            if profile is not None:
+                rows = zip(profile.place_m * 1e3, profile.light, profile.wanted, strict=True)
+                writer.writerows([axis, *(f"{value:.9g}" for value in row)] for row in rows)
+        return out.getvalue()
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the light of the area and its profiles; on `ax`, or on a new figure."""
+        from doedesign.report.areas import plot_area
+
+        return plot_area(self, ax)
+
+
+def area_of_design(design: Design, doe: CellOptic) -> AreaTable:
+    """Light on the area of a design's spec, of the design as drawn or as fabricated."""
+    assert design.spec is not None
+    assert design.spec.area is not None
+    files = input_files(design.spec)
+    return area_table(doe, AreaTarget.of(design.spec.area, design.camera, files, _SAMPLES))
+
+
+def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
+    """Look at the area of a DOE, in the light of its first wavelength."""
+    light, camera = light_on(doe, target), doe.camera
+    flat, wanted = target.flat, target.wanted
+    mean = np.sum((light * wanted)[flat]) / np.sum((wanted**2)[flat])
+    over = light / max(mean, 1e-300)
+    missed = np.sqrt(np.mean((over - wanted)[flat] ** 2)) / wanted[flat].mean()
+    picture = target.shape == "picture"
+    return AreaTable(
+        target,
+        over,
+        camera,
+        float(light[target.lit].sum()),
+        float(missed),
+        None if picture else _on_pixels(over, target, camera),
+        float(zeroth_order(doe)[0]),
+        float(over[~target.lit].max(initial=0.0)),
+        camera.transmission(camera.lines[0].wavelength_m),
+        None if picture else _profile(over, target, camera, 1),
+        None if picture else _profile(over, target, camera, 0),
+    )
+
+
+def light_on(doe: CellOptic, target: AreaTarget) -> Float[np.ndarray, "v u"]:
+    """Share of the incident light of the first wavelength on every sample of a lattice, Fresnel loss left out."""
+    camera, first = doe.camera, doe.camera.lines[0]
+    rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, camera))
+    modes = [line for line in camera.lines if line[:2] == first[:2]]
+    shares = (1.0,) if camera.beam is None else camera.beam.shares
+    light, power = np.zeros(target.value.shape), camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
+    for line, share in zip(modes, shares, strict=True):
+        field = rows @ np.asarray(doe.field(line)) @ columns.T
+        light += share * power * (field.real**2 + field.imag**2)
+    return light
+
+
+def _places(target: AreaTarget, camera: Camera, axis: int) -> Float[np.ndarray, " n"]:
+    """Places of the rows (axis 0) or columns of a lattice, from the middle of the area and along a line through it."""
+    middle = camera.sines_of(*target.centre_m)
+    if axis == 0:
+        return camera.image_m(target.sines_y, middle[1])[0] - target.centre_m[0]
+    return camera.image_m(middle[0], target.sines_x)[1] - target.centre_m[1]
+
+
+def _profile(over: Float[np.ndarray, "v u"], target: AreaTarget, camera: Camera, axis: int) -> Profile:
+    """Profile along y (axis 0) or x."""
+    across = _places(target, camera, 1 - axis)
+    share = _STRAIGHT if target.shape == "rectangle" else _ROUND
+    near = np.abs(across) <= max(share * target.size_m[1 - axis], np.abs(across).min() * 1.001)
+    light, wanted = (np.compress(near, values, 1 - axis).mean(1 - axis) for values in (over, target.value))
+    return Profile(_places(target, camera, axis), light, wanted)
+
+
+def _on_pixels(over: Float[np.ndarray, "v u"], target: AreaTarget, camera: Camera) -> float | None:
+    """Contrast of the mean light on pixels whose samples all lie inside."""
+    numbers = []
+    for axis in (0, 1):
+        place = _places(target, camera, axis) + target.centre_m[axis]
+        numbers.append(np.floor(place / camera.pixel_m + camera.window / 2).astype(int))
+    rows, columns = (number - number.min() for number in numbers)
+    shape = rows.max() + 1, columns.max() + 1
+    place = np.ravel_multi_index(np.broadcast_arrays(rows[:, None], columns), shape).ravel()
+    count, lit, inside = (
+        np.bincount(place, weights, shape[0] * shape[1])
+        for weights in (None, over.ravel(), target.flat.ravel().astype(float))
+    )
+    whole = (count > 0) & (inside == count)
+    if np.count_nonzero(whole) < 4:
+        return None
+    pixels = lit[whole] / count[whole]
+    return float(pixels.std() / pixels.mean())

@@ -1,0 +1,170 @@
+"""An area to be lit, on a lattice of directions that is fine enough for all that light can draw."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import map_coordinates
+
+from doedesign.design.patterns import picture_light
+from doedesign.spec.targets.areas import AreaSpec
+from fab.errors import InputError
+from sim.camera import Camera
+from sim.illumination import GaussianBeam
+
+# Samples per lambda d / D along each axis. Two would do for all detail of an endless picture; in a small one, light
+# may be even on every sample and uneven between them.
+_SAMPLES = 3.0
+_MARGIN = 2.0  # edges, beyond the area on each side
+OUTER, FLAT = 0.135, 0.9  # of the value inside: where an area begins, and where it is flat
+# The logistic function falls from 90 to 13.5 % over so many times its scale.
+_FALL = np.log(FLAT / (1 - FLAT)) + np.log((1 - OUTER) / OUTER)
+_MOST = 4096  # samples per axis
+_STRAIGHT, _PLACES = 0.3, 13  # share of a side, on either side of its middle, that should be straight; places on it
+_TAPER = 3.0  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class AreaTarget:
+    """An area on a lattice of direction sines.
+
+    Attributes:
+        sines_y: direction sines of the rows, ascending.
+        sines_x: of the columns.
+        value: `[y, x]` light wanted, from 1 in the middle of an area, over an edge, to 0.
+        dark: `[y, x]` where light counts against evenness although none is wanted.
+        centre_m: middle (y, x) of the area on the sensor.
+        size_m: its size (y, x) at half its value; 0 across a line.
+        edge_m: distance from 90 to 13.5 % of the value.
+        shape: its kind.
+        border: `[place, y]` and `[place, x]` weights of rows and columns for the light at places on the border, where
+            it should be half of that inside.
+    """
+
+    sines_y: Float[np.ndarray, " v"]
+    sines_x: Float[np.ndarray, " u"]
+    value: Float[np.ndarray, "v u"]
+    dark: Bool[np.ndarray, "v u"]
+    centre_m: tuple[float, float]
+    size_m: tuple[float, float]
+    edge_m: float
+    shape: str
+    border: tuple[Float[np.ndarray, "n v"], Float[np.ndarray, "n u"]]
+
+    @property
+    def lit(self) -> Bool[np.ndarray, "v u"]:
+        """Where light counts as that of the area."""
+        return self.value >= OUTER
+
+    @property
+    def flat(self) -> Bool[np.ndarray, "v u"]:
+        """Where light should be even, or as the picture has it."""
+        return self.lit if self.shape == "picture" else self.value >= FLAT
+
+    @property
+    def wanted(self) -> Float[np.ndarray, "v u"]:
+        """Light wanted where it should be flat: 1, but for pictures and across lines; elsewhere the value."""
+        return self.value if self.shape in ("picture", "line") else np.where(self.flat, 1.0, self.value)
+
+    @classmethod
+    def of(cls, table: AreaSpec, camera: Camera, files: Mapping[str, Path], samples: float = _SAMPLES) -> "AreaTarget":
+        """The area of a spec for the first wavelength of a camera, so many samples per lambda d / D apart.
+
+        Raises:
+            InputError: a picture that cannot be read or is dark, or an area with too much detail.
+        """
+        wavelength = camera.lines[0].wavelength_m
+        edge = table.edge_m or finest_detail_m(camera)
+        step = wavelength / camera.aperture_m / samples
+        middle, axes = table.offset_m[::-1], []
+        for centre, size in zip(middle, table.size_m, strict=True):
+            half = size / 2 + max(_MARGIN * edge, table.dark_m + edge)
+            ends = [camera.sines_of(*(centre + side * half, 0.0))[0] for side in (-1, 1)]
+            # A multiple of the step from the axis, so that the 0th order is one of the samples.
+            first, last = np.floor(ends[0] / step), np.ceil(ends[1] / step)
+            if last - first > _MOST:
+                rule = f"at most {_MOST} times lambda f / aperture / {samples:g} across"
+                got, cure = f"{last - first:.0f}", "Choose a smaller area or aperture."
+                raise InputError("area", rule, got, cure)
+            axes.append(np.arange(first, last + 1) * step)
+        y, x = camera.image_m(axes[0][:, None], axes[1][None, :])
+        at = y - middle[0], x - middle[1]
+        value = _draw(table, at, edge, files.get("area.picture"))
+        dark = np.zeros(value.shape, bool)
+        if table.dark_m:
+            wider = [size + 2 * table.dark_m for size in table.size_m]
+            dark = (np.abs(at[0]) <= wider[0] / 2) & (np.abs(at[1]) <= wider[1] / 2) & (value < 1 - FLAT)
+        sines = camera.sines_of(*(_border(table) + middle).T)
+        rows, columns = (_between(axis, at) for axis, at in zip(axes, sines, strict=True))
+        return cls(*axes, value, dark, middle, table.size_m, edge, table.shape, (rows, columns))
+
+
+def finest_detail_m(camera: Camera) -> float:
+    """Size of detail that light can draw: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light."""
+    scale = camera.lines[0].wavelength_m * camera.sensor_distance_m
+    finest = 2 * scale / camera.aperture_m
+    if not isinstance(camera.beam, GaussianBeam):
+        return finest
+    quality = np.sqrt(np.prod(camera.beam.m_squared))
+    return float(max(quality * scale / np.pi / np.sqrt(np.prod(camera.beam.radius_m)), finest))
+
+
+def _draw(
+    table: AreaSpec, at_m: tuple[Float[np.ndarray, "v u"], Float[np.ndarray, "v u"]], edge_m: float, path: Path | None
+) -> Float[np.ndarray, "v u"]:
+    """Light wanted at places (y, x) from the middle of an area."""
+    (y, x), (height, width) = np.broadcast_arrays(*at_m), table.size_m
+
+    def within(distance_m: np.ndarray) -> np.ndarray:
+        """Fall across an edge that lies so far outward of a place."""
+        return 1 / (1 + np.exp(np.clip(-distance_m * _FALL / edge_m, -50, 50)))
+
+    if table.shape == "rectangle":
+        return within(height / 2 - np.abs(y)) * within(width / 2 - np.abs(x))
+    if table.shape == "line":
+        along, across, size = (x, y, width) if width else (y, x, height)
+        return within(size / 2 - np.abs(along)) * np.exp(-2 * (across / edge_m) ** 2)
+    if table.shape == "picture":
+        assert path is not None
+        return _picture(path, y / width, x / width)
+    radius = np.hypot(2 * y / height, 2 * x / width)  # 1 on the rim
+    # Distance to the rim along the ray from the middle: exact for a circle.
+    outer = np.hypot(y, x) * (1 / np.maximum(radius, 1e-9) - 1)
+    if table.shape == "ellipse":
+        return within(outer)
+    assert table.inner_m is not None
+    return within(outer) * within(np.hypot(y, x) - table.inner_m / 2)
+
+
+def _border(table: AreaSpec) -> Float[np.ndarray, "n 2"]:
+    """Places (y, x) on the border, from the middle of an area; corners are left alone."""
+    (height, width), along = table.size_m, np.linspace(-_STRAIGHT, _STRAIGHT, _PLACES)
+    found = [np.zeros((0, 2))]
+    if table.shape in ("rectangle", "line"):
+        for side in (-0.5, 0.5):
+            found += [np.stack([along * height, np.full(_PLACES, side * width)], 1)] if width else []
+            found += [np.stack([np.full(_PLACES, side * height), along * width], 1)] if height else []
+    if table.shape in ("ellipse", "ring"):
+        rims = [(height, width)] + ([(table.inner_m, table.inner_m)] if table.inner_m else [])
+        angle = np.linspace(0, 2 * np.pi, 4 * _PLACES, endpoint=False)
+        found += [np.stack([high / 2 * np.sin(angle), wide / 2 * np.cos(angle)], 1) for high, wide in rims]
+    return np.concatenate(found)
+
+
+def _between(axis: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
+    """Weights on equally spaced samples for the values between them: a sinc under a Gaussian window."""
+    away = (at[:, None] - axis) / (axis[1] - axis[0])
+    weights = np.sinc(away) * np.exp(-((away / _TAPER) ** 2) / 2)
+    return weights / weights.sum(1, keepdims=True)
+
+
+def _picture(path: Path, y: Float[np.ndarray, "v u"], x: Float[np.ndarray, "v u"]) -> Float[np.ndarray, "v u"]:
+    """Light of a picture, its brightest part 1, at places in widths from its middle."""
+    light = picture_light(path)
+    if not light.max() > 0:
+        raise InputError(str(path), "the picture must hold some light", "black", "Give another picture.")
+    rows, columns = light.shape
+    places = np.stack([y * columns + (rows - 1) / 2, x * columns + (columns - 1) / 2])
+    return map_coordinates(light / light.max(), places, order=1, mode="constant")

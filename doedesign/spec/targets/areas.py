@@ -1,0 +1,114 @@
+"""The table [area]: a part of the sensor that a DOE should light, and the rules for it."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+
+from doedesign.spec.table import SpecTable, optional, toml_key
+from doedesign.spec.targets.beside import beside_problems
+from doedesign.spec.values import NotNegative, length
+from fab.errors import InputError
+from fab.units import UM, format_length
+from sim.camera import sines_at
+
+if TYPE_CHECKING:
+    from doedesign.spec.models import Spec
+
+Place = Annotated[float, length(-1.0, 1.0)]
+Size = Annotated[float, length(0.1 * UM, 1.0)]
+Shape = Literal["rectangle", "ellipse", "ring", "line", "picture"]
+
+
+class AreaSpec(SpecTable, frozen=True):
+    """An area to be lit, instead of objectives. Its phase is free.
+
+    Attributes:
+        shape: "rectangle" and "ellipse" (`width` and `height`), "ring" (`width`, `inner`), "line" (`width` along x, or
+            `height` along y; as thin as light can be) or "picture" (`picture` and `width`).
+        width_m: size along x on the sensor, where the light should have half its value inside.
+        height_m: size along y; of rectangles and ellipses the width if left out.
+        inner_m: inner diameter of a ring.
+        edge_m: distance over which light should fall from 90 to 13.5 % of its value inside; by default the radius of
+            the focus of a Gaussian beam, 2 wavelength x focal length / aperture for other light.
+        picture: a file with the light to be drawn, relative to the spec file: PNG, TIFF or JPEG, in the usual sRGB.
+        offset_m: [x, y] by which the area is moved on the sensor.
+        dark_m: width of a frame around the area in which light counts against evenness, too.
+        uniformity: how much of the efficiency evenness is worth: the share of light on the area less so many times
+            its contrast, standard deviation over mean, is made as large as it can be. 0 is for light alone.
+    """
+
+    shape: Shape = Field(examples=['"rectangle"'])
+    width_m: Size | None = optional()
+    height_m: Size | None = optional()
+    inner_m: Size | None = optional()
+    edge_m: Size | None = optional()
+    picture: str | None = optional()
+    offset_m: tuple[Place, Place] = optional((0.0, 0.0))
+    dark_m: Annotated[float, length(0.0, 1.0)] = optional(0.0)
+    uniformity: NotNegative = optional(1.0)
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Size (y, x) on the sensor, 0 across a line."""
+        width, height = self.width_m or 0.0, self.height_m or 0.0
+        if self.shape == "line":
+            return height, width
+        return height or width, width
+
+
+_SHAPING = ("width_m", "height_m", "inner_m", "picture")
+# Keys that each shape needs, and those that it may have besides.
+_KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "rectangle": (("width_m",), ("height_m",)),
+    "ellipse": (("width_m",), ("height_m",)),
+    "ring": (("width_m", "inner_m"), ()),
+    "line": ((), ("width_m", "height_m")),
+    "picture": (("picture", "width_m"), ()),
+}
+_ROOM = 1.15  # how much farther than its area light is looked at
+
+
+def area_problems(spec: "Spec") -> Iterator[InputError]:
+    """Return every rule that the area of a spec breaks."""
+    area: Any = spec.area
+    if area is None:
+        return
+    needed, allowed = _KEYS[area.shape]
+    complete = True
+    for name in needed:
+        if getattr(area, name) is None:
+            complete = False
+            cure = f"Add `{toml_key(name)}`, or choose another shape."
+            yield InputError(f"area.{toml_key(name)}", f'shape "{area.shape}" needs it', "nothing", cure)
+    for name in _SHAPING:
+        if getattr(area, name) is not None and name not in (*needed, *allowed):
+            rule = f'shape "{area.shape}" takes: {", ".join(map(toml_key, (*needed, *allowed)))}'
+            yield InputError(f"area.{toml_key(name)}", rule, toml_key(name), "Remove it.")
+    if area.shape == "line" and (area.width_m is None) == (area.height_m is None):
+        complete = False
+        yield InputError("area", "a line has a width or a height", "both or none", "Give one of them.")
+    if area.shape == "ring" and complete and area.inner_m >= area.width_m:
+        rule = f"must be smaller than the width, {format_length(area.width_m)}"
+        yield InputError("area.inner", rule, format_length(area.inner_m), "Choose a smaller one.")
+    if spec.spots is not None:
+        yield InputError("area", "takes the place of spots", "both", "Remove [area] or [spots].")
+    yield from beside_problems(spec, "area")
+    if complete:
+        yield from _reach(spec)
+
+
+def _reach(spec: "Spec") -> Iterator[InputError]:
+    """The rule that the DOE's cells can send light to every corner of the area."""
+    area: Any = spec.area
+    optics, pitch = spec.optics, spec.doe.pitch_m
+    wavelength, distance = optics.colours[0].wavelengths_m[0], optics.focal_length_m + spec.sensor.defocus_m
+    most = wavelength / (2 * pitch)
+    half = [size / 2 + area.dark_m for size in area.size_m]
+    y, x = (abs(at) + reach for at, reach in zip(area.offset_m[::-1], half, strict=True))
+    sine = max(map(abs, sines_at(optics.mapping, optics.distortion, y / distance, x / distance)))
+    if sine * _ROOM > most:
+        rule = f"cells of {format_length(pitch)} light places up to {most * distance / _ROOM / UM:.4g} um from the axis"
+        finer = format_length(float(f"{wavelength / (2 * sine * _ROOM):.4g}"))
+        cure = f"Choose a smaller area, or a pitch of at most {finer}."
+        yield InputError("area", rule, f"{max(y, x) / UM:.4g} um", cure)

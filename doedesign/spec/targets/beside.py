@@ -1,0 +1,42 @@
+"""What may stand beside a table that says where light should go."""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from fab.errors import InputError
+from fab.units import format_length
+
+if TYPE_CHECKING:
+    from doedesign.spec.models import Spec
+
+# Keys of [optimize] that spots and areas decide themselves, with their usual values.
+_OWN = (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through"))
+
+
+def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
+    """Return every rule that the other tables of a spec break beside its `table`, "spots" or "area"."""
+    if spec.objectives:
+        yield InputError(table, "takes the place of objectives", "both", f"Remove [{table}] or every [[objective]].")
+    if spec.scene.near_m or spec.scene.far_m != (math.inf,):
+        rule, cure = (
+            'the light is a collimated beam: far = ["inf"]',
+            "Change it, or describe the beam by [illumination].",
+        )
+        yield InputError("scene.far", rule, "others", cure)
+    if spec.optics.propagation != "far_field":
+        got = f'"{spec.optics.propagation}"'
+        yield InputError("optics.propagation", "they are computed by the far field", got, "Leave it out.")
+    if spec.process.chooses_depths:
+        yield InputError("process.etch_depths", "the depths must be known", '"optimize"', "Give them, or leave it out.")
+    for name, usual in _OWN:
+        if (got := getattr(spec.optimize, name)) != usual:
+            rule = "starts and levels of their own belong to spots and areas"
+            yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
+
+
+def no_defocus(spec: "Spec") -> Iterator[InputError]:
+    """Return the broken rule that spots lie in the focal plane."""
+    if spec.sensor.defocus_m:
+        got = format_length(spec.sensor.defocus_m)
+        yield InputError("sensor.defocus", "spots lie in the focal plane", got, "Leave it out.")
