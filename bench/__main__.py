@@ -17,6 +17,7 @@ TABLES = (
     "bench.train",
     "bench.pipeline",
     "bench.spots",
+    "bench.areas",
 )
 
 

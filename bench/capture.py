@@ -32,7 +32,7 @@ from sim.imaging.convolve import fast_length
 from sim.imaging.formation import Optics, capture, shadow_px
 from sim.imaging.occlusion import Model
 from sim.imaging.scene import Obstruction, Scene
-from sim.noise import photon_noise
+from sim.sensor.noise import photon_noise
 
 TARGET_RATIO, TARGET_S, TARGET_GB = 1.5, 60.0, 8.0
 PIXELS, WINDOW, COLOURS, ROUNDS = 512, 512, 3, 31

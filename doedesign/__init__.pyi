@@ -1,3 +1,6 @@
+from .areas.shape import AreaTable as AreaTable
+from .areas.shape import area_table as area_table
+from .areas.target import AreaTarget as AreaTarget
 from .build import camera_from_spec as camera_from_spec
 from .build import process_from_spec as process_from_spec
 from .calibration.estimate import Calibration as Calibration

@@ -65,10 +65,10 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     light = spec.illumination
     if light is None:
         return None
-    centre_m, angle_rad = light.centre_m[::-1], light.angles_rad[::-1]
+    centre_m, angle_rad = _yx(light.centre_m), _yx(light.angles_rad)
     if light.picture is None:
-        radius_m = tuple(diameter / 2 for diameter in _both(light.diameters_m)[::-1])
-        return GaussianBeam(radius_m, light.waist_distance_m, _both(light.m_squared)[::-1], centre_m, angle_rad)
+        y, x = _yx(light.diameters_m)
+        return GaussianBeam((y / 2, x / 2), light.waist_distance_m, _yx(light.m_squared), centre_m, angle_rad)
     path = input_files(spec)["illumination.picture"]
     picture = read_pixels(path, others="RGBA")
     if picture.ndim == 3:
@@ -79,9 +79,9 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     return MeasuredBeam(picture.astype(np.float64), light.pixel_m, centre_m, angle_rad)
 
 
-def _both(values: Sequence[float]) -> tuple[float, float]:
-    """One number for both axes, or [x, y]."""
-    return values[0], values[-1]
+def _yx(values: Sequence[float]) -> tuple[float, float]:
+    """One number for both axes, or [x, y], as (y, x)."""
+    return values[-1], values[0]
 
 
 def levels_from_spec(spec: ProcessSpec, chosen: Levels | None = None) -> Levels:

@@ -4,6 +4,7 @@ Reading order, from the substance to the picture:
 
     material    refractive index of the DOE substrate, and its Fresnel loss
     aperture    the clear aperture: how much of each DOE cell is open
+    illumination beams that light the DOE
     camera      lens and sensor; the wave a source sends into the aperture
     source      that wave as arrays for one wavelength, depth and field angle
     propagation pupil -> pixel energies: the far field (eqs. 7-9 of the paper), for rings, and the direct path (eq. 5)
@@ -18,8 +19,7 @@ Reading order, from the substance to the picture:
     light       sRGB and linear light
     obstruction fences, raindrops, dirt and masks of a user, drawn from physical parameters
     imaging     from a scene to the light on the sensor
-    noise       fast Poisson counts, and noise that gradients pass through
-    sensor      from light to raw numbers, and back to an image
+    sensor      from light to raw numbers, and back to an image; noise that gradients pass through
     tracing     sums and stacks of arrays that jax may be tracing
     store       PSF banks, height maps and pictures as OpenEXR files
     plots       pictures of all this

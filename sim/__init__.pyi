@@ -1,6 +1,8 @@
 from .camera import Camera as Camera
 from .camera import Colour as Colour
 from .camera import SpectralLine as SpectralLine
+from .illumination import GaussianBeam as GaussianBeam
+from .illumination import MeasuredBeam as MeasuredBeam
 from .imaging.field import FieldOptics as FieldOptics
 from .imaging.field import capture_frame as capture_frame
 from .imaging.formation import Optics as Optics

@@ -99,7 +99,7 @@ class MeasuredBeam:
     @cached_property
     def _key(self) -> tuple[object, ...]:
         picture = np.ascontiguousarray(self.intensity, np.float64)
-        return picture.shape, hashlib.sha256(picture).hexdigest(), self.pixel_m, self.centre_m, self.angle_rad
+        return picture.shape, hashlib.sha256(picture.tobytes()).hexdigest(), self.pixel_m, self.centre_m, self.angle_rad
 
     def __eq__(self, other: object) -> bool:
         """Whether all is the same, pixel by pixel."""

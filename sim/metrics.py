@@ -137,7 +137,9 @@ def _mean_over_aperture(doe: CellOptic, values: Any) -> Any:
 
 def _lit_mean(doe: CellOptic, values: Any, wavelength_m: float) -> Any:
     xp = jnp if is_traced(values, doe.coverage) else np
-    weights = xp.asarray(doe.coverage) * doe.camera.irradiance(wavelength_m)
+    light = doe.camera.irradiance(wavelength_m)
+    assert light is not None
+    weights = xp.asarray(doe.coverage) * light
     return xp.sum(xp.asarray(values) * weights) / xp.sum(weights)
 
 
@@ -233,9 +235,9 @@ def energy_budget(
     for line in replace(camera, colours=(colour,)).lines:
         field = np.asarray(optic.field(line, depth_m))
         wavelength, open_ = line.wavelength_m, 1.0
-        if camera.beam is not None:
+        if camera.beam is not None and (light := camera.incident(line)) is not None:
             curvature = camera.curvature_per_m(1 / depth_m) + camera.beam.curvature_per_m(wavelength)
-            open_ = float(np.sum(np.abs(camera.incident(line)) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
+            open_ = float(np.sum(np.abs(light) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
             open_ *= camera.grid.shape[0] ** 2 / scale
         entered += line.factor / camera.transmission(wavelength) * open_
         passed += line.factor * open_

@@ -21,7 +21,7 @@ PLACES = {
         ("sim/surface/relief.py", "(1.0 + variation.common_depth_scale){}"),
     ],
     "An objective": [
-        ("doedesign/spec/values.py", "OBJECTIVES = (\n{}"),
+        ("doedesign/spec/values/__init__.py", "OBJECTIVES = (\n{}"),
         ("doedesign/design/objectives.py", "{}\n\ndef far_spot("),
     ],
     "An obstruction": [

@@ -7,7 +7,7 @@ from tests.mutants import tests_for as meant_for
 
 
 def test_tests_are_found_by_name_first_and_by_what_they_import():
-    found = meant_for("sim/noise.py")
+    found = meant_for("sim/sensor/noise.py")
     assert "tests/sim/test_noise.py" in found[:2]
     assert all((ROOT / test).is_file() for test in found)
     assert meant_for("doedesign/design/patterns.py")[0] == "tests/doedesign/test_objectives.py"

@@ -77,7 +77,7 @@ class AreaTask:
     def initial_state(self) -> AreaState:
         """The phase that carries the beam to the area as rays would."""
         amplitudes, grid = np.asarray(self.problem.amplitudes), self.camera.grid
-        light = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
+        light: Any = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
         wavelength = self.camera.lines[0].wavelength_m
         directions = self.target.sines_y / wavelength, self.target.sines_x / wavelength
         phase = transport_phase(light, (grid.axis_m("y"), grid.axis_m("x")), self.target.value, directions)
@@ -100,7 +100,8 @@ class AreaTask:
 
     def state_of(self, arrays: list[np.ndarray], step: int) -> AreaState:
         """The state of a checkpoint."""
-        return AreaState(*jax.tree.unflatten(jax.tree.structure(self._like), map(jnp.asarray, arrays)), step)
+        phase, free, memory = jax.tree.unflatten(jax.tree.structure(self._like), map(jnp.asarray, arrays))
+        return AreaState(phase, free, memory, step)
 
     @property
     def begins(self) -> str:
@@ -115,8 +116,9 @@ class AreaTask:
             step = state.step
             if (share := self.settled(step)) and step % _BLOCK == 0:
                 state = self._settle(state, share)
-            *changed, loss, light = _step(self.problem, *state[:3], jnp.float32(self.spec.area.uniformity))
-            state = AreaState(*changed, step + 1)
+            uniformity = jnp.float32(self.spec.area.uniformity)
+            phase, memory, loss, light = _step(self.problem, state.phase, state.free, state.memory, uniformity)
+            state = AreaState(phase, state.free, memory, step + 1)
             terms = [float(part) for part in light]
             yield state, {"step": step, "loss": float(loss), "terms": terms, "names": names}
 
@@ -125,7 +127,9 @@ class AreaTask:
         count = self.spec.optimize.steps
         first = _BLOCK * round(_FREE * count / _BLOCK)
         blocks = max(1, (count - first) // _BLOCK)
-        return max(0.0, ((step - first) // _BLOCK + 1) / (blocks + 1))
+        done = max(0.0, ((step - first) // _BLOCK + 1) / (blocks + 1))
+        # Cells that are set last have nobody left to make up for them: few of them at a time.
+        return 1 - (1 - done) ** 1.5
 
     def _settle(self, state: AreaState, share: float) -> AreaState:
         """Set cells near to a level to it, and forget what L-BFGS knows of the others."""
@@ -169,15 +173,17 @@ def _optimiser() -> optax.GradientTransformationExtraArgs:
 @eqx.filter_jit
 def _step(
     problem: AreaProblem, phase: Array, free: Array, memory: Any, uniformity: Array
-) -> tuple[Array, Array, Any, Array, AreaLight]:
-    """One step of L-BFGS over the free cells: phase, what is free, memory; the loss before it and its parts."""
+) -> tuple[Array, Any, Array, AreaLight]:
+    """One step of L-BFGS over the free cells: phase and memory; the loss before it and its parts."""
     start = phase
 
     def loss_of(moved: Array) -> Array:
         return problem.loss(jnp.where(free > 0, moved, start), uniformity)[0]
 
     optimiser = _optimiser()
+    value: Any
     value, gradient = optax.value_and_grad_from_state(loss_of)(phase, state=memory)
     updates, memory = optimiser.update(gradient, memory, phase, value=value, grad=gradient, value_fn=loss_of)
     light = problem.judge(problem.light(phase))
-    return optax.apply_updates(phase, updates), free, memory, value, light
+    moved: Any = optax.apply_updates(phase, updates)
+    return moved, memory, value, light

@@ -15,6 +15,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from doedesign.areas.target import AreaTarget
 from sim.camera import Camera, path_at_m
 
+# By how much light on the edges of an area may differ from what is wanted without harm, over that inside.
+_LEEWAY = 0.1
+
 
 class AreaLight(NamedTuple):
     """Light of an area.
@@ -23,7 +26,8 @@ class AreaLight(NamedTuple):
         efficiency: share of the incident light on it, Fresnel loss left out.
         contrast: root of the mean square of light over the light wanted less 1, where it should be flat; of a picture,
             of the difference from what is wanted, over its mean.
-        misplaced: root of the mean square by which the light on the border is not half of that inside.
+        misplaced: root of the mean square by which the light on the border is not half of that inside, and of what
+            edges differ from the wanted ones beyond a leeway.
     """
 
     efficiency: Float[Array, ""]
@@ -42,6 +46,7 @@ class AreaProblem(eqx.Module):
         wanted: `[v, u]` light wanted, its mean over the flat part 1.
         lit: where light counts as that of the area.
         even: `[v, u]` weights of squared differences in the contrast.
+        edge: `[v, u]` weights of squared differences beyond the leeway on edges.
         border: `[place, v]` and `[place, u]` weights for the light at places on the border.
     """
 
@@ -51,13 +56,14 @@ class AreaProblem(eqx.Module):
     wanted: Float[Array, "v u"]
     lit: Bool[Array, "v u"]
     even: Float[Array, "v u"]
+    edge: Float[Array, "v u"]
     border: tuple[Float[Array, "n v"], Float[Array, "n u"]]
 
     @classmethod
     def of(cls, target: AreaTarget, camera: Camera, coverage: Float[np.ndarray, "y x"]) -> "AreaProblem":
         """The problem of a target for the first wavelength of a camera."""
         rows, columns = lattice_factors(target, camera)
-        flat, even = target.flat, (target.flat | target.dark).astype(float)
+        flat, even = target.flat, target.flat | target.dark
         return cls(
             jnp.asarray(incident_amplitudes(camera, coverage)),
             jnp.asarray(rows, jnp.complex64),
@@ -65,6 +71,7 @@ class AreaProblem(eqx.Module):
             jnp.asarray(target.wanted / target.wanted[flat].mean(), jnp.float32),
             jnp.asarray(target.lit),
             jnp.asarray(even / flat.sum(), jnp.float32),
+            jnp.asarray((target.lit & ~even) / flat.sum(), jnp.float32),
             (jnp.asarray(target.border[0], jnp.float32), jnp.asarray(target.border[1], jnp.float32)),
         )
 
@@ -87,9 +94,10 @@ class AreaProblem(eqx.Module):
         missed = jnp.sum(self.even * (over - self.wanted) ** 2)
         rows, columns = self.border
         misplaced = jnp.sum((jnp.sum(rows @ over * columns, axis=1) - 0.5) ** 2) / max(1, len(rows))
+        misplaced += jnp.sum(self.edge * jnp.maximum(jnp.abs(over - self.wanted) - _LEEWAY, 0.0) ** 2)
         return AreaLight(efficiency, jnp.sqrt(missed + 1e-12), jnp.sqrt(misplaced + 1e-12))
 
-    def loss(self, phase: Float[Array, "y x"], uniformity: float) -> tuple[Array, AreaLight]:
+    def loss(self, phase: Float[Array, "y x"], uniformity: float | Float[Array, ""]) -> tuple[Array, AreaLight]:
         """One less the merit, and the numbers that it is made of."""
         light = self.judge(self.light(phase))
         uneven = jnp.sqrt(light.contrast**2 + light.misplaced**2)

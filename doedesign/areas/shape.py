@@ -44,8 +44,8 @@ class Profile:
     @property
     def size_m(self) -> float | None:
         """Distance between the outermost places with half the light."""
-        ends = [self._half(side) for side in (-1, 1)]
-        return None if None in ends else float(ends[1] - ends[0])  # pyright: ignore[reportOptionalOperand]
+        low, high = (self._half(side) for side in (-1, 1))
+        return None if low is None or high is None else high - low
 
     @property
     def edge_m(self) -> float | None:
@@ -136,7 +136,7 @@ class AreaTable:
         }
 
     def measures(self) -> dict[str, float]:
-        """What a tolerance study follows."""
+        """Numbers that a tolerance study follows."""
         return {"on_target": self.efficiency, "contrast": self.contrast}
 
     def describe(self) -> str:
@@ -179,7 +179,12 @@ def area_of_design(design: Design, doe: CellOptic) -> AreaTable:
 
 
 def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
-    """Look at the area of a DOE, in the light of its first wavelength."""
+    """Look at the area of a DOE, in the light of its first wavelength.
+
+    Args:
+        doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
+        target: the area, on a lattice as fine as its light is to be seen.
+    """
     light, camera = light_on(doe, target), doe.camera
     flat, wanted = target.flat, target.wanted
     mean = np.sum((light * wanted)[flat]) / np.sum((wanted**2)[flat])

@@ -78,7 +78,7 @@ class AreaTarget:
         wavelength = camera.lines[0].wavelength_m
         edge = table.edge_m or finest_detail_m(camera)
         step = wavelength / camera.aperture_m / samples
-        middle, axes = table.offset_m[::-1], []
+        middle, axes = (table.offset_m[1], table.offset_m[0]), []
         for centre, size in zip(middle, table.size_m, strict=True):
             half = size / 2 + max(_MARGIN * edge, table.dark_m + edge)
             ends = [camera.sines_of(*(centre + side * half, 0.0))[0] for side in (-1, 1)]
@@ -98,15 +98,16 @@ class AreaTarget:
             dark = (np.abs(at[0]) <= wider[0] / 2) & (np.abs(at[1]) <= wider[1] / 2) & (value < 1 - FLAT)
         sines = camera.sines_of(*(_border(table) + middle).T)
         rows, columns = (_between(axis, at) for axis, at in zip(axes, sines, strict=True))
-        return cls(*axes, value, dark, middle, table.size_m, edge, table.shape, (rows, columns))
+        sines_y, sines_x = axes
+        return cls(sines_y, sines_x, value, dark, middle, table.size_m, edge, table.shape, (rows, columns))
 
 
 def finest_detail_m(camera: Camera) -> float:
     """Size of detail that light can draw: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light."""
     scale = camera.lines[0].wavelength_m * camera.sensor_distance_m
-    finest = 2 * scale / camera.aperture_m
+    finest = scale / camera.aperture_m
     if not isinstance(camera.beam, GaussianBeam):
-        return finest
+        return 2 * finest
     quality = np.sqrt(np.prod(camera.beam.m_squared))
     return float(max(quality * scale / np.pi / np.sqrt(np.prod(camera.beam.radius_m)), finest))
 

@@ -7,6 +7,8 @@ less blur (M. Cuturi, Adv. Neural Inf. Process. Syst. 26, 2292, 2013); on two re
 matrix products.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import RectBivariateSpline
@@ -55,15 +57,16 @@ def _coarse(
 ) -> tuple[Float[np.ndarray, "v u"], list[np.ndarray]]:
     """A picture on at most so many cells per axis, its sum 1, and their places."""
     shape = [min(n, _CELLS) for n in picture.shape]
-    smaller = np.maximum(zoom(picture, [m / n for m, n in zip(shape, picture.shape, strict=True)], order=1), 0)
+    resized: Any = zoom(picture, [m / n for m, n in zip(shape, picture.shape, strict=True)], order=1)
+    smaller = np.maximum(resized, 0)
     places = [np.linspace(axis[0], axis[-1], m) for axis, m in zip(axes, smaller.shape, strict=True)]
     return smaller / smaller.sum(), places
 
 
 def _potential(
-    source: Float[np.ndarray, "y x"], target: Float[np.ndarray, "v u"], costs: list[Float[np.ndarray, "a b"]]
+    source: Float[np.ndarray, "y x"], target: Float[np.ndarray, "v u"], costs: list[np.ndarray]
 ) -> Float[np.ndarray, "y x"]:
-    """Kantorovich's potential of the source for the cost (y - v)²/2 + (x - u)²/2."""
+    """Kantorovich's potential of the source, for costs `[y, v]` and `[x, u]` that add up."""
     outward, inward = np.zeros(source.shape), np.zeros(target.shape)
     for blur in _BLURS:
         # Potentials are taken out of the exponent, so that it stays small.

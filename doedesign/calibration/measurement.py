@@ -33,8 +33,8 @@ from doedesign.calibration.geometry import USUAL_SIGMA, GeometryPrior
 from doedesign.calibration.target import MeasuredImage
 from doedesign.spec import read_toml, spec_error
 from doedesign.spec.errors import validated
-from doedesign.spec.table import SpecTable
 from doedesign.spec.values import FarDepth, Pitch, Positive, Wavelength, bounded, broken, length, share
+from doedesign.spec.values.table import SpecTable
 from fab.errors import InputError
 from fab.files import sha256_file
 from fab.units import MM

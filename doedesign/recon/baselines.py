@@ -24,8 +24,8 @@ from jaxtyping import Array, Float
 
 from doedesign.recon.wiener import sharpened
 from sim.imaging.convolve import convolve, plan_otf
-from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
 from sim.sensor import Sensor
+from sim.sensor.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA
 
 ITERATIONS = 100
 # Light below which a blurred estimate counts as dark: far below what any sensor tells from black.

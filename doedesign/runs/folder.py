@@ -43,7 +43,7 @@ from doedesign.spec import (
     spec_to_json,
     spec_to_resolved_toml,
 )
-from doedesign.spec.table import toml_key
+from doedesign.spec.values.table import toml_key
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import (

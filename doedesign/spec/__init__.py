@@ -7,8 +7,7 @@
 Every mistake in a file is an `InputError` that names the file, the key, the rule, the value and the cure; several
 are reported together. `spec_warnings` returns what is allowed but probably not meant.
 
-    values      the types of value in a spec: lengths, names, options; the built-in objectives and starts
-    table       common ground of all tables
+    values/     the types of value in a spec: lengths, names, options; common ground of all tables
     models      the tables, one per section of the TOML
     scene       the tables of scene, illumination, obstruction and sensor
     response    colours of a camera from its spectral response
@@ -36,7 +35,6 @@ from doedesign.spec.order import OrderFile, OrderSpec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
-from doedesign.spec.table import toml_key
 from doedesign.spec.text import (
     process_to_toml,
     spec_digest,
@@ -47,6 +45,7 @@ from doedesign.spec.text import (
 )
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import HEIGHT_FILES, STARTS, Options
+from doedesign.spec.values.table import toml_key
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError

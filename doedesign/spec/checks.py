@@ -9,11 +9,11 @@ from collections.abc import Iterator
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
-from doedesign.spec.table import toml_key
 from doedesign.spec.targets.areas import area_problems
 from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
 from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
+from doedesign.spec.values.table import toml_key
 from fab.errors import InputError
 from fab.units import NM, UM, format_length
 from sim.camera import check_lens, image_place

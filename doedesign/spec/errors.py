@@ -13,8 +13,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from doedesign.spec.response import RESPONSE_KEYS
-from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.values import FROM_TOML, nearest
+from doedesign.spec.values.table import SpecTable, toml_key
 from fab.errors import InputError
 
 Location = Sequence[int | str]

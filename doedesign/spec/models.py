@@ -1,7 +1,7 @@
 """The spec: one frozen table per section of the TOML, without arrays and without defaults hidden elsewhere.
 
-`focal_length = "8 mm"` in TOML becomes `focal_length_m = 0.008` (`doedesign.spec.table`). Everything is compared,
-hashed and stored by value. Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
+`focal_length = "8 mm"` in TOML becomes `focal_length_m = 0.008` (`doedesign.spec.values.table`). Everything is
+compared, hashed and stored by value. Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
 """
 
 import re
@@ -13,7 +13,6 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import IlluminationSpec, ObstructionSpec, SceneSpec, SensorSpec
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.targets.areas import AreaSpec
 from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
@@ -36,6 +35,7 @@ from doedesign.spec.values import (
     length,
     share,
 )
+from doedesign.spec.values.table import SpecTable, optional
 from doedesign.spec.wafer import WaferSpec
 from fab.units import NM, UM, parse_length
 from sim.camera import Light, Polarised

@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import Count, NotNegative, accepted, length
+from doedesign.spec.values.table import SpecTable, optional
 from fab.units import MM, NM
 
 Small = Annotated[float, length(0.1 * NM, 1 * MM)]

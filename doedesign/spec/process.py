@@ -20,8 +20,8 @@ from pydantic import (
     model_validator,
 )
 
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import ColourName, FarDepth, NotNegative, bounded, broken, known, length, share
+from doedesign.spec.values.table import SpecTable, optional
 from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK
 from fab.units import MM, NM, UM

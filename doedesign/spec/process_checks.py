@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from doedesign.spec.process import ProcessSpec
-from doedesign.spec.table import toml_key
+from doedesign.spec.values.table import toml_key
 from doedesign.spec.variation import VariationFile
 from fab.errors import InputError
 from fab.levels import Levels

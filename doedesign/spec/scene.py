@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import (
     Count,
     FarDepth,
@@ -24,6 +23,7 @@ from doedesign.spec.values import (
     length,
     share,
 )
+from doedesign.spec.values.table import SpecTable, optional
 from fab.units import MM, NM, UM
 
 # The same names as in `sim`, which would bring jax along.

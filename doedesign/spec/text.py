@@ -7,8 +7,8 @@ from typing import Any
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process import ProcessSpec, SpreadSpec
-from doedesign.spec.table import SpecTable, toml_key
 from doedesign.spec.values import UNITS
+from doedesign.spec.values.table import SpecTable, toml_key
 from doedesign.spec.variation import ProcessFile, variation_file
 from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation

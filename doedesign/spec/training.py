@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import SpecTable
 from doedesign.spec.values import Count, NotNegative, Positive, Seed, Steps
+from doedesign.spec.values.table import SpecTable
 from fab.errors import InputError
 
 USUAL_SIZE = 512

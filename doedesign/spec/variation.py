@@ -20,8 +20,8 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 
 from doedesign.spec.process import ProcessSpec, quantity_of
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import length
+from doedesign.spec.values.table import SpecTable, optional
 from fab.process import DEVIATIONS, Deviation, Disc, MaskDisc, Variation
 
 Place = Annotated[float, length(-1.0, 1.0)]

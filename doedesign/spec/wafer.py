@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import SpecTable, optional
 from doedesign.spec.values import length
+from doedesign.spec.values.table import SpecTable, optional
 from fab.layout.wafer import Wafer
 from fab.units import MM, UM
 

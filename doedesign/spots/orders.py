@@ -131,7 +131,7 @@ class OrderTable:
         }
 
     def measures(self) -> dict[str, float]:
-        """What a tolerance study follows."""
+        """Numbers that a tolerance study follows."""
         return {"on_target": self.total, "uniformity_error": self.uniformity_error}
 
     def describe(self) -> str:

@@ -12,7 +12,7 @@ from doedesign.optimization import optimize
 from doedesign.runs.fabricated import fabricated
 from doedesign.spec import Spec, load_spec, spec_to_toml
 from doedesign.spots.design import SpotTask, spots_from_spec
-from doedesign.spots.orders import order_table
+from doedesign.spots.orders import OrderTable, order_table
 from fab.errors import InputError
 from fab.order.verify import verify
 from fab.process import Variation
@@ -120,9 +120,11 @@ def test_a_plate_as_fabricated_has_its_table(tmp_path: Path, monkeypatch: pytest
     cell = design.level_map.level[36:37, 36:60].astype(float)
     light = np.exp(2j * np.pi * rate * step * (7 - 1.05 * (7 - cell)))
     waves = np.fft.fft(light[0], norm="forward")[[-1, 0, 1]] * np.sinc(np.array([-1, 0, 1]) / 24)
-    made = found.orders["fabricated"]
+    made, drawn = found.aimed["fabricated"], found.aimed["nominal"]
+    assert isinstance(made, OrderTable)
+    assert isinstance(drawn, OrderTable)
     np.testing.assert_allclose(made.efficiency, np.abs(waves) ** 2, atol=1e-5)
-    assert made.uniformity_error > 2 * found.orders["nominal"].uniformity_error
+    assert made.uniformity_error > 2 * drawn.uniformity_error
     metrics = json.loads((tmp_path / "made" / "metrics.json").read_text())
     assert metrics["orders"]["fabricated"]["spots"] == pytest.approx(list(made.efficiency))
     assert (tmp_path / "made" / "orders.csv").exists()
@@ -196,7 +198,7 @@ def test_the_table_of_spots_is_written_as_it_was_read(tmp_path: Path):
         (["sensor.defocus=1 mm"], "sensor.defocus", "focal plane"),
         (["optimize.start=random"], "optimize.start", "starts and levels of their own"),
         (['objective=[{name = "far_spot"}]'], "spots", "takes the place of objectives"),
-        (["process.etch_depths=optimize"], "process.etch_depths", "known depths"),
+        (["process.etch_depths=optimize"], "process.etch_depths", "the depths must be known"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path: Path, overrides: list[str], where: str, rule: str):

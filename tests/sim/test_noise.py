@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from sim import noise
-from sim.noise import clipped, photon_noise, poisson, rounded, uniform_noise
+from sim.sensor import noise
+from sim.sensor.noise import clipped, photon_noise, poisson, rounded, uniform_noise
 
 DRAWS = 1 << 20
 

@@ -2,5 +2,5 @@
 
 spots   spots and diffraction orders
 areas   areas of even light, lines, rings, pictures
-beside  what may stand beside either of them
+beside  rules for the tables beside either of them
 """

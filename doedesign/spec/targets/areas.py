@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from doedesign.spec.table import SpecTable, optional, toml_key
 from doedesign.spec.targets.beside import beside_problems
 from doedesign.spec.values import NotNegative, length
+from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
 from fab.units import UM, format_length
 from sim.camera import sines_at

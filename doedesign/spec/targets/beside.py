@@ -1,4 +1,4 @@
-"""What may stand beside a table that says where light should go."""
+"""Rules for the tables beside one that says where light should go."""
 
 import math
 from collections.abc import Iterator

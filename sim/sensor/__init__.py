@@ -16,8 +16,8 @@ Noise models by name:
 * "none": what "physical" is the mean of.
 
 With "tseng" and "release" white is full scale; exposure, full well, quantum efficiency, dark current and read noise
-play no part. Gradients go through noise by reparametrisation (`sim.noise`), through rounding unchanged, and through
-clipping between its bounds only, so a saturated pixel has none.
+play no part. Gradients go through noise by reparametrisation (`sim.sensor.noise`), through rounding unchanged, and
+through clipping between its bounds only, so a saturated pixel has none.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from fab.errors import InputError
-from sim.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA, clipped, photon_noise, rounded, uniform_noise
+from sim.sensor.noise import RELEASE_WIDTH, TSENG_SCALE, TSENG_SIGMA, clipped, photon_noise, rounded, uniform_noise
 
 NoiseModel = Literal["physical", "tseng", "release", "none"]
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]

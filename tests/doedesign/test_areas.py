@@ -1,0 +1,308 @@
+"""Areas of light: transport against closed forms, light on the lattice against that of PSFs, what a design reaches."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import erf
+
+import doedesign.optimization as optimization
+from doedesign.areas.design import AreaTask
+from doedesign.areas.problem import incident_amplitudes
+from doedesign.areas.shape import AreaTable, Profile, area_of_design, area_table, light_on
+from doedesign.areas.target import AreaTarget
+from doedesign.areas.transport import transport_phase
+from doedesign.build import camera_from_spec
+from doedesign.lab.order import write_masks
+from doedesign.optimization import optimize
+from doedesign.prediction import predict
+from doedesign.runs.fabricated import fabricated
+from doedesign.spec import Spec, load_spec, spec_to_toml
+from fab.errors import InputError
+from fab.order.verify import verify
+from fab.pictures import write_pixels
+from fab.process import Variation
+from sim.aperture import circle_coverage
+from sim.psf_bank import psf
+from tests.pictures import leave_out_pictures
+
+SPEC = """
+name = "square"
+
+[optics]
+focal_length = "20 mm"
+wavelengths = ["532 nm"]
+design_wavelength = "532 nm"
+
+[doe]
+samples = 128
+pitch = "4 um"
+aperture = "512 um"
+material = "fused_silica"
+
+[process]
+levels = 16
+level_step = "72 nm"
+
+[scene]
+far = ["inf"]
+
+[sensor]
+pitch = "3.45 um"
+resolution = [1440, 1080]
+window = 160
+
+[area]
+shape = "rectangle"
+width = "300 um"
+height = "200 um"
+
+[optimize]
+steps = 60
+checkpoint_every = 20
+"""
+
+
+def spec_of(tmp_path: Path, *overrides: str) -> Spec:
+    path = tmp_path / "square.toml"
+    path.write_text(SPEC)
+    return load_spec(path, overrides)
+
+
+def gaussian(radius: float, at: np.ndarray) -> np.ndarray:
+    return np.exp(-2 * (at / radius) ** 2)
+
+
+def test_transport_of_a_gaussian_to_a_square_is_the_error_function():
+    """Along each axis: the slope is half the size times erf(sqrt(2) x / w), for the two integrals to keep step."""
+    at, directions = np.linspace(-3, 3, 200), np.linspace(-1, 1, 120)
+    light = gaussian(1.2, at)[:, None] * gaussian(1.2, at)
+    phase = transport_phase(light, (at, at), np.ones((120, 120)), (directions, directions))
+    slope = np.gradient(phase, at, axis=1) / (2 * np.pi)
+    middle = np.abs(at) < 1.2
+    # Blur of the coarse grids, at the rim of the beam most of all.
+    np.testing.assert_allclose(slope[100, middle], erf(np.sqrt(2) * at[middle] / 1.2), atol=0.04)
+
+
+def test_transport_is_a_lens_where_both_pictures_are_alike():
+    at, directions = np.linspace(-2, 2, 150), np.linspace(-0.5, 0.5, 150) + 0.3
+    disc = (np.hypot(at[:, None], at) < 1.8).astype(float)
+    phase = transport_phase(disc, (at, at), disc, (directions, directions))
+    y, x = np.gradient(phase, at, at)
+    inside = np.hypot(at[:, None], at) < 1.5
+    np.testing.assert_allclose(x[inside] / (2 * np.pi), (at / 4 + 0.3 + 0 * at[:, None])[inside], atol=0.01)
+    np.testing.assert_allclose(y[inside] / (2 * np.pi), (at[:, None] / 4 + 0.3 + 0 * at)[inside], atol=0.01)
+
+
+@pytest.mark.parametrize("beam", ["", 'kind = "gaussian"\ndiameter = ["300 um", "250 um"]\nm_squared = 1.3'])
+def test_light_on_the_lattice_is_that_of_the_sensor(tmp_path: Path, beam: str):
+    """Against `sim.psf`, whose transform is another: summed over the area, and its share of the window."""
+    path = tmp_path / "square.toml"
+    path.write_text(SPEC + (f"[illumination]\n{beam}\n" if beam else ""))
+    spec = load_spec(path, ["optimize.steps=4"])
+    design = optimize(spec)
+    assert spec.area is not None
+    target = AreaTarget.of(spec.area, design.camera, {}, 4.0)
+    light = light_on(design.as_optic(), target)
+    bank, camera = psf(design), design.camera
+    image = np.asarray(bank.energy[0, 0]) / camera.transmission(532e-9)
+    y, x = (camera.image_m(target.sines_y, 0.0)[0], camera.image_m(0.0, target.sines_x)[1])
+    axis = camera.axis_m()
+    ours = light[np.ix_(np.abs(y) < 80e-6, np.abs(x) < 120e-6)].sum()
+    theirs = image[np.ix_(np.abs(axis) < 80e-6, np.abs(axis) < 120e-6)].sum()
+    assert ours == pytest.approx(theirs, rel=0.04)  # a row of samples or pixels on the border
+    assert light.sum() == pytest.approx(image[np.ix_(np.abs(axis) < y[-1], np.abs(axis) < x[-1])].sum(), rel=0.02)
+
+
+def test_the_problem_sees_the_light_of_the_optic(tmp_path: Path):
+    spec = spec_of(tmp_path, "optimize.steps=4")
+    task, design = AreaTask.from_spec(spec), optimize(spec)
+    phase = 2 * np.pi * design.camera.waves_per_metre(532e-9) * design.height_m.astype(float)
+    seen = np.asarray(task.problem.light(jnp.asarray(phase, jnp.float32)))
+    np.testing.assert_allclose(seen, light_on(design.as_optic(), task.target), atol=1e-4 * seen.max())
+
+
+def test_the_gradient_is_that_of_the_loss(tmp_path: Path):
+    task = AreaTask.from_spec(spec_of(tmp_path))
+    rng = np.random.default_rng(1)
+    phase = task.initial_state().phase + jnp.asarray(rng.normal(0, 0.1, (128, 128)), jnp.float32)
+    step = jnp.asarray(rng.normal(0, 1, (128, 128)), jnp.float32)
+
+    def loss(one: jax.Array) -> jax.Array:
+        return task.problem.loss(one, 1.0)[0]
+
+    slope = float(jnp.sum(jax.grad(loss)(phase) * step))
+    ends = [float(loss(phase + side * 0.02 * step)) for side in (1, -1)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 0.04, rel=0.02)  # single precision
+
+
+def test_a_rectangle_has_its_size_and_is_even(tmp_path: Path):
+    table = area_of_design(design := optimize(spec_of(tmp_path)), design.as_optic())
+    assert table.efficiency > 0.8
+    assert table.contrast < 0.06
+    assert table.along_x is not None
+    assert table.along_y is not None
+    assert table.along_x.size_m == pytest.approx(300e-6, abs=4e-6)
+    assert table.along_y.size_m == pytest.approx(200e-6, abs=4e-6)
+    assert table.pixel_contrast is not None
+    assert table.pixel_contrast < 1.1 * table.contrast
+    assert table.zeroth_order < 0.01
+    # With less weight on evenness there is more light.
+    brighter = optimize(spec_of(tmp_path, "area.uniformity=0.1"))
+    assert area_of_design(brighter, brighter.as_optic()).efficiency > table.efficiency + 0.01
+
+
+@pytest.mark.parametrize(
+    ("changes", "least", "wide"),
+    [
+        (['area.shape="ellipse"'], 0.8, 0.07),
+        (['area.shape="ring"', "area.height=", 'area.inner="150 um"'], 0.75, 0.12),
+        (['area.shape="line"', "area.height="], 0.5, 0.12),
+        (["area.offset=['150 um', '-100 um']"], 0.8, 0.03),
+    ],
+)
+def test_other_shapes_get_most_of_the_light(tmp_path: Path, changes: list[str], least: float, wide: float):
+    """Their sizes to within half of the 42 um in which light of this aperture can fall, or better."""
+    text = SPEC
+    if "area.height=" in changes:
+        text, changes = text.replace('height = "200 um"\n', ""), [c for c in changes if c != "area.height="]
+    path = tmp_path / "square.toml"
+    path.write_text(text)
+    design = optimize(load_spec(path, changes))
+    table = area_of_design(design, design.as_optic())
+    assert table.efficiency > least
+    assert table.along_x is not None
+    assert table.along_x.size_m == pytest.approx(300e-6, rel=wide)
+
+
+def test_a_picture_is_drawn_upright(tmp_path: Path):
+    grey = np.zeros((40, 60), np.uint8)
+    grey[25:35, 10:50] = 255  # a bar in the upper half
+    grey[5:15, 10:20] = 255  # and a square below its left end
+    write_pixels(tmp_path / "sign.png", grey)
+    text = SPEC.replace('shape = "rectangle"', 'shape = "picture"\npicture = "sign.png"')
+    text = text.replace('height = "200 um"\n', "").replace("300 um", "400 um")
+    path = tmp_path / "square.toml"
+    path.write_text(text)
+    spec = load_spec(path)
+    design = optimize(spec)
+    table = area_of_design(design, design.as_optic())
+    assert table.along_x is None
+    assert table.efficiency > 0.6
+    image, axis = np.asarray(psf(design).energy[0, 0]), design.camera.axis_m()
+    upper, left = axis > 0, axis < 0
+    assert image[np.ix_(upper, ~left)].sum() > 3 * image[np.ix_(~upper, ~left)].sum()
+    assert image[np.ix_(~upper, left)].sum() > 3 * image[np.ix_(~upper, ~left)].sum()
+    assert area_table(design.as_optic(), table.target).summary() == table.summary()
+
+
+def test_a_profile_finds_size_and_edges():
+    at = np.linspace(-10, 10, 401)
+    light = np.interp(np.abs(at), [4, 6], [1.0, 0.0])
+    profile = Profile(at, light, light)
+    assert profile.size_m == pytest.approx(10, abs=1e-6)
+    assert profile.edge_m == pytest.approx(2 * (0.9 - 0.135), abs=1e-6)
+    assert Profile(at, 0 * at, at).size_m is None
+    assert Profile(at, 0 * at, at).edge_m is None
+
+
+def test_power_is_that_of_the_beam(tmp_path: Path):
+    path = tmp_path / "square.toml"
+    path.write_text(SPEC + '[illumination]\nkind = "gaussian"\ndiameter = "200 um"\n')
+    camera = camera_from_spec(load_spec(path))
+    waves = incident_amplitudes(camera, np.asarray(circle_coverage(camera.grid, camera.aperture_m)))
+    # A circle of 2.46 beam radii.
+    assert np.sum(np.abs(waves) ** 2) == pytest.approx(1 - np.exp(-2 * (camera.aperture_m / 200e-6) ** 2), abs=1e-4)
+
+
+@pytest.mark.parametrize("stop", [10, 40])
+def test_a_stopped_run_goes_on_to_the_same_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int):
+    leave_out_pictures(monkeypatch, optimization)
+    spec = spec_of(tmp_path, "optimize.checkpoint_every=10")
+    whole = optimize(spec, tmp_path / "whole")
+
+    save = optimization.save_checkpoint
+
+    def save_and_stop(run: object, arrays: object, step: int, history: object) -> None:
+        save(run, arrays, step, history)  # pyright: ignore[reportArgumentType]
+        if step == stop:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimization, "save_checkpoint", save_and_stop)
+    with pytest.raises(KeyboardInterrupt):
+        optimize(spec, tmp_path / "run")
+    monkeypatch.setattr(optimization, "save_checkpoint", save)
+    resumed = optimize(spec, tmp_path / "run")
+    assert resumed.level_map.digest == whole.level_map.digest
+    assert (tmp_path / "run/metrics.json").read_bytes() == (tmp_path / "whole/metrics.json").read_bytes()
+    assert (tmp_path / "run/history.jsonl").read_bytes() == (tmp_path / "whole/history.jsonl").read_bytes()
+
+
+def test_a_run_leads_to_a_verified_order_and_to_a_plate_with_errors(tmp_path: Path):
+    spec = spec_of(tmp_path, "optimize.steps=20")
+    optimize(spec, tmp_path / "run")
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["area"]["ceiling_source"] == "none known"
+    assert (tmp_path / "run/area.csv").read_text().startswith("axis,place_mm,light,wanted\nx,")
+    assert (tmp_path / "run/area.png").is_file()
+    write_masks(tmp_path / "run", tmp_path / "order")
+    assert verify(tmp_path / "order").passed
+    made = fabricated(tmp_path / "run", variation=Variation(depth_scale=(0.1, 0, 0, 0)), out=tmp_path / "made")
+    tables = made.aimed
+    assert isinstance(tables["fabricated"], AreaTable)
+    assert tables["fabricated"].efficiency < tables["nominal"].efficiency
+    row = made.rows["fabricated"][0]
+    assert row["on_target"] == tables["fabricated"].efficiency
+    assert row["contrast"] == tables["fabricated"].contrast
+    assert (tmp_path / "made/area.csv").is_file()
+
+
+def test_a_tolerance_study_sees_the_area(tmp_path: Path):
+    design = optimize(spec_of(tmp_path, "optimize.steps=20"))
+    rows = predict(design, design.process(), Variation(common_depth_scale=0.1)).rows
+    assert rows[0]["contrast"] > predict(design, design.process(), Variation()).rows[0]["contrast"]
+    assert "uniformity_error" not in rows[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "where", "words"),
+    [
+        (['area.shape="disc"'], "area.shape", "rectangle"),
+        (['area.shape="ring"'], "area.inner", "needs it"),
+        (['area.inner="10 um"'], "area.inner", "takes: width, height"),
+        (['area.shape="line"'], "area", "a width or a height"),
+        (['area.width="3 mm"'], "area", "light places up to 1157 um"),
+        (['sensor.defocus="20 mm"'], "sensor.defocus", "between"),
+        (['optimize.start="random"'], "optimize.start", "starts and levels of their own"),
+        (['scene.far=["1 m"]'], "scene.far", "collimated"),
+        (['spots={ count = [3, 3], spacing = "50 um" }'], "area", "takes the place of spots"),
+        (['objective=[{ name = "window_loss" }]'], "area", "takes the place of objectives"),
+        (["area.uniformity=-1"], "area.uniformity", "0"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, changes: list[str], where: str, words: str):
+    with pytest.raises(InputError) as refused:
+        spec_of(tmp_path, *changes)
+    assert where in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_a_missing_or_black_picture_is_refused(tmp_path: Path):
+    text = SPEC.replace('shape = "rectangle"', 'shape = "picture"\npicture = "sign.png"')
+    path = tmp_path / "square.toml"
+    path.write_text(text.replace('height = "200 um"\n', ""))
+    with pytest.raises(InputError, match="the file must exist"):
+        optimize(load_spec(path))
+    write_pixels(tmp_path / "sign.png", np.zeros((8, 8), np.uint8))
+    with pytest.raises(InputError, match="must hold some light"):
+        optimize(load_spec(path))
+
+
+def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
+    spec = spec_of(tmp_path, "area.offset=['10 um', '0 um']", 'area.dark="50 um"')
+    path = tmp_path / "again.toml"
+    path.write_text(spec_to_toml(spec))
+    assert load_spec(path) == spec

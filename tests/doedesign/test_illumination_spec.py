@@ -1,0 +1,135 @@
+"""The table [illumination]: from the file to a camera's beam, what is refused, and what a run keeps of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import doedesign.optimization as optimization
+from doedesign.build import camera_from_spec
+from doedesign.optimization import optimize
+from doedesign.runs.folder import open_run
+from doedesign.spec import Spec, load_spec, spec_to_toml
+from fab.errors import InputError
+from fab.pictures import write_pixels
+from sim.illumination import GaussianBeam, MeasuredBeam
+from sim.transfer import mtf
+from tests.doedesign.test_spots_run import SPEC
+from tests.pictures import leave_out_pictures
+
+GAUSSIAN = """
+[illumination]
+kind = "gaussian"
+diameter = ["120 um", "100 um"]
+"""
+PICTURE = """
+[illumination]
+kind = "picture"
+picture = "beam.png"
+pixel = "4 um"
+"""
+
+
+def spec_of(tmp_path: Path, table: str, *overrides: str) -> Spec:
+    path = tmp_path / "fan.toml"
+    path.write_text(SPEC + table)
+    return load_spec(path, overrides)
+
+
+def beam_picture(path: Path) -> np.ndarray:
+    at = (np.arange(64) - 31.5) * 4e-6
+    grey = np.rint(60000 * np.exp(-2 * ((at[:, None] - 20e-6) ** 2 + at**2) / 60e-6**2)).astype(np.uint16)
+    write_pixels(path, grey)
+    return grey
+
+
+def test_a_spec_has_x_before_y_and_a_beam_y_before_x(tmp_path: Path):
+    given = ("illumination.m_squared=[1.5, 1.0]", "illumination.angle=['0 deg', '1 deg']")
+    more = ("illumination.centre=['5 um', '0 um']", 'illumination.waist_distance="-0.2 m"')
+    beam = camera_from_spec(spec_of(tmp_path, GAUSSIAN, *given, *more)).beam
+    assert isinstance(beam, GaussianBeam)
+    assert (beam.radius_m, beam.waist_distance_m, beam.m_squared, beam.centre_m) == (
+        (50e-6, 60e-6),
+        -0.2,
+        (1.0, 1.5),
+        (0.0, 5e-6),
+    )
+    assert beam.angle_rad == pytest.approx((np.deg2rad(1), 0.0))
+    single = camera_from_spec(spec_of(tmp_path, GAUSSIAN, 'illumination.diameter="80 um"')).beam
+    assert single == GaussianBeam((40e-6, 40e-6))
+    assert camera_from_spec(spec_of(tmp_path, "")).beam is None
+
+
+def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
+    spec = spec_of(tmp_path, GAUSSIAN, "illumination.angle=['0 deg', '1 deg']", "illumination.m_squared=1.5")
+    path = tmp_path / "again.toml"
+    path.write_text(spec_to_toml(spec))
+    assert load_spec(path) == spec
+
+
+@pytest.mark.parametrize(
+    ("table", "changes", "where", "words"),
+    [
+        (GAUSSIAN, ['illumination.kind="laser"'], "illumination.kind", "gaussian"),
+        (GAUSSIAN, ["illumination.m_squared=0.5"], "illumination.m_squared", "between 1 and 3"),
+        (GAUSSIAN, ["illumination.diameter=['1 mm', '1 mm', '1 mm']"], "illumination.diameter", "one number or"),
+        (GAUSSIAN, ['illumination.picture="a.png"'], "illumination.picture", "takes: diameter"),
+        (GAUSSIAN, ['scene.far=["1 m"]'], "scene.far", "takes the place of sources"),
+        ('[illumination]\nkind = "gaussian"\n', [], "illumination.diameter", "needs it"),
+        (PICTURE, ['illumination.picture="beam.gif"'], "illumination.picture", ".png"),
+        (PICTURE, ["illumination.m_squared=1.5"], "illumination.m_squared", "takes: picture, pixel"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, table: str, changes: list[str], where: str, words: str):
+    with pytest.raises(InputError) as refused:
+        spec_of(tmp_path, table, *changes)
+    assert where in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_a_run_keeps_the_picture_of_its_beam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    leave_out_pictures(monkeypatch, optimization)
+    grey = beam_picture(tmp_path / "beam.png")
+    spec = spec_of(tmp_path, PICTURE)
+    optimize(spec, tmp_path / "run")
+    (tmp_path / "beam.png").unlink()
+    beam = camera_from_spec(open_run(tmp_path / "run").spec).beam
+    assert isinstance(beam, MeasuredBeam)
+    np.testing.assert_array_equal(beam.intensity, grey)  # the brightest place above the middle
+    copy = tmp_path / "run/illumination.png"
+    beam_picture(copy)
+    write_pixels(copy, grey[::-1])
+    with pytest.raises(InputError, match="must be the file this run wrote"):
+        open_run(tmp_path / "run")
+
+
+def test_a_black_or_missing_picture_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="the file must exist"):
+        optimize(spec_of(tmp_path, PICTURE))
+    write_pixels(tmp_path / "beam.png", np.zeros((8, 8), np.uint16))
+    with pytest.raises(InputError, match="must have some light"):
+        optimize(spec_of(tmp_path, PICTURE))
+
+
+def test_spots_of_a_gaussian_beam_are_equal(tmp_path: Path):
+    """Spots that lie apart, in the light of the beam: their phases are searched for it, and their table is of it."""
+    from doedesign.prediction import on_target
+
+    text = GAUSSIAN.replace('["120 um", "100 um"]', '"120 um"')
+    spec = spec_of(tmp_path, text, 'spots={ count = [3, 3], spacing = "500 um", starts = 8 }', "optimize.steps=60")
+    design = optimize(spec)
+    lit, even = (on_target(one, one.as_optic()) for one in (design, optimize(spec_of(tmp_path, ""))))
+    assert lit is not None
+    assert even is not None
+    assert lit.measures()["uniformity_error"] < 0.05
+    assert lit.measures()["on_target"] > 0.75
+
+
+def test_modes_share_one_transfer_function(tmp_path: Path):
+    """Fewer than the beam's modes would leave a larger coherent part: MTF of one mode of M² = 1 lies above."""
+    design = optimize(spec_of(tmp_path, GAUSSIAN, "optimize.steps=2"))
+    mixed = optimize(spec_of(tmp_path, GAUSSIAN, "illumination.m_squared=1.8", "optimize.steps=2"))
+    one, many = (mtf(each).transfer for each in (design, mixed))
+    assert one[0, 0, 0] == pytest.approx(1)
+    assert many[0, 0, 0] == pytest.approx(1)
+    assert not np.allclose(one, many, atol=0.01)
