@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from doedesign.design import analytic
 from doedesign.design.patterns import positive_length
 from doedesign.spec import STARTS
 from fab.errors import InputError
+from fab.units import parse_angle
 from sim.camera import Camera
 from sim.material import full_wave_height_m
 from sim.propagation.hankel import ring_count
@@ -123,6 +125,80 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     return lens(setup, float(best[0]) * limit)
 
 
+def axicon(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Cone that bends light toward the axis by `angle` (`doedesign.design.analytic`)."""
+    return _wrapped(setup, analytic.axicon(setup.radii_m(), _angle(options, "angle", None), setup.wavelength_m))
+
+
+def vortex(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Spiral of `charge` waves per turn."""
+    charge = _number(options, "charge", 1, -1000, 1000)
+    if charge != round(charge) or charge == 0:
+        raise InputError(f"{_WHERE}.charge", "must be a whole number, and not 0", repr(charge), "For example 1.")
+    return _wrapped(setup, analytic.vortex(*_places(setup, "vortex"), int(charge)))
+
+
+def blazed(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Sawtooth of `period` that sends light toward `azimuth`."""
+    places, azimuth_rad = _places(setup, "blazed"), _angle(options, "azimuth", 0.0)
+    return _wrapped(setup, analytic.blazed(*places, *_needed(options, "period"), azimuth_rad))
+
+
+def lens_array(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Square lenses of `focal_length`, `pitch` apart."""
+    pitch_m, focal_m = _needed(options, "pitch", "focal_length")
+    return _wrapped(setup, analytic.lens_array(*_places(setup, "lens_array"), pitch_m, focal_m, setup.wavelength_m))
+
+
+def cubic(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Cubic phase of so many `waves` at the rim on each axis."""
+    rim_m = setup.camera.aperture_m / 2
+    return _wrapped(setup, analytic.cubic(*_places(setup, "cubic"), _number(options, "waves", 5, -1e3, 1e3), rim_m))
+
+
+def axilens(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Lens of a focal length from `near` on the axis to `far` at the rim."""
+    return _wrapped(setup, analytic.axilens(setup.radii_m(), *_foci(setup, options), setup.wavelength_m))
+
+
+def logarithmic_asphere(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """Lens whose zones of equal area focus at distances from `near` to `far`, equally spaced."""
+    return _wrapped(setup, analytic.logarithmic_asphere(setup.radii_m(), *_foci(setup, options), setup.wavelength_m))
+
+
+def _wrapped(setup: StartSetup, waves: Heights) -> Heights:
+    """Heights of a phase, wrapped at one wave."""
+    return np.mod(waves, 1.0) * setup.wave_m
+
+
+def _places(setup: StartSetup, name: str) -> tuple[Heights, Heights]:
+    """Places (y, x) of all cells; a mistake for rings, which have none."""
+    if setup.radial:
+        cure = 'Use parametrization = "freeform".'
+        raise InputError("optimize.start", "rings have a start that is a profile over the radius", f'"{name}"', cure)
+    grid = setup.camera.grid
+    y, x = np.meshgrid(grid.axis_m("y"), grid.axis_m("x"), indexing="ij")
+    return y, x
+
+
+def _needed(options: Mapping[str, Any], *keys: str) -> list[float]:
+    """Lengths among the options that have no usual value."""
+    found = [_length(options, key, 0.0) for key in keys]
+    for key in keys:
+        if key not in options:
+            raise InputError(f"{_WHERE}.{key}", "the start needs it", "nothing", f'For example {key} = "250 um".')
+    return found
+
+
+def _foci(setup: StartSetup, options: Mapping[str, Any]) -> tuple[float, float, float]:
+    """The options `near` and `far`, and the radius of the rim, metres."""
+    near_m, far_m = _needed(options, "near", "far")
+    if near_m == far_m:
+        cure = 'For one focal length use start = "fresnel".'
+        raise InputError(f"{_WHERE}.far", "must differ from `near`", repr(options["far"]), cure)
+    return near_m, far_m, setup.camera.aperture_m / 2
+
+
 BUILT_IN = {name: globals()[name] for name in STARTS}
 
 
@@ -140,6 +216,16 @@ def _number(options: Mapping[str, Any], key: str, default: float, low: float, hi
         rule = f"must be a number from {low:g} to {high:g}"
         raise InputError(f"{_WHERE}.{key}", rule, repr(value), "Correct it.")
     return float(value)
+
+
+def _angle(options: Mapping[str, Any], key: str, default_rad: float | None) -> float:
+    if key not in options and default_rad is not None:
+        return default_rad
+    try:
+        return parse_angle(options.get(key, ""))
+    except ValueError as error:
+        rule, cure = "must be an angle with a unit", f'For example {key} = "1 deg".'
+        raise InputError(f"{_WHERE}.{key}", rule, repr(options.get(key)), cure) from error
 
 
 def _length(options: Mapping[str, Any], key: str, default_m: float) -> float:

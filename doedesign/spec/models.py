@@ -167,7 +167,9 @@ class OptimizeSpec(SpecTable, frozen=True):
 
     Attributes:
         parametrization: "freeform" (every cell) or "radial" (a profile over the radius).
-        start: "flat", "random", "fresnel", "ring", or the path of a height map relative to the spec file.
+        start: a built-in one, which with `steps = 0` is a design of its own: "flat", "random", "fresnel", "ring",
+            "axicon", "vortex", "blazed", "lens_array", "cubic", "axilens", "logarithmic_asphere"
+            (`doedesign.design.starts`); or the path of a height map relative to the spec file.
         start_options: keyword arguments of the start.
         steps: optimisation steps; 0 evaluates the start.
         learning_rate: step size of Adam, in radians of phase at the design wavelength.

@@ -39,6 +39,13 @@ STARTS = {
     "random": ("feature",),
     "fresnel": ("focal_length", "evaluations"),
     "ring": ("far_energy", "period", "roughness"),
+    "axicon": ("angle",),
+    "vortex": ("charge",),
+    "blazed": ("period", "azimuth"),
+    "lens_array": ("pitch", "focal_length"),
+    "cubic": ("waves",),
+    "axilens": ("near", "far"),
+    "logarithmic_asphere": ("near", "far"),
 }
 
 
