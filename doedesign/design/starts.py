@@ -140,8 +140,8 @@ def vortex(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
 
 def blazed(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     """Sawtooth of `period` that sends light toward `azimuth`."""
-    places, azimuth_rad = _places(setup, "blazed"), _angle(options, "azimuth", 0.0)
-    return _wrapped(setup, analytic.blazed(*places, *_needed(options, "period"), azimuth_rad))
+    azimuth_rad, (period_m,) = _angle(options, "azimuth", 0.0), _needed(options, "period")
+    return _wrapped(setup, analytic.blazed(*_places(setup, "blazed"), period_m, azimuth_rad))
 
 
 def lens_array(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
