@@ -42,7 +42,7 @@ def camera_from_spec(spec: Spec) -> Camera:
         aperture_m=spec.doe.aperture_m - 2 * spec.process.chrome_overlap_m,
         material=spec.doe.material,
         colours=tuple(Colour(c.name, c.wavelengths_m, c.weights) for c in spec.optics.colours),
-        focal_length_m=spec.optics.focal_length_m,
+        focal_length_m=np.inf if spec.optics.focal_length_m is None else spec.optics.focal_length_m,
         pixel_m=spec.sensor.pixel_m,
         window=spec.sensor.window,
         fill=spec.sensor.fill_factor,
@@ -53,6 +53,7 @@ def camera_from_spec(spec: Spec) -> Camera:
         light=spec.optics.light,
         polarisation=spec.optics.polarisation,
         beam=beam_from_spec(spec),
+        distance_m=spec.sensor.distance_m,
     )
 
 

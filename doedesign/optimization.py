@@ -217,7 +217,7 @@ def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
 
 def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[str]:
     spec, camera, height = run.spec, design.camera, design.nominal_height_m
-    near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.optics.propagation
+    near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.propagation or camera.propagation
     levels = None if spec.optimize.quantisation == "none" else design.levels
     names = [*write_design(run.folder, design), "history.jsonl", "metrics.json", "spec.toml"]
     write_history(run, design.history)

@@ -26,6 +26,7 @@ IDEAL: Distortion = (0.0, 0.0)
 _INVERSIONS = 8  # steps of Newton's method that undo a distortion; five reach double precision for 20 %
 # How far beyond the corners of a window the image must not be folded over: light is looked for a little outside.
 _MARGIN = 1.2
+_PARAXIAL = 0.02  # wave
 Light = Literal["scalar", "edges"]
 Polarised = Literal["unpolarised", "x", "y"]
 
@@ -75,6 +76,7 @@ class Camera:
             all light that passes the aperture: nothing is vignetted.
         light: "scalar" for a thin element, "edges" for one whose walls add their light (`sim.rigorous.edge_optic`).
         polarisation: "unpolarised", or "x" or "y", the axis along which the electric field lies; for light with edges.
+        distance_m: distance of the sensor behind the DOE where there is no lens and `focal_length_m` is infinite.
         beam: the beam that lights the DOE, of whose power energies are shares; None for plane or spherical waves, whose
             power is that on the clear aperture.
     """
@@ -93,10 +95,18 @@ class Camera:
     doe_distance_m: float = 0.0
     light: str = "scalar"
     polarisation: str = "unpolarised"
+    distance_m: float | None = None
     beam: Beam | None = None
 
     def __post_init__(self) -> None:
         """Refuse a lens that cannot image the window, and words that mean nothing here."""
+        if math.isinf(self.focal_length_m) != (self.distance_m is not None):
+            got = f"a focal length of {self.focal_length_m:g} m and a distance of {self.distance_m} m"
+            rule, cure = "a camera has a lens, or a sensor at a distance", "Give a distance without a lens only."
+            raise InputError("distance_m", rule, got, cure)
+        if self.distance_m is not None and (self.mapping != "sine" or any(self.distortion) or self.doe_distance_m):
+            rule = "without a lens there is no mapping, distortion or distance before it"
+            raise InputError("mapping", rule, self.lens_text, "Leave them out.")
         check_lens(self.mapping, self.distortion, self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m)
         for key, words in (("light", get_args(Light)), ("polarisation", get_args(Polarised))):
             if getattr(self, key) not in words:
@@ -115,8 +125,10 @@ class Camera:
         For a DOE at a distance s before the lens it is the element B of the ray matrix from DOE to sensor,
         d + s (1 - d/f) with d from lens to sensor, which Collins' integral has in place of d (S. A. Collins, J. Opt.
         Soc. Am. 60, 1168, 1970). In the focal plane B = f whatever s is, and nothing is left of the lens's curvature:
-        there s changes phases on the sensor alone.
+        there s changes phases on the sensor alone. Without a lens B = d.
         """
+        if self.distance_m is not None:
+            return self.distance_m
         return self.focal_length_m + self.defocus_m - self.doe_distance_m * self.defocus_m / self.focal_length_m
 
     def curvature_per_m(self, source_per_m: float = 0.0) -> float:
@@ -158,13 +170,31 @@ class Camera:
             return None
         return beam_irradiance(self.beam, self.grid, self.aperture_m, wavelength_m)
 
+    @property
+    def propagation(self) -> Literal["far_field", "angular_spectrum"]:
+        """How light gets to the sensor unless one asks for another way.
+
+        "far_field" behind a lens, and without one where its quadratic phase is right and cells can follow it: cells² N
+        / lambda at most the distance, and less than `_PARAXIAL` of a wave of fourth order from the rim to a corner of
+        the window; "angular_spectrum" where the sensor is nearer.
+        """
+        if self.distance_m is None:
+            return "far_field"
+        shortest = min(w for colour in self.colours for w in colour.wavelengths_m)
+        reach = self.aperture_m / 2 + self.window * self.pixel_m / math.sqrt(2)
+        fourth = reach**4 / (8 * self.distance_m**3 * shortest)
+        follows = self.grid.shape[0] * self.grid.pitch_m**2 / shortest <= self.distance_m
+        return "far_field" if follows and fourth < _PARAXIAL else "angular_spectrum"
+
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""
         return Grid((self.window, self.window), self.pixel_m).axis_m("x")
 
     @property
     def lens_text(self) -> str:
-        """The lens's mapping in words."""
+        """The lens's mapping in words, or that there is none."""
+        if self.distance_m is not None:
+            return f"no lens, sensor {format_length(self.distance_m)} behind the DOE"
         names = {"sine": "places follow the sine of the angle", "tangent": "places follow the tangent of the angle"}
         k1, k2 = self.distortion
         bent = f", distortion k1 = {k1:g}, k2 = {k2:g}" if any(self.distortion) else ""
@@ -198,10 +228,12 @@ class Camera:
     def defocus_radius_m(self, depth_m: float) -> float:
         """Radius on the sensor of the geometric blur disc: D/2 · |B/z + 1 - d/f|, or D f / (2 z) in the focal plane.
 
-        B is `sensor_distance_m` and d the distance from lens to sensor.
+        B is `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow.
         """
-        distance = self.focal_length_m + self.defocus_m
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
+        if self.distance_m is not None:
+            return self.aperture_m / 2 * (self.distance_m * inverse_depth + 1.0)
+        distance = self.focal_length_m + self.defocus_m
         return self.aperture_m / 2 * abs(self.sensor_distance_m * inverse_depth + 1.0 - distance / self.focal_length_m)
 
 

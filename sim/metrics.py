@@ -17,7 +17,7 @@ from scipy.fft import fft2
 
 from fab.grid import Grid
 from sim.aperture import circle_coverage
-from sim.camera import Camera, Colour
+from sim.camera import Camera, Colour, source_path_m
 from sim.optic import CellOptic
 from sim.tracing import is_traced, stacked, total
 
@@ -228,15 +228,19 @@ def energy_budget(
     `uncollected` near zero or below it would show a fault in either.
     """
     camera = optic.camera
-    curvature = camera.curvature_per_m(1 / depth_m)
     scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
     reach = camera.grid.pitch_m / (pitch_m or camera.grid.pitch_m) / 2
     entered = passed = band = 0.0
+    lensed = camera.curvature_per_m(1 / depth_m)
     for line in replace(camera, colours=(colour,)).lines:
+        curvature = lensed
         field = np.asarray(optic.field(line, depth_m))
         wavelength, open_ = line.wavelength_m, 1.0
+        if camera.distance_m is not None:  # the band is one of directions behind the DOE, not of places
+            field = field * np.exp(-2j * np.pi * source_path_m(camera, np.inf) / wavelength).astype(np.complex64)
+            curvature = 0.0 if np.isinf(depth_m) else 1 / depth_m
         if camera.beam is not None and (light := camera.incident(line)) is not None:
-            curvature = camera.curvature_per_m(1 / depth_m) + camera.beam.curvature_per_m(wavelength)
+            curvature += camera.beam.curvature_per_m(wavelength)
             open_ = float(np.sum(np.abs(light) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
             open_ *= camera.grid.shape[0] ** 2 / scale
         entered += line.factor / camera.transmission(wavelength) * open_

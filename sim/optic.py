@@ -56,7 +56,7 @@ class Optic(eqx.Module):
         self,
         line: SpectralLine,
         depth_m: float,
-        propagation: Propagation = "far_field",
+        propagation: Propagation | None = None,
         sampling: float | None = None,
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> Any:
@@ -65,7 +65,7 @@ class Optic(eqx.Module):
         Args:
             line: the wavelength.
             depth_m: source depth.
-            propagation: far field, or one of the direct kernels (for DOEs of cells).
+            propagation: far field, or one of the direct kernels (for DOEs of cells); that of the camera if left out.
             sampling: intensity samples per lambda d / D (far field only); see `plan_far_field`.
             field_rad: field angles (y, x); they matter to lenses that do not image sines (`Camera.mapping`).
 
@@ -135,11 +135,12 @@ class CellOptic(CameraOptic):
         self,
         line: SpectralLine,
         depth_m: float,
-        propagation: Propagation = "far_field",
+        propagation: Propagation | None = None,
         sampling: float | None = None,
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> FarField | DirectPath:
         """Operators of the far field, or of a direct kernel (which serves every depth)."""
+        propagation = propagation or self.camera.propagation
         if propagation == "far_field":
             return plan_far_field(
                 self.camera,
@@ -300,11 +301,12 @@ class RingOptic(CameraOptic):
         self,
         line: SpectralLine,
         depth_m: float,
-        propagation: Propagation = "far_field",
+        propagation: Propagation | None = None,
         sampling: float | None = None,
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> Hankel:
         """Operators of the Hankel transform, for every depth."""
+        propagation = propagation or self.camera.propagation
         if propagation != "far_field":
             raise ValueError(f"`propagation` must be 'far_field' for rings, but got {propagation!r}")
         return plan_hankel(self.camera, line.wavelength_m)

@@ -173,7 +173,7 @@ class BankOptic(Optic):
         self,
         line: SpectralLine,
         depth_m: float,
-        propagation: Propagation = "far_field",
+        propagation: Propagation | None = None,
         sampling: float | None = None,
         field_rad: tuple[float, float] = ON_AXIS,
     ) -> None:
@@ -224,7 +224,7 @@ def psf(
     depths: Length | Sequence[Length] = np.inf,
     *,
     field_rad: tuple[float, float] = ON_AXIS,
-    propagation: Propagation = "far_field",
+    propagation: Propagation | None = None,
     sampling: float | None = None,
     on_psf: Callable[[], None] = lambda: None,
 ) -> PsfBank:
@@ -238,7 +238,7 @@ def psf(
         camera: lens, sensor, substrate and DOE grid of a bare height map; another lens or sensor for an optic of cells.
         depths: one source depth or several, in metres or with a unit; "inf" for a star.
         field_rad: field angles (y, x), positive where light travels toward +y or +x; the window follows the chief ray.
-        propagation: far field, or one of the direct kernels.
+        propagation: far field, or one of the direct kernels; by default the one that the camera needs.
         sampling: intensity samples per lambda d / D (far field only); see `sim.propagation.farfield.plan_far_field`.
         on_psf: called after every single PSF, for progress.
 
@@ -273,7 +273,7 @@ def psf(
 def _prepared(
     optic: Optic,
     asked: Sequence[tuple[SpectralLine, float]],
-    way: tuple[Propagation, float | None],
+    way: tuple[Propagation | None, float | None],
     field_rad: tuple[float, float],
 ) -> Iterator[tuple[Any, Any]]:
     """Plan and source of every line and depth, each made while the light of the one before it is computed."""

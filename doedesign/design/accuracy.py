@@ -39,7 +39,7 @@ class Accuracy(NamedTuple):
     numerics: float | None
     rim: float
     walls: float | None
-    lens: float
+    lens: float | None
 
 
 def accuracies(optic: HeightOptic | EdgeOptic, bank: PsfBank, depths_m: Sequence[float]) -> list[Accuracy]:
@@ -62,14 +62,19 @@ def accuracies(optic: HeightOptic | EdgeOptic, bank: PsfBank, depths_m: Sequence
             depth: relative_difference(bank.energy[middle, bank.depths_m.index(depth)], image)
             for depth, image in zip(depths_m, seen, strict=True)
         }
-    other = psf(optic, replace(one, mapping=_OTHER[camera.mapping]), depths_m).energy[0]
+    mapped: dict[float, float] = {}
+    if camera.distance_m is None:
+        other = psf(optic, replace(one, mapping=_OTHER[camera.mapping]), depths_m).energy[0]
+        mapped = {
+            depth: relative_difference(bank.energy[middle, bank.depths_m.index(depth)], image)
+            for depth, image in zip(depths_m, other, strict=True)
+        }
     found = []
-    for depth, image in zip(depths_m, other, strict=True):
-        lens = relative_difference(bank.energy[middle, bank.depths_m.index(depth)], image)
+    for depth in depths_m:
         plan = optic.plan(line, depth)
         numerics = plan.expected_error if isinstance(plan, FarField) else None
         rim = rim_error(optic, line, depth)
-        found.append(Accuracy(camera.colours[middle].name, depth, numerics, rim, walls.get(depth), lens))
+        found.append(Accuracy(camera.colours[middle].name, depth, numerics, rim, walls.get(depth), mapped.get(depth)))
     return found
 
 
@@ -129,6 +134,7 @@ def in_words(found: Sequence[Accuracy], camera: Camera) -> str:
     if walls := [one.walls for one in found if one.walls is not None]:
         parts.append(f"walls left out {largest(walls)}")
     words = {"sine": "f sin angle instead of f tan angle", "tangent": "f tan angle instead of f sin angle"}
-    parts.append(f"{words[camera.mapping]} {largest([one.lens for one in found])}")
+    if lens := [one.lens for one in found if one.lens is not None]:
+        parts.append(f"{words[camera.mapping]} {largest(lens)}")
     nanometres = mean_wavelength_m(camera.colours[len(camera.colours) // 2]) * 1e9
     return f"PSFs may be off ({nanometres:.0f} nm, relative): " + ", ".join(parts)

@@ -170,7 +170,9 @@ class Design:
         rows: dict[str, object] = {
             "level map": self.level_map,
             "clear aperture": format_length(self.camera.aperture_m),
-            "lens": f"f = {format_length(self.camera.focal_length_m)}, {self.camera.lens_text}",
+            "lens": self.camera.lens_text
+            if self.camera.distance_m
+            else f"f = {format_length(self.camera.focal_length_m)}, {self.camera.lens_text}",
             "colours": colours,
             "near": near,
             "far": far,

@@ -117,7 +117,8 @@ def problem_of(
 def _is_sparse(spec: Spec) -> bool:
     """Whether a step takes one sample of intensity per lambda d / D."""
     optimize = spec.optimize
-    transformed = optimize.parametrization != "radial" and spec.optics.propagation != "fresnel"
+    far = camera_from_spec(spec).propagation == "far_field" and spec.optics.propagation != "fresnel"
+    transformed = optimize.parametrization != "radial" and far
     return optimize.sampling == "sparse" and transformed
 
 
@@ -130,7 +131,7 @@ def plans_of(spec: Spec) -> Problem:
     depths_m = (*spec.scene.near_m, *spec.scene.far_m)
     flat = optic_as_drawn(camera, np.zeros(camera.grid.shape), depths_m=depths_m)
     optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else flat
-    propagation = "far_field" if radial else spec.optics.propagation
+    propagation = "far_field" if radial else spec.propagation
     sampling = 1.0 if _is_sparse(spec) else None
     return Problem(
         parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),

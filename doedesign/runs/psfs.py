@@ -74,7 +74,7 @@ def psfs(
             done = count(1)
 
             def bank(name: str) -> PsfBank:
-                optic, propagation = optics[name], run.spec.optics.propagation
+                optic, propagation = optics[name], run.spec.propagation
                 profile = radial_profile(designs[name], camera.grid) if _takes_hankel(run, name, field_rad) else None
                 if profile is not None:
                     optic, propagation = RingOptic(camera, jnp.asarray(profile[: ring_count(camera)])), "far_field"

@@ -32,8 +32,8 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
-    rules = (_light, _doe, _sensor, _lens, _scene, _fresnel_sampling, _objectives, _process, _limits, _training)
-    rules = (*rules, spot_problems, area_problems, _illumination)
+    rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
+    rules = (*rules, _limits, _training, spot_problems, area_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -67,8 +67,35 @@ def _doe(spec: Spec) -> Iterator[InputError]:
         yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
 
 
+def _distance(spec: Spec) -> Iterator[InputError]:
+    """A camera has a lens or none; what belongs to a lens only."""
+    optics, sensor = spec.optics, spec.sensor
+    if optics.focal_length_m is None and sensor.distance_m is None:
+        cure = 'Add it, for example focal_length = "8 mm", or sensor.distance for light without a lens.'
+        yield InputError("optics.focal_length", "a camera has a lens, or a sensor at a distance", "neither", cure)
+    if optics.focal_length_m is not None and sensor.distance_m is not None:
+        cure = "Remove it, or optics.focal_length."
+        yield InputError("sensor.distance", "it is for light without a lens", "both", cure)
+    if optics.focal_length_m is not None or sensor.distance_m is None:
+        return
+    alone = {
+        "optics.mapping": optics.mapping != "sine",
+        "optics.distortion": any(optics.distortion),
+        "optics.doe_distance": optics.doe_distance_m > 0,
+        "optics.propagation": optics.propagation != "far_field",
+        "sensor.defocus": sensor.defocus_m != 0,
+    }
+    for key, given in alone.items():
+        if given:
+            yield InputError(key, "it belongs to a lens, and there is none", "a value", "Leave it out.")
+    if spec.scene.near_m:
+        rule = "obstructions are looked past through a lens"
+        yield InputError("scene.near", rule, "depths", "Leave them out, or give optics.focal_length.")
+
+
 def _sensor(spec: Spec) -> Iterator[InputError]:
-    focal, sensor, colours = spec.optics.focal_length_m, spec.sensor, spec.optics.colours
+    sensor, colours = spec.sensor, spec.optics.colours
+    focal = spec.optics.focal_length_m or math.inf
     if sensor.defocus_m <= -focal / 2:
         rule = f"the sensor must stay beyond half the focal length, {format_length(focal)}, from the lens"
         yield InputError("sensor.defocus", rule, format_length(sensor.defocus_m), "Choose a smaller defocus.")
@@ -95,6 +122,8 @@ def _lens(spec: Spec) -> Iterator[InputError]:
         if optics.doe_distance_m:
             rule = "on the direct path the DOE lies on the lens"
             yield InputError("optics.doe_distance", rule, format_length(optics.doe_distance_m), cure)
+    if optics.focal_length_m is None:
+        return
     if optics.doe_distance_m * sensor.defocus_m >= optics.focal_length_m**2 / 2:
         rule = "with the sensor beyond the focus it must stay below focal_length² / (2 defocus)"
         got, cure = format_length(optics.doe_distance_m), "Move the DOE to the lens or the sensor into focus."
@@ -168,7 +197,7 @@ def _illumination(spec: Spec) -> Iterator[InputError]:
 
 def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
     wavelength_m, focal_m, needed_m = _shortest_m(spec), spec.optics.focal_length_m, _nyquist_length_m(spec)
-    if spec.optics.propagation != "fresnel" or needed_m <= focal_m:
+    if spec.optics.propagation != "fresnel" or focal_m is None or needed_m <= focal_m:
         return
     span_m = spec.doe.samples * spec.doe.pitch_m
     samples = math.ceil(span_m**2 / (wavelength_m * focal_m))
@@ -254,7 +283,7 @@ def _image_share(spec: Spec, sine: float) -> float:
 
 
 def _window_warnings(spec: Spec) -> Iterator[str]:
-    sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m, spec.doe.pitch_m
+    sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m or spec.image_distance_m, spec.doe.pitch_m
     binned = min(sensor.resolution) // sensor.binning
     if sensor.window > binned:
         yield (

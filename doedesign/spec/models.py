@@ -4,6 +4,7 @@
 compared, hashed and stored by value. Rules between two tables are in `checks`; `doedesign.spec.load_spec` applies both.
 """
 
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -97,7 +98,8 @@ class OpticsSpec(SpecTable, frozen=True):
     """Lens and light.
 
     Attributes:
-        focal_length_m: focal length of the camera lens the DOE sits on.
+        focal_length_m: focal length of the camera lens the DOE sits on; left out where there is none and the sensor has
+            a `distance`.
         design_wavelength_m: wavelength at which the full height of the levels should be one wave.
         colours: colour channels, in the order of a PSF bank's first axis. In TOML, `wavelengths = ["656 nm",
             "589 nm"]` is short for one channel of one wavelength each, named after it ("656nm"), and
@@ -116,7 +118,7 @@ class OpticsSpec(SpecTable, frozen=True):
         polarisation: of the light at walls: "unpolarised", or "x" or "y", the axis of the electric field.
     """
 
-    focal_length_m: Annotated[float, length(10 * UM, 100.0)] = Field(examples=['"8 mm"'])
+    focal_length_m: Annotated[float, length(10 * UM, 100.0)] | None = optional()
     design_wavelength_m: Wavelength = Field(examples=['"550 nm"'])
     colours: tuple[ColourSpec, ...] = Field(min_length=1)
     propagation: Literal["far_field", "fresnel"] = "far_field"
@@ -232,6 +234,16 @@ class Spec(SpecTable, frozen=True):
     network: NetworkSpec = optional(NetworkSpec())
     train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)
+
+    @property
+    def image_distance_m(self) -> float:
+        """Distance of the sensor from the lens, or from the DOE where there is no lens."""
+        return self.sensor.distance_m or (self.optics.focal_length_m or math.nan) + self.sensor.defocus_m
+
+    @property
+    def propagation(self) -> Literal["far_field", "fresnel"] | None:
+        """How light is to get to the sensor behind a lens; None without one, where its distance says it."""
+        return self.optics.propagation if self.sensor.distance_m is None else None
 
     @property
     def file(self) -> Path | None:

@@ -118,6 +118,7 @@ class SensorSpec(SpecTable, frozen=True):
         fill_factor: side of a pixel's light-sensitive square over its pitch; a length ratio, so 0.9 collects
             81 % of the light.
         defocus_m: distance of the sensor beyond the focal plane.
+        distance_m: distance of the sensor behind the DOE where there is no lens.
         full_well_e: electrons that a pixel holds, after binning.
         exposure: share of the full well that a white of the scene fills through a lossless lens.
         quantum_efficiency: electrons per photon, one number or one per colour.
@@ -135,6 +136,7 @@ class SensorSpec(SpecTable, frozen=True):
     window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
     fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
     defocus_m: Annotated[float, length(-10 * MM, 10 * MM)] = 0.0
+    distance_m: Annotated[float, length(1 * UM, 1e6)] | None = optional()
     full_well_e: Positive | None = optional()
     exposure: Annotated[float, Field(strict=True, gt=0, le=100)] | None = optional()
     quantum_efficiency: Efficiencies = optional(())

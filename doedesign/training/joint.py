@@ -264,7 +264,7 @@ def _learnt_doe(spec: Spec, source: str) -> TrainingDoe:
 
 def resting_doe(spec: Spec, camera: Camera, kind: ObstructionKind, height_m: Float[np.ndarray, "y x"]) -> TrainingDoe:
     """A DOE that stays as it is, by exact PSFs over all depths that scenes may have."""
-    bank = psf(height_m, camera, resting_depths_m(spec, kind), propagation=spec.optics.propagation)
+    bank = psf(height_m, camera, resting_depths_m(spec, kind), propagation=spec.propagation)
     return TrainingDoe.at_rest(bank.as_optic())
 
 
@@ -282,7 +282,7 @@ def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
     """Field angles (y, x) of a scene, anywhere on the sensor."""
     share = np.random.default_rng((seed, _SALT_FIELD, number)).uniform(-0.5, 0.5, 2)
     width, height = (n * spec.sensor.pitch_m for n in spec.sensor.resolution)
-    y, x = np.arctan(share * np.array([height, width]) / spec.optics.focal_length_m)
+    y, x = np.arctan(share * np.array([height, width]) / spec.image_distance_m)
     return float(y), float(x)
 
 

@@ -263,7 +263,7 @@ class JointTraining(TrainingJob):
             height = trained.nominal_height_m
             names += write_design(folder, trained)
         depths = tuple(dict.fromkeys((*near, *spec.scene.far_m, np.inf)))
-        bank = psf(height, camera, depths, propagation=spec.optics.propagation)
+        bank = psf(height, camera, depths, propagation=spec.propagation)
         write_bank(folder / BANK_NAME, bank, {"design": spec.name})
         found = self.evaluate(state, baselines=True)
         write_atomic(folder / "metrics.json", canonical_json({**found.means, "scenes": found.scenes}))

@@ -5,7 +5,8 @@ paper's sizes that means cells below a micrometre, which is why `sim.propagation
 serves as a reference and for small apertures. Two kernels: the paraxial `"fresnel"` transfer function exp(-i pi lambda
 d nu^2) and the `"angular_spectrum"` exp(2 pi i d sqrt(1/lambda^2 - nu^2)), both band-limited after K. Matsushima and T.
 Shimobaba, Opt. Express 17, 19662 (2009), so that the kernel itself never aliases: light that would leave the padded
-grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate.
+grid is dropped. The band ends in a cosine, because a sharp end rings: 2 % in the image of a rough plate. Without a lens
+it is how light gets to a sensor too near for the far field, cells then being squares instead of points.
 """
 
 from typing import Literal, cast
@@ -33,11 +34,13 @@ class DirectPath(eqx.Module):
     lens: Complex[Array, "y x"]  # `[y, x]` transmission of the thin lens, unit modulus
     kernel: Complex[Array, "ky kx"]  # `[ky, kx]` transfer function in FFT order on the padded grid
     first: int = eqx.field(static=True)  # first sample kept on the sensor, per axis
+    parts: int = eqx.field(static=True)  # samples per cell and axis
     expected_error: float  # predicted relative L2 error of the pixel integration alone
 
     def energy(self, pupil: PupilRows, rows: PyTree, shared: PyTree) -> Float[Array, "v u"]:
         """Energy in every pixel of the window, per unit power on the clear aperture; see `FarField.energy`."""
         field = pupil(rows, shared) * self.lens
+        field = jnp.repeat(jnp.repeat(field, self.parts, axis=0), self.parts, axis=1)
         spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
         kept = self.gather.inputs  # samples per axis that the pixels use
         image = jnp.roll(jnp.fft.ifft2(spectrum), (-self.first, -self.first), (0, 1))[:kept, :kept]
@@ -66,8 +69,9 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
             'Use the "far_field" path.',
         )
         raise InputError("camera.mapping", rule, camera.lens_text, cure)
+    parts = _parts(camera, wavelength_m)
     cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
-    nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m)
+    nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m) if camera.distance_m is None else 0.0
     if nyquist > camera.focal_length_m * (1 + 1e-9):
         limit = wavelength_m * camera.focal_length_m / camera.aperture_m
         raise InputError(
@@ -78,13 +82,14 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
             f'Use propagation = "far_field", or a pitch of at most {limit * 1e6:.3g} um '
             f"(N = {int(np.ceil(camera.aperture_m / limit))}) for this aperture.",
         )
+    cells, pitch = cells * parts, pitch / parts
     half = camera.window * camera.pixel_m / 2 / pitch
     width = camera.pixel_m * camera.fill / pitch
     kept = 2 * int(np.ceil(half + width + 8))
     if 2 * half > 3 * cells:
         rule = f"on the direct path the window must fit on three apertures, {3 * cells * pitch * 1e3:.4g} mm"
         got = f"{camera.window * camera.pixel_m * 1e3:.4g} mm"
-        raise InputError("camera.window", rule, got, "Use a smaller window or the far-field path.")
+        raise InputError("camera.window", rule, got, "Use a smaller window, or the far-field path behind a lens.")
     # Light from one rim of the aperture to the far edge of the window must pass the kernel's band untapered.
     padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
     middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
@@ -95,19 +100,31 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     area = np.pi * camera.aperture_m**2 / 4
     matrix = weights.matrix * (pitch / np.sqrt(area))
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
-    # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d.
+    # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d;
+    # without a lens it holds r^2/2d, which this takes out again.
     lens = wrapped_waves(-square / (2 * distance * wavelength_m), 1.0)
     return DirectPath(
         gather=Banded.from_dense(matrix),
         lens=cis(jnp.asarray(lens)),
-        kernel=_kernel(padded, pitch, wavelength_m, distance, kernel),
+        kernel=_kernel(padded, pitch, wavelength_m, distance, kernel, square_cells=camera.distance_m is not None),
         first=first,
+        parts=parts,
         expected_error=np.sqrt(2) * weights.expected_error,
     )
 
 
+def _parts(camera: Camera, wavelength_m: float) -> int:
+    """Samples per cell and axis that carry light from one rim to the far corner of the window; one behind a lens."""
+    if camera.distance_m is None:
+        return 1
+    across = camera.aperture_m / 2 + camera.window * camera.pixel_m / np.sqrt(2)
+    sine = across / np.hypot(across, camera.distance_m)
+    # Intensity has twice the band of the field.
+    return max(1, int(np.ceil(4 * camera.grid.pitch_m * sine / wavelength_m)))
+
+
 def _kernel(
-    padded: int, pitch_m: float, wavelength_m: float, distance_m: float, kernel: Kernel
+    padded: int, pitch_m: float, wavelength_m: float, distance_m: float, kernel: Kernel, *, square_cells: bool
 ) -> Complex[Array, "ky kx"]:
     frequency = np.fft.fftfreq(padded, pitch_m)
     square = frequency[:, None] ** 2 + frequency[None, :] ** 2
@@ -122,5 +139,7 @@ def _kernel(
         limit = 1 / (wavelength_m * np.sqrt((2 * step * distance_m) ** 2 + 1))
     fall = np.clip((np.abs(frequency) / limit - _UNTAPERED) / (1 - _UNTAPERED), 0.0, 1.0)
     passed = np.cos(np.pi / 2 * fall) ** 2
+    if square_cells:  # light of a cell is that of its whole square, and not of a point in its middle
+        passed = passed * np.sinc(frequency * pitch_m)
     passed = passed[:, None] * passed[None, :] * (square < carrier)
     return cis(jnp.asarray(wrapped_waves(waves, 1.0))) * jnp.asarray(passed, jnp.float32)

@@ -102,7 +102,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     """The rule that the DOE's cells can send light to every corner of the area."""
     area: Any = spec.area
     optics, pitch = spec.optics, spec.doe.pitch_m
-    wavelength, distance = optics.colours[0].wavelengths_m[0], optics.focal_length_m + spec.sensor.defocus_m
+    wavelength, distance = optics.colours[0].wavelengths_m[0], spec.image_distance_m
     most = wavelength / (2 * pitch)
     half = [size / 2 + area.dark_m for size in area.size_m]
     y, x = (abs(at) + reach for at, reach in zip(area.offset_m[::-1], half, strict=True))

@@ -141,12 +141,12 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     optics = spec.optics
     farthest, sine = 0.0, 0.0
     for y, x in _corners(spots):
-        share = (y / optics.focal_length_m, x / optics.focal_length_m)
+        share = (y / spec.image_distance_m, x / spec.image_distance_m)
         sines = sines_at(optics.mapping, optics.distortion, *share)
         if max(map(abs, sines)) > sine:
             farthest, sine = max(abs(y), abs(x)), max(map(abs, sines))
     if sine > most:
-        rule = f"cells of {format_length(pitch)} steer light {most * optics.focal_length_m / UM:.4g} um far at most"
+        rule = f"cells of {format_length(pitch)} steer light {most * spec.image_distance_m / UM:.4g} um far at most"
         finer = format_length(wavelength / (2 * sine))
         cure = f"Bring the spots nearer to the axis, or choose a pitch of at most {finer}."
         yield InputError("spots", rule, f"a spot {farthest / UM:.4g} um from the axis", cure)

@@ -1,0 +1,134 @@
+"""Specs without a lens: which way light takes, what belongs to a lens only, and a run from the spec to the masks."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import doedesign.optimization as optimization
+from doedesign.build import camera_from_spec
+from doedesign.lab.order import write_masks
+from doedesign.optimization import optimize
+from doedesign.prediction import on_target
+from doedesign.runs.fabricated import fabricated
+from doedesign.spec import Spec, load_spec, spec_to_toml
+from fab.errors import InputError
+from fab.order.verify import verify
+from tests.pictures import leave_out_pictures
+
+SPEC = """
+name = "bare"
+
+[optics]
+wavelengths = ["850 nm"]
+design_wavelength = "850 nm"
+
+[doe]
+samples = 100
+pitch = "4 um"
+aperture = "400 um"
+material = "fused_silica"
+
+[process]
+levels = 8
+level_step = "234.6 nm"
+
+[scene]
+far = ["inf"]
+
+[sensor]
+distance = "5 mm"
+pitch = "2 um"
+resolution = [1440, 1080]
+window = 64
+
+[optimize]
+start = "fresnel"
+start_options = { focal_length = "5 mm" }
+steps = 0
+"""
+
+
+def spec_of(tmp_path: Path, *overrides: str) -> Spec:
+    path = tmp_path / "bare.toml"
+    path.write_text(SPEC)
+    return load_spec(path, overrides)
+
+
+def test_the_way_of_light_follows_from_the_distance(tmp_path: Path):
+    near, far = (camera_from_spec(spec_of(tmp_path, f'sensor.distance="{d}"')) for d in ("1.5 mm", "50 mm"))
+    assert (near.propagation, far.propagation) == ("angular_spectrum", "far_field")
+    assert near.focal_length_m == np.inf
+    assert "no lens, sensor 1.5 mm behind" in near.lens_text
+    # The shadow of the aperture.
+    assert near.defocus_radius_m(np.inf) == pytest.approx(near.aperture_m / 2)
+    assert spec_of(tmp_path).image_distance_m == 5e-3
+
+
+def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
+    spec = spec_of(tmp_path)
+    path = tmp_path / "again.toml"
+    path.write_text(spec_to_toml(spec))
+    assert load_spec(path) == spec
+
+
+@pytest.mark.parametrize(("distance", "least"), [("5 mm", 0.6), ("1.5 mm", 0.05)])
+def test_a_run_leads_to_a_verified_order_and_to_a_plate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, distance: str, least: float
+):
+    leave_out_pictures(monkeypatch, optimization)
+    spec = spec_of(tmp_path, f'sensor.distance="{distance}"', f"optimize.start_options.focal_length='{distance}'")
+    optimize(spec, tmp_path / "run")
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    row = metrics["psf"][0]
+    assert row["far_spot"] > least
+    assert sum(row["budget"].values()) == pytest.approx(1, abs=1e-5)
+    assert all(one["lens"] is None for one in metrics.get("accuracy", []))
+    made = fabricated(tmp_path / "run")
+    assert made.rows["fabricated"][0]["far_spot"] == pytest.approx(row["far_spot"], rel=1e-3)
+    write_masks(tmp_path / "run", tmp_path / "order")
+    assert verify(tmp_path / "order").passed
+
+
+def test_a_design_is_optimised_for_a_sensor_near_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """From a flat start, at a distance for which the angular spectrum is needed."""
+    leave_out_pictures(monkeypatch, optimization)
+    text = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=30", 'sensor.distance="1.5 mm"')
+    target = 'objective=[{ name = "target_pattern", options = { pattern = "disc", diameter = "40 um" } }]'
+    design = optimize(spec_of(tmp_path, *text, target))
+    losses = [record["loss"] for record in design.history]
+    assert losses[-1] < 0.7 * losses[0]
+
+
+def test_an_area_is_lit_without_a_lens(tmp_path: Path):
+    plain = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=60", 'sensor.distance="50 mm"')
+    area = 'area={ shape = "ellipse", width = "1.5 mm" }'
+    design = optimize(spec_of(tmp_path, *plain, area, 'sensor.pitch="20 um"', "sensor.window=128"))
+    table = on_target(design, design.as_optic())
+    assert table is not None
+    assert table.measures()["on_target"] > 0.65  # of an area seven times as wide as what light can draw
+
+
+@pytest.mark.parametrize(
+    ("changes", "where", "words"),
+    [
+        (['optics.focal_length="8 mm"'], "sensor.distance", "without a lens"),
+        (['optics.mapping="tangent"'], "optics.mapping", "belongs to a lens"),
+        (['sensor.defocus="1 mm"'], "sensor.defocus", "belongs to a lens"),
+        (['optics.propagation="fresnel"'], "optics.propagation", "belongs to a lens"),
+        (['scene.near=["5 mm"]', 'scene.far=["1 m"]'], "scene.near", "through a lens"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, changes: list[str], where: str, words: str):
+    with pytest.raises(InputError) as refused:
+        spec_of(tmp_path, *changes)
+    assert where in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_neither_lens_nor_distance_is_refused(tmp_path: Path):
+    path = tmp_path / "bare.toml"
+    path.write_text(SPEC.replace('distance = "5 mm"\n', ""))
+    with pytest.raises(InputError, match="a camera has a lens, or a sensor at a distance"):
+        load_spec(path)
