@@ -21,7 +21,7 @@ from doedesign.optimization import optimize
 from doedesign.spec import load_spec
 from fab.levels import height_of
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+TEMPLATES = Path(__file__).parents[1] / "doedesign" / "templates"
 WAVE_M = 532e-9
 
 
@@ -111,7 +111,7 @@ def diffuser(quick: bool) -> None:
     seconds, design = 0.0, None
     for uniformity in (1.0,) if quick else (1.0, 0.2):
         begun = time.perf_counter()
-        design = optimize(load_spec(EXAMPLES / "diffuser.toml", [f"area.uniformity={uniformity}"]))
+        design = optimize(load_spec(TEMPLATES / "diffuser.toml", [f"area.uniformity={uniformity}"]))
         seconds = time.perf_counter() - begun
         found = judge_diffuser(design, transmission_of(design))
         least, most = (0.80, 0.15) if uniformity == 1.0 else (0.90, 0.30)
@@ -141,7 +141,7 @@ def top_hat(width_m: float, height_m: float) -> None:
     """Design and judge one; print its numbers."""
     begun = time.perf_counter()
     changes = [f"area.width={width_m * 1e6:g} um", f"area.height={height_m * 1e6:g} um"]
-    design = optimize(load_spec(EXAMPLES / "top_hat.toml", changes))
+    design = optimize(load_spec(TEMPLATES / "top_hat.toml", changes))
     seconds = time.perf_counter() - begun
     step, beam_m = 1.5e-6, 2.5e-3
     x_m, y_m = (np.arange(-round((size / 2 + 80e-6) / step), round((size / 2 + 80e-6) / step) + 1) * step

@@ -9,6 +9,7 @@
 Public names are listed in `__init__.pyi` and loaded when they are used. The rooms behind them, from the user's words to
 the result:
 
+    templates       specs to begin with
     spec            a TOML spec as frozen tables, its rules, its messages, its digest
     build           spec -> values: camera, levels, process, wafer
     design          parameters, objectives and optimisation of a height map; `Design`, which carries the result

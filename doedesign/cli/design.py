@@ -9,6 +9,31 @@ from doedesign.cli.options import AsJson, Flag, Overrides, length_of
 from fab.errors import InputError
 
 
+def new(name: str | None = None, *, out: Path | None = None, json_: AsJson = False) -> None:
+    """Write a commented spec to begin with, or list those that there are.
+
+    Args:
+        name: What it should make: splitter, fan_out, diffuser, top_hat, lens ...; without one all are listed.
+        out: The file; NAME.toml by default.
+    """
+    from doedesign.templates import template_names, template_summary, template_text
+    from fab.files import write_atomic
+
+    if name is None:
+        names = template_names()
+        if json_:
+            print_text(json.dumps({each: template_summary(each) for each in names}))
+        else:
+            wide = max(map(len, names))
+            print_text("\n".join(f"{each:{wide}}  {template_summary(each)}" for each in names))
+        return
+    text, path = template_text(name), out or Path(f"{name}.toml")
+    if path.exists():
+        raise InputError(str(path), "a new spec must not replace a file", "a file of that name", "Give another --out.")
+    write_atomic(path, text.encode())
+    print_paths([path], json_)
+
+
 def optimize(
     spec: Path,
     *,

@@ -37,8 +37,6 @@ def test_every_spec_loads_without_a_warning(path: Path):
     [
         ("quick", ["doe.aperture=0.1184 mm", 'scene.near=["6 mm"]', 'scene.far=["inf"]']),
         ("beam_splitter", ["doe.aperture=0.128 mm", "objective.0.options.spacing=30 um"]),
-        ("diffuser", ["doe.aperture=0.128 mm", "area.width=300 um"]),
-        ("top_hat", ["doe.aperture=1.28 mm", "illumination.diameter=0.6 mm", "area.width=3 mm", "area.height=2 mm"]),
     ],
 )
 def test_small_specs_run(name: str, changes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
