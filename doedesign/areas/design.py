@@ -75,7 +75,12 @@ class AreaTask:
         return cls(spec, camera, levels, target, AreaProblem.of(target, camera, coverage))
 
     def initial_state(self) -> AreaState:
-        """The phase that carries the beam to the area as rays would."""
+        """The phase that carries the beam to the area as rays would, or a random one."""
+        assert self.spec.area is not None
+        if self.spec.area.start == "random":
+            shape, rng = self.camera.grid.shape, np.random.default_rng(self.spec.optimize.seed)
+            phase = jnp.asarray(rng.uniform(0, 2 * np.pi, shape), jnp.float32)
+            return self._begun(phase, jnp.ones(shape, jnp.float32), 0)
         amplitudes, grid = np.asarray(self.problem.amplitudes), self.camera.grid
         light: Any = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
         wavelength = self.camera.lines[0].wavelength_m
@@ -106,7 +111,9 @@ class AreaTask:
     @property
     def begins(self) -> str:
         """How a design begins, in words."""
-        return "carrying the beam to the area by optimal transport"
+        assert self.spec.area is not None
+        random = self.spec.area.start == "random"
+        return "starting from random phases" if random else "carrying the beam to the area by optimal transport"
 
     def steps(self, state: AreaState) -> Iterator[tuple[AreaState, dict[str, Any]]]:
         """Do the remaining steps one by one; yields the state, and the line of the history."""

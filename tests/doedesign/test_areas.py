@@ -1,6 +1,7 @@
 """Areas of light: transport against closed forms, light on the lattice against that of PSFs, what a design reaches."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -197,6 +198,23 @@ def test_a_picture_is_drawn_upright(tmp_path: Path):
     assert image[np.ix_(upper, ~left)].sum() > 3 * image[np.ix_(~upper, ~left)].sum()
     assert image[np.ix_(~upper, left)].sum() > 3 * image[np.ix_(~upper, ~left)].sum()
     assert area_table(design.as_optic(), table.target).summary() == table.summary()
+
+
+def test_random_starts_are_for_any_beam(tmp_path: Path):
+    """Half of the plate lights all of the area from a random start, and half of it from one by transport."""
+    shares = {}
+    for start in ("transport", "random"):
+        design = optimize(spec_of(tmp_path, f'area.start="{start}"'))
+        camera = design.camera
+        half = np.where(camera.grid.axis_m("x") < 0, 1.0, 0.0) * np.ones((128, 1))
+        optic = design.as_optic()
+        masked = replace(optic, coverage=optic.coverage * jnp.asarray(half, jnp.float32))
+        image, axis = np.asarray(psf(masked).energy[0, 0]), camera.axis_m()
+        inside = np.abs(axis[:, None]) < 80e-6
+        left, right = (image[:, (side * axis > 0) & (np.abs(axis) < 130e-6)][inside[:, 0]].sum() for side in (-1, 1))
+        shares[start] = abs(left - right) / (left + right)
+    assert shares["transport"] > 0.8
+    assert shares["random"] < 0.3
 
 
 def test_a_profile_finds_size_and_edges():

@@ -36,6 +36,8 @@ class AreaSpec(SpecTable, frozen=True):
         dark_m: width of a frame around the area in which light counts against evenness, too.
         uniformity: how much of the efficiency evenness is worth: the share of light on the area less so many times
             its contrast, standard deviation over mean, is made as large as it can be. 0 is for light alone.
+        start: "transport" carries the beam to the area as rays would: without speckle, for the beam that is described
+            and where it is aimed at the DOE. "random" mixes the light of all its parts: with speckle, for any beam.
     """
 
     shape: Shape = Field(examples=['"rectangle"'])
@@ -47,6 +49,7 @@ class AreaSpec(SpecTable, frozen=True):
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
     dark_m: Annotated[float, length(0.0, 1.0)] = optional(0.0)
     uniformity: NotNegative = optional(1.0)
+    start: Literal["transport", "random"] = optional("transport")
 
     @property
     def size_m(self) -> tuple[float, float]:
