@@ -55,7 +55,9 @@ def spot_radius_m(camera: Camera, wavelength_m: float) -> float:
 
 
 def near_and_far(camera: Camera, depths_m: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Depths whose defocus disc is wider than the far spot, and the others."""
+    """Depths whose defocus disc is wider than the far spot, and the others; without a lens all are others."""
+    if camera.distance_m is not None:
+        return (), tuple(depths_m)
     spot_m = spot_radius_m(camera, max(line.wavelength_m for line in camera.lines))
     near = tuple(z for z in depths_m if camera.defocus_radius_m(z) > spot_m)
     return near, tuple(z for z in depths_m if z not in near)

@@ -143,7 +143,7 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
 
     _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m)
     depth = group.depths[column]
-    disc_m = camera.defocus_radius_m(bank.depths_m[depth])
+    disc_m = _disc_m(camera, bank.depths_m[depth])
     if disc_m > _least_disc_m(bank):
         _circle(axes, disc_m, "--")
     shares = {"window": float(np.asarray(bank.energy)[picked[0], depth].sum(dtype=np.float64))}
@@ -186,6 +186,11 @@ def _inset_pixels(camera: Camera, bank: "Bank") -> int:
     return min(math.ceil(3 * radius / bank.pixel_m), bank.energy.shape[-1] // 2)
 
 
+def _disc_m(camera: Camera, depth_m: float) -> float:
+    """Radius of the defocus disc; without a lens nothing is out of focus."""
+    return 0.0 if camera.distance_m is not None else camera.defocus_radius_m(depth_m)
+
+
 def _least_disc_m(bank: "Bank") -> float:
     """Radius below which a circle would hide what it surrounds, or not be seen at all."""
     return bank.energy.shape[-1] * bank.pixel_m / 80
@@ -195,7 +200,7 @@ def _notes(camera: Camera, bank: "Bank", shown: dict[str, list[int]]) -> str:
     """Meaning of the marks in the panels."""
     words = []
     depths = [bank.depths_m[i] for positions in shown.values() for i in positions]
-    if any(camera.defocus_radius_m(depth) > _least_disc_m(bank) for depth in depths):
+    if any(_disc_m(camera, depth) > _least_disc_m(bank) for depth in depths):
         words.append("dashed: geometric defocus disc")
     if "far" in shown:
         width = 2 * _inset_pixels(camera, bank) + bank.energy.shape[-1] % 2
