@@ -30,6 +30,7 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
         name: of its design.
     """
     run, order = Path("runs") / name, Path("masks") / name
+    yield ["new"]
     yield ["optimize", str(spec)]
     yield ["masks", str(run)]
     yield ["verify", str(order)]
