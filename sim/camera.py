@@ -174,17 +174,21 @@ class Camera:
     def propagation(self) -> Literal["far_field", "angular_spectrum"]:
         """How light gets to the sensor unless one asks for another way.
 
-        "far_field" behind a lens, and without one where its quadratic phase is right and cells can follow it: cells² N
-        / lambda at most the distance, and less than `_PARAXIAL` of a wave of fourth order from the rim to a corner of
-        the window; "angular_spectrum" where the sensor is nearer.
+        "far_field" behind a lens, and without one from `far_from_m` on; "angular_spectrum" where the sensor is nearer.
         """
-        if self.distance_m is None:
-            return "far_field"
+        return "far_field" if self.distance_m is None or self.distance_m >= self.far_from_m else "angular_spectrum"
+
+    @property
+    def far_from_m(self) -> float:
+        """Distance without a lens from which on the far field holds for this aperture and window.
+
+        Its quadratic phase is right to `_PARAXIAL` of a wave of fourth order from the rim to a corner of the window,
+        and cells can follow it: cells pitch² / wavelength is at most the distance.
+        """
         shortest = min(w for colour in self.colours for w in colour.wavelengths_m)
         reach = self.aperture_m / 2 + self.window * self.pixel_m / math.sqrt(2)
-        fourth = reach**4 / (8 * self.distance_m**3 * shortest)
-        follows = self.grid.shape[0] * self.grid.pitch_m**2 / shortest <= self.distance_m
-        return "far_field" if follows and fourth < _PARAXIAL else "angular_spectrum"
+        follows = self.grid.shape[0] * self.grid.pitch_m**2 / shortest
+        return max(follows, (reach**4 / (8 * shortest * _PARAXIAL)) ** (1 / 3))
 
     def axis_m(self) -> Float[np.ndarray, " window"]:
         """Pixel centres on the sensor relative to the chief ray, metres."""

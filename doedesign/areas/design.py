@@ -23,8 +23,10 @@ from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
 from doedesign.spec import Spec, input_files
 from doedesign.spots.superposition import Staircase
+from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
+from fab.units import format_length
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 
@@ -67,9 +69,20 @@ class AreaTask:
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "AreaTask":
-        """Prepare the task of a spec that has an area."""
+        """Prepare the task of a spec that has an area.
+
+        Raises:
+            InputError: a sensor without a lens that is too near, or a picture that cannot be drawn.
+        """
         assert spec.area is not None
         camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
+        if camera.propagation != "far_field":
+            rule = f"an area without a lens needs a sensor at least {format_length(float(f'{camera.far_from_m:.3g}'))} away"
+            got, cure = (
+                format_length(camera.distance_m or 0.0),
+                "Move the sensor, or choose a smaller aperture or window.",
+            )
+            raise InputError("sensor.distance", rule, got, cure)
         target = AreaTarget.of(spec.area, camera, input_files(spec))
         coverage = np.asarray(circle_coverage(camera.grid, camera.aperture_m))
         return cls(spec, camera, levels, target, AreaProblem.of(target, camera, coverage))

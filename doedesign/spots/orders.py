@@ -183,7 +183,10 @@ def order_table(
         depth_m: distance of the source.
     """
     camera, line = optic.camera, optic.camera.lines[0]
-    plain = optic if camera.beam is None else replace(optic, camera=replace(camera, beam=None))
+    # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
+    focal = {} if camera.distance_m is None else {"distance_m": None, "focal_length_m": camera.distance_m}
+    bare = camera.beam is not None or camera.distance_m is not None
+    plain = replace(optic, camera=replace(camera, beam=None, **focal)) if bare else optic
     field, coverage, grid = np.asarray(plain.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
     if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
         light = camera.irradiance(line.wavelength_m)

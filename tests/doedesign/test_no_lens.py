@@ -51,9 +51,10 @@ steps = 0
 
 
 def spec_of(tmp_path: Path, *overrides: str) -> Spec:
-    path = tmp_path / "bare.toml"
-    path.write_text(SPEC)
-    return load_spec(path, overrides)
+    """The spec with changes; `sensor.distance=` takes that line out."""
+    path, none = tmp_path / "bare.toml", "sensor.distance="
+    path.write_text(SPEC.replace('distance = "5 mm"\n', "") if none in overrides else SPEC)
+    return load_spec(path, [change for change in overrides if change != none])
 
 
 def test_the_way_of_light_follows_from_the_distance(tmp_path: Path):
@@ -101,6 +102,22 @@ def test_a_design_is_optimised_for_a_sensor_near_by(tmp_path: Path, monkeypatch:
     assert losses[-1] < 0.7 * losses[0]
 
 
+def test_orders_of_a_unit_cell_need_no_lens(tmp_path: Path):
+    plain = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=20")
+    spots = 'spots={ count = [3, 3], period = "80 um", starts = 8 }'
+    lensed, bare = (
+        optimize(spec_of(tmp_path, *plain, spots, *more))
+        for more in (("optics.focal_length='5 mm'", "sensor.distance="), ())
+    )
+    assert lensed.level_map.digest == bare.level_map.digest
+    tables = [on_target(each, each.as_optic()) for each in (lensed, bare)]
+    assert tables[0] is not None
+    assert tables[1] is not None
+    assert tables[0].measures() == pytest.approx(tables[1].measures(), abs=1e-5)
+    with pytest.raises(InputError, match="in the focus of a lens"):
+        spec_of(tmp_path, *plain, 'spots={ count = [3, 3], spacing = "80 um" }')
+
+
 def test_an_area_is_lit_without_a_lens(tmp_path: Path):
     plain = ("optimize.start='flat'", "optimize.start_options={}", "optimize.steps=60", 'sensor.distance="50 mm"')
     area = 'area={ shape = "ellipse", width = "1.5 mm" }'
@@ -108,6 +125,8 @@ def test_an_area_is_lit_without_a_lens(tmp_path: Path):
     table = on_target(design, design.as_optic())
     assert table is not None
     assert table.measures()["on_target"] > 0.65  # of an area seven times as wide as what light can draw
+    with pytest.raises(InputError, match=r"needs a sensor at least 1\.\d+ mm away"):
+        optimize(spec_of(tmp_path, *plain, 'area={ shape = "ellipse", width = "40 um" }', 'sensor.distance="1.5 mm"'))
 
 
 @pytest.mark.parametrize(

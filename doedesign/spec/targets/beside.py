@@ -35,8 +35,11 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
             yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
 
 
-def no_defocus(spec: "Spec") -> Iterator[InputError]:
-    """Return the broken rule that spots lie in the focal plane."""
+def in_focus(spec: "Spec") -> Iterator[InputError]:
+    """Return the broken rules that spots lie in the focal plane of a lens; orders of a unit cell need none."""
+    if spec.sensor.distance_m is not None and spec.spots is not None and spec.spots.period_m is None:
+        cure = "Give optics.focal_length, or spots.period for orders of a unit cell."
+        yield InputError("sensor.distance", "spots lie in the focus of a lens", "a distance", cure)
     if spec.sensor.defocus_m:
         got = format_length(spec.sensor.defocus_m)
         yield InputError("sensor.defocus", "spots lie in the focal plane", got, "Leave it out.")

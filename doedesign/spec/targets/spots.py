@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from doedesign.spec.targets.beside import beside_problems, no_defocus
+from doedesign.spec.targets.beside import beside_problems, in_focus
 from doedesign.spec.values import Count, NotNegative, Positive, broken, length
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
@@ -96,7 +96,7 @@ def spot_problems(spec: "Spec") -> Iterator[InputError]:
         complete = False
         yield problem
     yield from beside_problems(spec, "spots")
-    yield from no_defocus(spec)
+    yield from in_focus(spec)
     if complete:
         yield from _reach(spec)
 
