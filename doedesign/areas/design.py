@@ -77,11 +77,9 @@ class AreaTask:
         assert spec.area is not None
         camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
         if camera.propagation != "far_field":
-            rule = f"an area without a lens needs a sensor at least {format_length(float(f'{camera.far_from_m:.3g}'))} away"
-            got, cure = (
-                format_length(camera.distance_m or 0.0),
-                "Move the sensor, or choose a smaller aperture or window.",
-            )
+            least, got = (format_length(float(f"{d:.3g}")) for d in (camera.far_from_m, camera.distance_m or 0))
+            rule = f"an area without a lens needs a sensor at least {least} away"
+            cure = "Move the sensor, or choose a smaller aperture or window."
             raise InputError("sensor.distance", rule, got, cure)
         target = AreaTarget.of(spec.area, camera, input_files(spec))
         coverage = np.asarray(circle_coverage(camera.grid, camera.aperture_m))
