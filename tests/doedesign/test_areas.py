@@ -159,9 +159,9 @@ def test_a_rectangle_has_its_size_and_is_even(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "least", "wide"),
     [
-        (['area.shape="ellipse"'], 0.8, 0.07),
+        pytest.param(['area.shape="ellipse"'], 0.8, 0.07, marks=pytest.mark.slow),
         (['area.shape="ring"', "area.height=", 'area.inner="150 um"'], 0.75, 0.12),
-        (['area.shape="line"', "area.height="], 0.5, 0.12),
+        pytest.param(['area.shape="line"', "area.height="], 0.5, 0.12, marks=pytest.mark.slow),
         (["area.offset=['150 um', '-100 um']"], 0.8, 0.03),
     ],
 )
@@ -236,7 +236,7 @@ def test_power_is_that_of_the_beam(tmp_path: Path):
     assert np.sum(np.abs(waves) ** 2) == pytest.approx(1 - np.exp(-2 * (camera.aperture_m / 200e-6) ** 2), abs=1e-4)
 
 
-@pytest.mark.parametrize("stop", [10, 40])
+@pytest.mark.parametrize("stop", [pytest.param(10, marks=pytest.mark.slow), 40])
 def test_a_stopped_run_goes_on_to_the_same_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int):
     leave_out_pictures(monkeypatch, optimization)
     spec = spec_of(tmp_path, "optimize.checkpoint_every=10")
@@ -259,6 +259,7 @@ def test_a_stopped_run_goes_on_to_the_same_design(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "run/history.jsonl").read_bytes() == (tmp_path / "whole/history.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_run_leads_to_a_verified_order_and_to_a_plate_with_errors(tmp_path: Path):
     spec = spec_of(tmp_path, "optimize.steps=20")
     optimize(spec, tmp_path / "run")

@@ -74,7 +74,7 @@ def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
     assert load_spec(path) == spec
 
 
-@pytest.mark.parametrize(("distance", "least"), [("5 mm", 0.6), ("1.5 mm", 0.05)])
+@pytest.mark.parametrize(("distance", "least"), [pytest.param("5 mm", 0.6, marks=pytest.mark.slow), ("1.5 mm", 0.05)])
 def test_a_run_leads_to_a_verified_order_and_to_a_plate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, distance: str, least: float
 ):

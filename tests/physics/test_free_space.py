@@ -57,7 +57,12 @@ def rayleigh_sommerfeld(camera: Camera, height_m: np.ndarray, at_m: np.ndarray) 
 
 @pytest.mark.parametrize(
     ("distance_m", "way"),
-    [(0.4e-3, "angular_spectrum"), (1e-3, "angular_spectrum"), (2e-3, "far_field"), (40e-3, "far_field")],
+    [
+        (0.4e-3, "angular_spectrum"),
+        pytest.param(1e-3, "angular_spectrum", marks=pytest.mark.slow),
+        (2e-3, "far_field"),
+        pytest.param(40e-3, "far_field", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("kind", ["lens", "random"])
 def test_light_is_that_of_rayleigh_and_sommerfeld(distance_m: float, way: str, kind: str):
