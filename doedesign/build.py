@@ -70,7 +70,7 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     if light.picture is None:
         y, x = _yx(light.diameters_m)
         return GaussianBeam((y / 2, x / 2), light.waist_distance_m, _yx(light.m_squared), centre_m, angle_rad)
-    path = input_files(spec)["illumination.picture"]
+    path = input_files(spec, "illumination.picture")["illumination.picture"]
     picture = read_pixels(path, others="RGBA")
     if picture.ndim == 3:
         picture = picture[..., : 3 if picture.shape[2] > 2 else 1].mean(axis=2)

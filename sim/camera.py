@@ -143,13 +143,17 @@ class Camera:
     @property
     def lines(self) -> tuple[SpectralLine, ...]:
         """Every wavelength of every colour, colour by colour, and of each every mode of the beam."""
-        shares = (1.0,) if self.beam is None else self.beam.shares
         return tuple(
             SpectralLine(number, wavelength, weight * self.transmission(wavelength) * share, mode)
             for number, colour in enumerate(self.colours)
             for wavelength, weight in zip(colour.wavelengths_m, colour.weights, strict=True)
-            for mode, share in enumerate(shares)
+            for mode, share in enumerate(self.shares)
         )
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Power of every mode of the beam, together 1; `lines` has as many of every wavelength."""
+        return (1.0,) if self.beam is None else self.beam.shares
 
     def chief_rad(self, field_rad: tuple[float, float]) -> tuple[float, float]:
         """Angles (y, x) of the chief ray at field angles about the axis of the beam, or about that of the lens."""

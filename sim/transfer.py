@@ -92,7 +92,7 @@ def mtf(
     frequencies = np.linspace(0.0, 0.5 / camera.pixel_m, count)
     otf = np.zeros((len(camera.colours), len(depths_m), count), np.complex128)
     lags = np.arange(camera.grid.shape[1])
-    shares = (1.0,) if camera.beam is None else camera.beam.shares
+    shares = camera.shares
     weights = [weight for colour in camera.colours for weight in colour.weights]
     for d, depth in enumerate(depths_m):
         for k, weight in enumerate(weights):

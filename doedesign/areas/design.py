@@ -27,7 +27,6 @@ from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import format_length
-from sim.aperture import circle_coverage
 from sim.camera import Camera
 
 _MEMORY = 8  # steps that L-BFGS remembers
@@ -81,9 +80,8 @@ class AreaTask:
             rule = f"an area without a lens needs a sensor at least {least} away"
             cure = "Move the sensor, or choose a smaller aperture or window."
             raise InputError("sensor.distance", rule, got, cure)
-        target = AreaTarget.of(spec.area, camera, input_files(spec))
-        coverage = np.asarray(circle_coverage(camera.grid, camera.aperture_m))
-        return cls(spec, camera, levels, target, AreaProblem.of(target, camera, coverage))
+        target = AreaTarget.of(spec.area, camera, input_files(spec).get("area.picture"))
+        return cls(spec, camera, levels, target, AreaProblem.of(target, camera))
 
     def initial_state(self) -> AreaState:
         """The phase that carries the beam to the area as rays would, or a random one."""
@@ -177,11 +175,6 @@ class AreaTask:
         )
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 
-    def judged(self, level_map: LevelMap) -> AreaLight:
-        """Efficiency and contrast of a level map as the optimiser sees them."""
-        phase = np.angle(self.staircase.light)[level_map.level]
-        return self.problem.judge(self.problem.light(jnp.asarray(phase, jnp.float32)))
-
 
 def _optimiser() -> optax.GradientTransformationExtraArgs:
     search = optax.scale_by_zoom_linesearch(max_linesearch_steps=12, initial_guess_strategy="one")
@@ -196,12 +189,12 @@ def _step(
     start = phase
 
     def loss_of(moved: Array) -> Array:
-        return problem.loss(jnp.where(free > 0, moved, start), uniformity)[0]
+        return problem.loss(jnp.where(free > 0, moved, start), uniformity)
 
     optimiser = _optimiser()
     value: Any
     value, gradient = optax.value_and_grad_from_state(loss_of)(phase, state=memory)
     updates, memory = optimiser.update(gradient, memory, phase, value=value, grad=gradient, value_fn=loss_of)
-    light = problem.judge(problem.light(phase))
+    light = problem.judge(phase)
     moved: Any = optax.apply_updates(phase, updates)
     return moved, memory, value, light

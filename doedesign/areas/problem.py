@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from doedesign.areas.target import AreaTarget
-from sim.camera import Camera, path_at_m
+from sim.camera import Camera
+from sim.optic import CellOptic, HeightOptic
 
 # By how much light on the edges of an area may differ from what is wanted without harm, over that inside.
 _LEEWAY = 0.1
@@ -35,14 +36,10 @@ class AreaLight(NamedTuple):
     misplaced: Float[Array, ""]
 
 
-class AreaProblem(eqx.Module):
-    """A DOE to be designed for an area.
+class AreaScore(eqx.Module):
+    """How light on a lattice is judged.
 
     Attributes:
-        amplitudes: `[mode, y, x]` wave on every cell by mode of the beam, its open share and the root of its power
-            included; its squares sum to the light that passes the opening.
-        along_y: `[v, y]` factors of the rows, exp(-2 pi i u y) with the cell's sinc, for the rows of the lattice.
-        along_x: `[u, x]` the same of the columns.
         wanted: `[v, u]` light wanted, its mean over the flat part 1.
         lit: where light counts as that of the area.
         even: `[v, u]` weights of squared differences in the contrast.
@@ -50,9 +47,6 @@ class AreaProblem(eqx.Module):
         border: `[place, v]` and `[place, u]` weights for the light at places on the border.
     """
 
-    amplitudes: Complex[Array, "mode y x"]
-    along_y: Complex[Array, "v y"]
-    along_x: Complex[Array, "u x"]
     wanted: Float[Array, "v u"]
     lit: Bool[Array, "v u"]
     even: Float[Array, "v u"]
@@ -60,20 +54,55 @@ class AreaProblem(eqx.Module):
     border: tuple[Float[Array, "n v"], Float[Array, "n u"]]
 
     @classmethod
-    def of(cls, target: AreaTarget, camera: Camera, coverage: Float[np.ndarray, "y x"]) -> "AreaProblem":
-        """The problem of a target for the first wavelength of a camera."""
-        rows, columns = lattice_factors(target, camera)
+    def of(cls, target: AreaTarget) -> "AreaScore":
+        """The score of a target."""
         flat, even = target.flat, target.flat | target.dark
         return cls(
-            jnp.asarray(incident_amplitudes(camera, coverage)),
-            jnp.asarray(rows, jnp.complex64),
-            jnp.asarray(columns, jnp.complex64),
             jnp.asarray(target.wanted / target.wanted[flat].mean(), jnp.float32),
             jnp.asarray(target.lit),
             jnp.asarray(even / flat.sum(), jnp.float32),
             jnp.asarray((target.lit & ~even) / flat.sum(), jnp.float32),
             (jnp.asarray(target.border[0], jnp.float32), jnp.asarray(target.border[1], jnp.float32)),
         )
+
+    def inside(self, light: Float[Array, "v u"]) -> Float[Array, ""]:
+        """Light inside: what the wanted light is to be multiplied by to fit best."""
+        weights = self.even * self.wanted
+        return jnp.sum(weights * light) / jnp.sum(weights * self.wanted)
+
+    def judge(self, light: Float[Array, "v u"]) -> AreaLight:
+        """Efficiency, contrast and misplaced light of shares of the incident light."""
+        efficiency = jnp.sum(jnp.where(self.lit, light, 0.0))
+        over = light / jnp.maximum(self.inside(light), 1e-30)
+        missed = jnp.sum(self.even * (over - self.wanted) ** 2)
+        rows, columns = self.border
+        misplaced = jnp.sum((jnp.sum(rows @ over * columns, axis=1) - 0.5) ** 2) / max(1, len(rows))
+        misplaced += jnp.sum(self.edge * jnp.maximum(jnp.abs(over - self.wanted) - _LEEWAY, 0.0) ** 2)
+        return AreaLight(efficiency, jnp.sqrt(missed + 1e-12), jnp.sqrt(misplaced + 1e-12))
+
+
+class AreaProblem(eqx.Module):
+    """A DOE to be designed for an area.
+
+    Attributes:
+        amplitudes: `[mode, y, x]` field behind the bare opening (`mode_fields`).
+        along_y: `[v, y]` factors of the rows, exp(-2 pi i u y) with the cell's sinc, for the rows of the lattice.
+        along_x: `[u, x]` the same of the columns.
+        score: how the light on the lattice is judged.
+    """
+
+    amplitudes: Complex[Array, "mode y x"]
+    along_y: Complex[Array, "v y"]
+    along_x: Complex[Array, "u x"]
+    score: AreaScore
+
+    @classmethod
+    def of(cls, target: AreaTarget, camera: Camera) -> "AreaProblem":
+        """The problem of a target for the first wavelength of a camera."""
+        rows, columns = lattice_factors(target, camera)
+        bare = mode_fields(HeightOptic.of(camera))
+        fields, along_y, along_x = (jnp.asarray(part, jnp.complex64) for part in (bare, rows, columns))
+        return cls(fields, along_y, along_x, AreaScore.of(target))
 
     def light(self, phase: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """Share of the incident light on every sample of the lattice."""
@@ -85,37 +114,22 @@ class AreaProblem(eqx.Module):
 
         return jnp.sum(jax.lax.map(of_mode, self.amplitudes), axis=0)
 
-    def judge(self, light: Float[Array, "v u"]) -> AreaLight:
-        """Efficiency and contrast of light on the lattice."""
-        efficiency = jnp.sum(jnp.where(self.lit, light, 0.0))
-        weights = self.even * self.wanted
-        mean = jnp.sum(weights * light) / jnp.sum(weights * self.wanted)  # of the scale that fits best
-        over = light / jnp.maximum(mean, 1e-30)
-        missed = jnp.sum(self.even * (over - self.wanted) ** 2)
-        rows, columns = self.border
-        misplaced = jnp.sum((jnp.sum(rows @ over * columns, axis=1) - 0.5) ** 2) / max(1, len(rows))
-        misplaced += jnp.sum(self.edge * jnp.maximum(jnp.abs(over - self.wanted) - _LEEWAY, 0.0) ** 2)
-        return AreaLight(efficiency, jnp.sqrt(missed + 1e-12), jnp.sqrt(misplaced + 1e-12))
+    def judge(self, phase: Float[Array, "y x"]) -> AreaLight:
+        """Efficiency, contrast and misplaced light of a phase."""
+        return self.score.judge(self.light(phase))
 
-    def loss(self, phase: Float[Array, "y x"], uniformity: float | Float[Array, ""]) -> tuple[Array, AreaLight]:
-        """One less the merit, and the numbers that it is made of."""
-        light = self.judge(self.light(phase))
-        uneven = jnp.sqrt(light.contrast**2 + light.misplaced**2)
-        return 1.0 - light.efficiency + uniformity * uneven, light
+    def loss(self, phase: Float[Array, "y x"], uniformity: float | Float[Array, ""]) -> Float[Array, ""]:
+        """One less the merit."""
+        light = self.judge(phase)
+        return 1.0 - light.efficiency + uniformity * jnp.sqrt(light.contrast**2 + light.misplaced**2)
 
 
-def incident_amplitudes(camera: Camera, coverage: Float[np.ndarray, "y x"]) -> Complex[np.ndarray, "mode y x"]:
-    """Wave `[mode, y, x]` behind the opening for the first wavelength, curvature of lens and sensor included."""
-    first = camera.lines[0]
-    waves = path_at_m(camera, camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x"), np.inf) / first.wavelength_m
-    waves = np.broadcast_to(waves, camera.grid.shape)
+def mode_fields(doe: CellOptic) -> Complex[np.ndarray, "mode y x"]:
+    """Field behind a DOE for the first wavelength, by mode of the beam; its squares sum to the light that passes."""
+    camera = doe.camera
     power = camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
-    wave = coverage * np.sqrt(power) * np.exp(2j * np.pi * (waves - np.rint(waves)))
-    if camera.beam is None:
-        return wave[None].astype(np.complex64)
-    own = [line for line in camera.lines if line[:2] == first[:2]]
-    modes = [np.sqrt(share) * camera.incident(line) * wave for share, line in zip(camera.beam.shares, own, strict=True)]
-    return np.stack(modes).astype(np.complex64)
+    modes = zip(camera.shares, camera.lines, strict=False)  # those of the first wavelength come first
+    return np.stack([np.float32(np.sqrt(share * power)) * np.asarray(doe.field(line)) for share, line in modes])
 
 
 def lattice_factors(

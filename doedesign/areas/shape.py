@@ -5,10 +5,11 @@ import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from doedesign.areas.problem import lattice_factors
+from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
 from doedesign.areas.target import FLAT, OUTER, AreaTarget
 from doedesign.design.design import Design
 from doedesign.spec import input_files
@@ -89,9 +90,10 @@ class AreaTable:
         light: `[y, x]` light on the lattice over the mean of the flat part.
         camera: optics and sensor.
         efficiency: share of the incident light where at least 13.5 % is wanted, Fresnel loss left out.
-        contrast: root mean square of light over what is wanted less 1, where at least 90 % is.
-        pixel_contrast: standard deviation over mean of the sensor's pixels that lie in the flat part, an edge away
-            from its border; None without such pixels, and for pictures.
+        contrast: root mean square of light over what is wanted less 1, where at least 90 % is, and in a frame that
+            should be dark.
+        pixel_contrast: standard deviation over mean of the sensor's pixels that lie in the flat part; None without such
+            pixels, and for pictures.
         zeroth_order: share of the light that passes as if the DOE were flat.
         side_lobe: strongest light where less than 13.5 % is wanted, over the mean of the flat part.
         fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
@@ -174,8 +176,9 @@ def area_of_design(design: Design, doe: CellOptic) -> AreaTable:
     """Light on the area of a design's spec, of the design as drawn or as fabricated."""
     assert design.spec is not None
     assert design.spec.area is not None
-    files = input_files(design.spec)
-    return area_table(doe, AreaTarget.of(design.spec.area, design.camera, files, _SAMPLES))
+    key = "area.picture"
+    picture = input_files(design.spec, key)[key] if design.spec.area.picture else None
+    return area_table(doe, AreaTarget.of(design.spec.area, design.camera, picture, _SAMPLES))
 
 
 def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
@@ -185,18 +188,16 @@ def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
         doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
         target: the area, on a lattice as fine as its light is to be seen.
     """
-    light, camera = light_on(doe, target), doe.camera
-    flat, wanted = target.flat, target.wanted
-    mean = np.sum((light * wanted)[flat]) / np.sum((wanted**2)[flat])
-    over = light / max(mean, 1e-300)
-    missed = np.sqrt(np.mean((over - wanted)[flat] ** 2)) / wanted[flat].mean()
+    light, camera, score = light_on(doe, target), doe.camera, AreaScore.of(target)
+    shares = jnp.asarray(light, jnp.float32)
+    over, judged = light / max(float(score.inside(shares)), 1e-30), score.judge(shares)
     picture = target.shape == "picture"
     return AreaTable(
         target,
         over,
         camera,
-        float(light[target.lit].sum()),
-        float(missed),
+        float(judged.efficiency),
+        float(judged.contrast),
         None if picture else _on_pixels(over, target, camera),
         float(zeroth_order(doe)[0]),
         float(over[~target.lit].max(initial=0.0)),
@@ -208,14 +209,11 @@ def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
 
 def light_on(doe: CellOptic, target: AreaTarget) -> Float[np.ndarray, "v u"]:
     """Share of the incident light of the first wavelength on every sample of a lattice, Fresnel loss left out."""
-    camera, first = doe.camera, doe.camera.lines[0]
-    rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, camera))
-    modes = [line for line in camera.lines if line[:2] == first[:2]]
-    shares = (1.0,) if camera.beam is None else camera.beam.shares
-    light, power = np.zeros(target.value.shape), camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
-    for line, share in zip(modes, shares, strict=True):
-        field = rows @ np.asarray(doe.field(line)) @ columns.T
-        light += share * power * (field.real**2 + field.imag**2)
+    rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, doe.camera))
+    light = np.zeros(target.value.shape)
+    for mode in mode_fields(doe):
+        field = rows @ mode @ columns.T
+        light += field.real**2 + field.imag**2
     return light
 
 

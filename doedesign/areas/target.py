@@ -1,6 +1,5 @@
 """An area to be lit, on a lattice of directions that is fine enough for all that light can draw."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from scipy.ndimage import map_coordinates
 from doedesign.design.patterns import picture_light
 from doedesign.spec.targets.areas import AreaSpec
 from fab.errors import InputError
+from fab.units import format_length
 from sim.camera import Camera
 from sim.illumination import GaussianBeam
 
@@ -69,17 +69,20 @@ class AreaTarget:
         return self.value if self.shape in ("picture", "line") else np.where(self.flat, 1.0, self.value)
 
     @classmethod
-    def of(cls, table: AreaSpec, camera: Camera, files: Mapping[str, Path], samples: float = _SAMPLES) -> "AreaTarget":
+    def of(cls, table: AreaSpec, camera: Camera, picture: Path | None, samples: float = _SAMPLES) -> "AreaTarget":
         """The area of a spec for the first wavelength of a camera, so many samples per lambda d / D apart.
 
         Raises:
-            InputError: a picture that cannot be read or is dark, or an area with too much detail.
+            InputError: a picture that cannot be read, is dark, or reaches beyond what cells can light, or an area with
+                too much detail.
         """
+        light = None if picture is None else _picture_light(picture)
+        size_m = table.size_m if light is None else (table.size_m[1] * light.shape[0] / light.shape[1], table.size_m[1])
         wavelength = camera.lines[0].wavelength_m
         edge = table.edge_m or finest_detail_m(camera)
         step = wavelength / camera.aperture_m / samples
         middle, axes = (table.offset_m[1], table.offset_m[0]), []
-        for centre, size in zip(middle, table.size_m, strict=True):
+        for centre, size in zip(middle, size_m, strict=True):
             half = size / 2 + max(_MARGIN * edge, table.dark_m + edge)
             ends = [camera.sines_of(*(centre + side * half, 0.0))[0] for side in (-1, 1)]
             # A multiple of the step from the axis, so that the 0th order is one of the samples.
@@ -89,17 +92,18 @@ class AreaTarget:
                 got, cure = f"{last - first:.0f}", "Choose a smaller area or aperture."
                 raise InputError("area", rule, got, cure)
             axes.append(np.arange(first, last + 1) * step)
+        _require_reach(camera, max(float(np.abs(axis).max()) for axis in axes))
         y, x = camera.image_m(axes[0][:, None], axes[1][None, :])
         at = y - middle[0], x - middle[1]
-        value = _draw(table, at, edge, files.get("area.picture"))
+        value = _draw(table, at, edge) if light is None else _draw_picture(light, at, size_m)
         dark = np.zeros(value.shape, bool)
         if table.dark_m:
-            wider = [size + 2 * table.dark_m for size in table.size_m]
+            wider = [size + 2 * table.dark_m for size in size_m]
             dark = (np.abs(at[0]) <= wider[0] / 2) & (np.abs(at[1]) <= wider[1] / 2) & (value < 1 - FLAT)
         sines = camera.sines_of(*(_border(table) + middle).T)
         rows, columns = (_between(axis, at) for axis, at in zip(axes, sines, strict=True))
         sines_y, sines_x = axes
-        return cls(sines_y, sines_x, value, dark, middle, table.size_m, edge, table.shape, (rows, columns))
+        return cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns))
 
 
 def finest_detail_m(camera: Camera) -> float:
@@ -112,8 +116,17 @@ def finest_detail_m(camera: Camera) -> float:
     return float(max(quality * scale / np.pi / np.sqrt(np.prod(camera.beam.radius_m)), finest))
 
 
+def _require_reach(camera: Camera, farthest: float) -> None:
+    """Raise an `InputError` where the farthest direction sine is beyond those that the cells tell apart."""
+    most = camera.lines[0].wavelength_m / (2 * camera.grid.pitch_m)
+    if farthest > most:
+        finer = format_length(float(f"{camera.grid.pitch_m * most / farthest:.3g}"))
+        rule = f"cells of {format_length(camera.grid.pitch_m)} light directions up to a sine of {most:.3g}"
+        raise InputError("area", rule, f"{farthest:.3g}", f"Choose a smaller area, or a pitch of at most {finer}.")
+
+
 def _draw(
-    table: AreaSpec, at_m: tuple[Float[np.ndarray, "v u"], Float[np.ndarray, "v u"]], edge_m: float, path: Path | None
+    table: AreaSpec, at_m: tuple[Float[np.ndarray, "v u"], Float[np.ndarray, "v u"]], edge_m: float
 ) -> Float[np.ndarray, "v u"]:
     """Light wanted at places (y, x) from the middle of an area."""
     (y, x), (height, width) = np.broadcast_arrays(*at_m), table.size_m
@@ -127,9 +140,6 @@ def _draw(
     if table.shape == "line":
         along, across, size = (x, y, width) if width else (y, x, height)
         return within(size / 2 - np.abs(along)) * np.exp(-2 * (across / edge_m) ** 2)
-    if table.shape == "picture":
-        assert path is not None
-        return _picture(path, y / width, x / width)
     radius = np.hypot(2 * y / height, 2 * x / width)  # 1 on the rim
     # Distance to the rim along the ray from the middle: exact for a circle.
     outer = np.hypot(y, x) * (1 / np.maximum(radius, 1e-9) - 1)
@@ -161,11 +171,27 @@ def _between(axis: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"]) -> Floa
     return weights / weights.sum(1, keepdims=True)
 
 
-def _picture(path: Path, y: Float[np.ndarray, "v u"], x: Float[np.ndarray, "v u"]) -> Float[np.ndarray, "v u"]:
-    """Light of a picture, its brightest part 1, at places in widths from its middle."""
+def _picture_light(path: Path) -> Float[np.ndarray, "y x"]:
+    """Light of a picture, its brightest part 1."""
     light = picture_light(path)
     if not light.max() > 0:
         raise InputError(str(path), "the picture must hold some light", "black", "Give another picture.")
-    rows, columns = light.shape
-    places = np.stack([y * columns + (rows - 1) / 2, x * columns + (columns - 1) / 2])
-    return map_coordinates(light / light.max(), places, order=1, mode="constant")
+    return light / light.max()
+
+
+def _draw_picture(
+    light: Float[np.ndarray, "y x"],
+    at_m: tuple[Float[np.ndarray, "v u"], Float[np.ndarray, "v u"]],
+    size_m: tuple[float, float],
+) -> Float[np.ndarray, "v u"]:
+    """Light of a picture of that size at places (y, x) from its middle; dark around it.
+
+    Detail finer than the distance of the places is averaged first.
+    """
+    from skimage.transform import resize
+
+    steps_m = [float(np.ptp(at)) / (n - 1) for at, n in zip(at_m, at_m[0].shape, strict=True)]
+    shape = [min(n, int(np.ceil(size / step))) for n, size, step in zip(light.shape, size_m, steps_m, strict=True)]
+    light = np.asarray(resize(light, shape, anti_aliasing=True))
+    places = [at / size * n + (n - 1) / 2 for at, size, n in zip(at_m, size_m, light.shape, strict=True)]
+    return map_coordinates(light, np.stack(np.broadcast_arrays(*places)), order=1, mode="constant")

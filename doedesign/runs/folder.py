@@ -35,8 +35,8 @@ from pydantic import BaseModel, ValidationError
 from doedesign import __version__
 from doedesign.spec import (
     Spec,
-    beam_copy,
     input_files,
+    kept_pictures,
     load_spec,
     spec_digest,
     spec_from_json,
@@ -241,17 +241,18 @@ def _changed_keys(path: Path, spec: Spec) -> str:
 
 
 def begin_run(run: Run) -> None:
-    """Write the manifest of a claimed run that begins, its spec, and the picture of its beam."""
+    """Write the manifest of a claimed run that begins, its spec, and its pictures."""
+    for key, name in kept_pictures(run.spec).items():
+        if not run.path(name).is_file():
+            write_atomic(run.path(name), read_bytes(input_files(run.spec, key)[key]))
     _write_manifest(run, "running", {})
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
-    if (name := beam_copy(run.spec)) and not run.path(name).is_file():
-        write_atomic(run.path(name), read_bytes(input_files(run.spec)["illumination.picture"]))
 
 
 def finish_run(run: Run, results: Sequence[str], depths_m: Sequence[float] = ()) -> None:
     """Mark a claimed run done, with its files and, where it was to choose them, the depths of the etches, metres."""
     chosen = {_DEPTHS: list(depths_m)} if run.spec.process.chooses_depths else {}
-    kept = [name] if (name := beam_copy(run.spec)) else []
+    kept = kept_pictures(run.spec).values()
     digests = {name: sha256_file(run.path(name)) for name in sorted([*results, *kept])}
     _write_manifest(run, "done", {**chosen, "results_sha256": digests})
     run.path(CHECKPOINT).unlink(missing_ok=True)
@@ -282,7 +283,8 @@ def open_run(folder: Path) -> Run:
         cure = "Give the run, or a training behind its plate."
         raise InputError(str(folder), f"must hold a plate, {LEVEL_MAP}", "none", cure)
     for name, digest in manifest.results_sha256.items():
-        if (name.endswith((".exr", LEVEL_MAP)) or name == beam_copy(spec)) and sha256_file(folder / name) != digest:
+        relied = name.endswith((".exr", LEVEL_MAP)) or name in kept_pictures(spec).values()
+        if relied and sha256_file(folder / name) != digest:
             cure = f"Restore it, or remove {folder} and optimise again."
             raise InputError(str(folder / name), "must be the file this run wrote", "a changed file", cure)
     if spec.process.chooses_depths:  # from now on as if the depths that it chose had been given

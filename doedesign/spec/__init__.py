@@ -49,7 +49,7 @@ from doedesign.spec.values.table import toml_key
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
 from fab.errors import InputError
-from fab.files import read_bytes
+from fab.files import MANIFEST_NAME, read_bytes
 from fab.levels import Levels
 from fab.process import Variation
 
@@ -170,23 +170,21 @@ def _checked(
     return value
 
 
-def input_files(spec: Spec) -> dict[str, Path]:
-    """Return the files a spec names by dotted key ("optimize.start", "objective[0].options.image").
+def input_files(spec: Spec, only: str | None = None) -> dict[str, Path]:
+    """Return the files a spec names by dotted key ("optimize.start", "objective[0].options.image"), or `only` one.
 
-    They are found relative to the folder of the spec file, or to the current one.
+    They are found relative to the folder of the spec file, or to the current one; in a run, those that it keeps.
     """
     named = {} if spec.optimize.start in STARTS else {"optimize.start": spec.optimize.start}
     for index, objective in enumerate(spec.objectives):
         if "image" in objective.options:
             named[f"objective[{index}].options.image"] = str(objective.options["image"])
-    if spec.area is not None and spec.area.picture is not None:
-        named["area.picture"] = spec.area.picture
-    beam = spec.illumination
-    if beam is not None and beam.picture is not None:
-        named["illumination.picture"] = beam.picture
+    named |= _pictures(spec)
     folder = Path() if spec.file is None else spec.file.parent
-    if (copy := beam_copy(spec)) and (folder / copy).is_file():
-        named["illumination.picture"] = copy
+    if (folder / MANIFEST_NAME).is_file():  # that of a run
+        named |= kept_pictures(spec)
+    if only is not None:
+        named = {only: named[only]}
     files = {key: folder / name for key, name in named.items()}
     missing = [
         InputError(key, "the file must exist", f'"{named[key]}"', f"Put it at {file} or change the path.")
@@ -198,10 +196,16 @@ def input_files(spec: Spec) -> dict[str, Path]:
     return files
 
 
-def beam_copy(spec: Spec) -> str:
-    """Name under which a run keeps the picture of its beam, so that it needs nothing outside its folder."""
-    beam = spec.illumination
-    return "" if beam is None or beam.picture is None else f"illumination{Path(beam.picture).suffix.lower()}"
+def _pictures(spec: Spec) -> dict[str, str]:
+    """Pictures that more than the optimisation looks at, by dotted key."""
+    tables = {"area": spec.area, "illumination": spec.illumination}
+    return {f"{name}.picture": table.picture for name, table in tables.items() if table and table.picture}
+
+
+def kept_pictures(spec: Spec) -> dict[str, str]:
+    """Names under which a run keeps its own copies of pictures, by dotted key, so that it needs nothing else."""
+    names = _pictures(spec).items()
+    return {key: f"{key.replace('.', '_')}{Path(name).suffix.lower()}" for key, name in names}
 
 
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from scipy.special import erf
 
 import doedesign.optimization as optimization
 from doedesign.areas.design import AreaTask
-from doedesign.areas.problem import incident_amplitudes
+from doedesign.areas.problem import mode_fields
 from doedesign.areas.shape import AreaTable, Profile, area_of_design, area_table, light_on
 from doedesign.areas.target import AreaTarget
 from doedesign.areas.transport import transport_phase
@@ -26,7 +26,7 @@ from fab.errors import InputError
 from fab.order.verify import verify
 from fab.pictures import write_pixels
 from fab.process import Variation
-from sim.aperture import circle_coverage
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from tests.pictures import leave_out_pictures
 
@@ -106,7 +106,7 @@ def test_light_on_the_lattice_is_that_of_the_sensor(tmp_path: Path, beam: str):
     spec = load_spec(path, ["optimize.steps=4"])
     design = optimize(spec)
     assert spec.area is not None
-    target = AreaTarget.of(spec.area, design.camera, {}, 4.0)
+    target = AreaTarget.of(spec.area, design.camera, None, 4.0)
     light = light_on(design.as_optic(), target)
     bank, camera = psf(design), design.camera
     image = np.asarray(bank.energy[0, 0]) / camera.transmission(532e-9)
@@ -133,7 +133,7 @@ def test_the_gradient_is_that_of_the_loss(tmp_path: Path):
     step = jnp.asarray(rng.normal(0, 1, (128, 128)), jnp.float32)
 
     def loss(one: jax.Array) -> jax.Array:
-        return task.problem.loss(one, 1.0)[0]
+        return task.problem.loss(one, 1.0)
 
     slope = float(jnp.sum(jax.grad(loss)(phase) * step))
     ends = [float(loss(phase + side * 0.02 * step)) for side in (1, -1)]
@@ -200,6 +200,30 @@ def test_a_picture_is_drawn_upright(tmp_path: Path):
     assert area_table(design.as_optic(), table.target).summary() == table.summary()
 
 
+def test_a_run_of_a_picture_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A portrait, all of it; the run keeps it, and takes no picture of that name for its own before it is one."""
+    leave_out_pictures(monkeypatch, optimization)
+    grey = np.zeros((60, 30), np.uint8)
+    grey[50:58, 5:25] = grey[2:10, 5:25] = 255
+    write_pixels(tmp_path / "sign.png", grey)
+    write_pixels(tmp_path / "area_picture.png", np.full((8, 8), 255, np.uint8))
+    text = SPEC.replace('shape = "rectangle"', 'shape = "picture"\npicture = "sign.png"')
+    path = tmp_path / "square.toml"
+    path.write_text(text.replace('height = "200 um"\n', "").replace("300 um", "200 um"))
+    design = optimize(load_spec(path), tmp_path / "run")
+    (tmp_path / "sign.png").unlink()
+    drawn = fabricated(tmp_path / "run").aimed["nominal"]
+    assert isinstance(drawn, AreaTable)
+    assert drawn.target.size_m == pytest.approx((400e-6, 200e-6))
+    image, axis = np.asarray(psf(design).energy[0, 0]), design.camera.axis_m()
+    bars = [image[np.abs(axis - side * 160e-6) < 40e-6].sum() for side in (-1, 1)]
+    assert min(bars) > 0.25
+    assert image[np.abs(axis) < 40e-6].sum() < 0.2 * min(bars)
+    write_pixels(tmp_path / "sign.png", np.full((300, 30), 255, np.uint8))
+    with pytest.raises(InputError, match="light directions up to a sine of"):
+        optimize(load_spec(path, ['area.width="300 um"']))
+
+
 def test_random_starts_are_for_any_beam(tmp_path: Path):
     """Half of the plate lights all of the area from a random start, and half of it from one by transport."""
     shares = {}
@@ -231,7 +255,7 @@ def test_power_is_that_of_the_beam(tmp_path: Path):
     path = tmp_path / "square.toml"
     path.write_text(SPEC + '[illumination]\nkind = "gaussian"\ndiameter = "200 um"\n')
     camera = camera_from_spec(load_spec(path))
-    waves = incident_amplitudes(camera, np.asarray(circle_coverage(camera.grid, camera.aperture_m)))
+    waves = mode_fields(HeightOptic.of(camera))
     # A circle of 2.46 beam radii.
     assert np.sum(np.abs(waves) ** 2) == pytest.approx(1 - np.exp(-2 * (camera.aperture_m / 200e-6) ** 2), abs=1e-4)
 

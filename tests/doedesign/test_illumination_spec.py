@@ -91,12 +91,14 @@ def test_a_run_keeps_the_picture_of_its_beam(tmp_path: Path, monkeypatch: pytest
     leave_out_pictures(monkeypatch, optimization)
     grey = beam_picture(tmp_path / "beam.png")
     spec = spec_of(tmp_path, PICTURE)
+    # A picture of the name of a run's copy, beside the spec of a user, is somebody else's.
+    write_pixels(tmp_path / "illumination_picture.png", np.zeros((8, 8), np.uint16))
     optimize(spec, tmp_path / "run")
     (tmp_path / "beam.png").unlink()
     beam = camera_from_spec(open_run(tmp_path / "run").spec).beam
     assert isinstance(beam, MeasuredBeam)
     np.testing.assert_array_equal(beam.intensity, grey)  # the brightest place above the middle
-    copy = tmp_path / "run/illumination.png"
+    copy = tmp_path / "run/illumination_picture.png"
     beam_picture(copy)
     write_pixels(copy, grey[::-1])
     with pytest.raises(InputError, match="must be the file this run wrote"):
