@@ -30,8 +30,8 @@ from sim.camera import Camera
 from sim.material import refractive_index
 from sim.optic import HeightOptic, ViewedOptic
 from sim.propagation.oblique import oblique_waves
-from sim.rigorous.edge_widths import width_series
 from sim.rigorous.walls import Walls, light_of_cells_and_walls
+from sim.rigorous.width_tables import highest_wall, two_waves, width_series
 from sim.source import SeparableSource, SourceMap, View
 from sim.tracing import is_traced
 
@@ -39,7 +39,6 @@ from sim.tracing import is_traced
 # split; lines are about a tenth of the light.
 _GOOD, _WORST, _MOST_TAPS = 0.003, 0.03, 10
 _SHARES = 33  # of the way from the axis to the rim, for which weights are fitted
-_NODE_M = 25e-9  # highest walls are rounded up to, so that plates much alike share what is made for them
 
 
 class EdgeOptic(ViewedOptic):
@@ -137,9 +136,7 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
     for view in views:
         wavelength = view.wavelength_m
         index = refractive_index(camera.material, wavelength)
-        # Walls of two waves, where heights are traced.
-        highest = 2 * wavelength / (index - 1) if is_traced(height) else float(jnp.ptp(height))
-        highest = _NODE_M * max(1, int(np.ceil(highest / _NODE_M - 1e-3)))
+        highest = highest_wall(two_waves(wavelength, index) if is_traced(height) else float(jnp.ptp(height)))
         taps, _ = line_weights(*oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m)))
         walls = []
         for axis in ("y", "x"):

@@ -104,8 +104,7 @@ def relative_widths(
     return np.mean(widths, axis=0) * np.exp(-2j * np.pi * heights_m / wavelength_m)
 
 
-@lru_cache(maxsize=64)
-def width_series(
+def computed_series(
     highest_m: float, wavelength_m: float, index: float, polarisation: str, axis: str
 ) -> Complex[np.ndarray, " term"]:
     """`relative_widths` of all heights up to a highest as a short series.

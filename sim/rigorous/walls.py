@@ -28,7 +28,7 @@ class Walls(eqx.Module):
     """Walls across one axis.
 
     Attributes:
-        width: series of their light over that of the lower cell (`sim.rigorous.edge_widths.width_series`), over the
+        width: series of their light over that of the lower cell (`sim.rigorous.width_tables.width_series`), over the
             pitch.
         slope: series of the derivative of height / highest times that series, per metre of height.
         highest_m: height of the highest.

@@ -23,7 +23,8 @@ from jaxtyping import Array, Float
 
 from sim.camera import Camera
 from sim.material import refractive_index
-from sim.rigorous.edge_widths import series_at, width_series
+from sim.rigorous.edge_widths import series_at
+from sim.rigorous.width_tables import width_series
 from sim.surface.cell import LINE_DEGREE
 from sim.surface.pieces import TILE, Pair, light_of
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias

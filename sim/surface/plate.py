@@ -22,6 +22,7 @@ from sim.metrics import in_parts
 from sim.optic import ViewedOptic, height_transmission
 from sim.propagation.pupil import DoeRows, SourceColumns
 from sim.rigorous.edge_optic import EdgeOptic, with_edges
+from sim.rigorous.width_tables import HEADROOM
 from sim.source import SourceMap, View
 from sim.surface.lines import wall_series
 from sim.surface.opening import Opening
@@ -30,8 +31,6 @@ from sim.surface.relief import plan_of, relief_of, require_possible, view_weight
 from sim.surface.roughness import cell_roughness, cell_share
 from sim.surface.tiles import transmission_of
 from sim.tracing import is_traced, single, stacked
-
-_HEADROOM = 1.25  # of the sum of all depths, for errors
 
 
 class FabricatedDoe(ViewedOptic):
@@ -160,7 +159,7 @@ def _highest_m(process: Process, variation: Variation, traced: bool) -> float:
     scales = none if traced else variation.depth_scale or none
     common = 0.0 if traced else variation.common_depth_scale
     made = sum(abs(depth * (1 + common) * (1 + scale)) for depth, scale in zip(drawn, scales, strict=True))
-    return _HEADROOM * sum(drawn) * max(1, int(np.ceil(made / sum(drawn) / _HEADROOM)))
+    return HEADROOM * sum(drawn) * max(1, int(np.ceil(made / sum(drawn) / HEADROOM)))
 
 
 def _walled(optic: EdgeOptic, wavelengths_m: tuple[float, ...]) -> FabricatedDoe:

@@ -16,8 +16,9 @@ from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous import compare_row, edge_widths
 from sim.rigorous.edge_optic import line_weights, optic_as_drawn, with_edges
-from sim.rigorous.edge_widths import series_at, width_series
+from sim.rigorous.edge_widths import series_at
 from sim.rigorous.walls import Walls, light_of_cells_and_walls
+from sim.rigorous.width_tables import width_series
 
 PITCH, STEP, WAVELENGTH = 1.85e-6, 75e-9, 0.552e-6
 INDEX = refractive_index("fused_silica", WAVELENGTH)
