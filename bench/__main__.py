@@ -18,6 +18,7 @@ TABLES = (
     "bench.pipeline",
     "bench.spots",
     "bench.areas",
+    "bench.focus",
 )
 
 

@@ -16,6 +16,9 @@ from .capture.simulate import simulate as simulate
 from .design.design import Design as Design
 from .design.objectives import PsfSet as PsfSet
 from .design.objectives import import_objectives as import_objectives
+from .focus.depth import FocusTable as FocusTable
+from .focus.depth import focus_table as focus_table
+from .focus.foci import Foci as Foci
 from .lab.as_built import AsBuiltPrediction as AsBuiltPrediction
 from .lab.as_built import as_built as as_built
 from .lab.order import write_masks as write_masks

@@ -57,6 +57,7 @@ from sim.transfer import mtf
 
 if TYPE_CHECKING:
     from doedesign.areas.design import AreaState
+    from doedesign.focus.design import FocusState
     from doedesign.spots.design import SpotState
 
 log = logging.getLogger("doedesign")
@@ -153,9 +154,9 @@ def _resume(
 
 
 def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
-    """Design what the spots or the area of a spec ask for; in a run, go on from its checkpoint.
+    """Design what the spots, the area or the foci of a spec ask for; in a run, go on from its checkpoint.
 
-    None for a spec that has neither.
+    None for a spec that has none of them.
     """
     if spec.spots is not None:
         from doedesign.spots.design import SpotTask
@@ -165,6 +166,10 @@ def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
         from doedesign.areas.design import AreaTask
 
         task = AreaTask.from_spec(spec)
+    elif spec.focus is not None:
+        from doedesign.focus.design import FocusTask
+
+        task = FocusTask.from_spec(spec)
     else:
         return None
     stored, history = None if run is None else load_checkpoint(run, task.template), []
@@ -182,7 +187,7 @@ def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
     return task.finished(state, history)
 
 
-_State = TypeVar("_State", OptimizationState, "SpotState", "AreaState")
+_State = TypeVar("_State", OptimizationState, "SpotState", "AreaState", "FocusState")
 
 
 def _iterate(

@@ -17,6 +17,7 @@ from sim.surface import FabricatedDoe, as_fabricated
 
 if TYPE_CHECKING:
     from doedesign.areas.shape import AreaTable
+    from doedesign.focus.depth import FocusTable
     from doedesign.spots.orders import OrderTable
 
 
@@ -46,13 +47,17 @@ def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[di
     return metric_rows(bank.metric_inputs(design.near_m, surface, nominal, aimed=aimed), "fabricated")
 
 
-def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | None":
-    """Light on what a design should draw, spots or an area, of the design as drawn or as fabricated.
+def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | FocusTable | None":
+    """Light on what a design should make, spots, an area or foci, of the design as drawn or as fabricated.
 
-    None for a design that should draw neither.
+    None for a design that should make none of them.
     """
-    if design.spec is None or (design.spec.spots is None and design.spec.area is None):
+    if design.spec is None or not design.spec.aims:
         return None
+    if design.spec.focus is not None:
+        from doedesign.focus.depth import focus_of_design
+
+        return focus_of_design(design, doe)
     if design.spec.spots is not None:
         from doedesign.spots.design import orders_of_design
 

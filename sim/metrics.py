@@ -396,6 +396,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "on_target": _aimed_metric("on_target", "light on the target", "low"),
         "uniformity_error": _aimed_metric("uniformity_error", "uniformity error", "high"),
         "contrast": _aimed_metric("contrast", "contrast", "high"),
+        "focus_width": _aimed_metric("focus_width", "largest width of the foci over that wanted", "high"),
     }
 )
 

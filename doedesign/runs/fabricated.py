@@ -27,6 +27,7 @@ from sim.surface.leakage import SplitPsf, split_psf
 
 if TYPE_CHECKING:
     from doedesign.areas.shape import AreaTable
+    from doedesign.focus.depth import FocusTable
     from doedesign.spots.orders import OrderTable
 
 # Interference beyond what two fields can do is rounding of single precision, far below one part in a thousand; of sharp
@@ -46,7 +47,7 @@ class FabricatedPsfs(NamedTuple):
         rows: metrics of both, "nominal" and "fabricated", a row per depth and colour (`doedesign.prediction`); those of
             the DOE with "split", the energy in the window by origin, whose three parts sum to the throughput.
         variation: errors of the DOE.
-        aimed: tables of both where the spec has spots or an area, under the same names as the rows; empty otherwise.
+        aimed: tables of both where the spec has spots, an area or foci, under the same names as the rows; else empty.
     """
 
     bank: PsfBank
@@ -54,7 +55,7 @@ class FabricatedPsfs(NamedTuple):
     splits: dict[tuple[int, int], SplitPsf]
     rows: dict[str, list[dict[str, Any]]]
     variation: Variation
-    aimed: "dict[str, OrderTable | AreaTable]"
+    aimed: "dict[str, OrderTable | AreaTable | FocusTable]"
 
 
 def fabricated(

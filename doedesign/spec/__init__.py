@@ -12,7 +12,7 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     scene       the tables of scene, illumination, obstruction and sensor
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good DOE
-    targets/    the tables of spots and areas
+    targets/    the tables of spots, areas and foci
     wafer       the table of the wafer: dies, mask blanks, chrome
     order       the table of what a mask shop is asked for
     training    the tables of the network and its training

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
 from doedesign.spec.targets.areas import area_problems
+from doedesign.spec.targets.focus import focus_problems
 from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
 from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
@@ -33,7 +34,7 @@ _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all othe
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
-    rules = (*rules, _limits, _training, spot_problems, area_problems)
+    rules = (*rules, _limits, _training, spot_problems, area_problems, focus_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -212,7 +213,7 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
 
 
 def _objectives(spec: Spec) -> Iterator[InputError]:
-    if not (spec.objectives or spec.spots or spec.area) and spec.optimize.steps > 0:
+    if not (spec.objectives or spec.aims) and spec.optimize.steps > 0:
         rule = "an optimisation must have something to improve"
         yield InputError("objective", rule, "no [[objective]]", "Add one, or steps = 0.")
     for index, objective in enumerate(spec.objectives):

@@ -15,6 +15,7 @@ from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
 from doedesign.spec.scene import IlluminationSpec, ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.targets.areas import AreaSpec
+from doedesign.spec.targets.focus import FocusSpec
 from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
@@ -212,8 +213,8 @@ class ObjectiveSpec(SpecTable, frozen=True):
 class Spec(SpecTable, frozen=True):
     """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-    `objectives` are the terms of the loss, unless `spots` or an `area` say where light should go, and `limits` the
-    conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML.
+    `objectives` are the terms of the loss, unless `spots`, an `area` or a `focus` say where light should go, and
+    `limits` the conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -228,12 +229,18 @@ class Spec(SpecTable, frozen=True):
     objectives: tuple[ObjectiveSpec, ...] = ()
     spots: SpotsSpec | None = optional()
     area: AreaSpec | None = optional()
+    focus: FocusSpec | None = optional()
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
     order: OrderSpec = optional(OrderSpec())
     network: NetworkSpec = optional(NetworkSpec())
     train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)
+
+    @property
+    def aims(self) -> bool:
+        """Whether a table of its own says where light should go."""
+        return any(table is not None for table in (self.spots, self.area, self.focus))
 
     @property
     def image_distance_m(self) -> float:

@@ -296,6 +296,7 @@ def test_a_run_leads_to_a_verified_order_and_to_a_plate_with_errors(tmp_path: Pa
     made = fabricated(tmp_path / "run", variation=Variation(depth_scale=(0.1, 0, 0, 0)), out=tmp_path / "made")
     tables = made.aimed
     assert isinstance(tables["fabricated"], AreaTable)
+    assert isinstance(tables["nominal"], AreaTable)
     assert tables["fabricated"].efficiency < tables["nominal"].efficiency
     row = made.rows["fabricated"][0]
     assert row["on_target"] == tables["fabricated"].efficiency

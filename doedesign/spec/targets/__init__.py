@@ -2,5 +2,6 @@
 
 spots   spots and diffraction orders
 areas   areas of even light, lines, rings, pictures
-beside  rules for the tables beside either of them
+focus   foci on the axis, an extended depth of focus
+beside  rules for the tables beside any of them
 """

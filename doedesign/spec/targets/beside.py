@@ -10,12 +10,12 @@ from fab.units import format_length
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
-# Keys of [optimize] that spots and areas decide themselves, with their usual values.
+# Keys of [optimize] that spots, areas and foci decide themselves, with their usual values.
 _OWN = (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through"))
 
 
 def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
-    """Return every rule that the other tables of a spec break beside its `table`, "spots" or "area"."""
+    """Return every rule that the other tables of a spec break beside its `table`, "spots", "area" or "focus"."""
     if spec.objectives:
         yield InputError(table, "takes the place of objectives", "both", f"Remove [{table}] or every [[objective]].")
     if spec.scene.near_m or spec.scene.far_m != (math.inf,):
@@ -31,7 +31,7 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
         yield InputError("process.etch_depths", "the depths must be known", '"optimize"', "Give them, or leave it out.")
     for name, usual in _OWN:
         if (got := getattr(spec.optimize, name)) != usual:
-            rule = "starts and levels of their own belong to spots and areas"
+            rule = "spots, areas and foci have starts and levels of their own"
             yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
 
 

@@ -1,0 +1,92 @@
+"""The table [focus]: distances behind a DOE without a lens at which light should come to a focus, and how small."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
+
+from doedesign.spec.targets.beside import beside_problems
+from doedesign.spec.values import Positive, length
+from doedesign.spec.values.table import SpecTable, optional
+from fab.errors import InputError
+from fab.units import UM, format_length
+
+if TYPE_CHECKING:
+    from doedesign.spec.models import Spec
+
+Distance = Annotated[float, length(10 * UM, 1000.0)]
+Width = Annotated[float, length(0.1 * UM, 1.0)]
+AIRY_WIDTH = 1.029  # full width at half maximum of an Airy disc, wavelength x distance / aperture
+
+
+class FocusSpec(SpecTable, frozen=True):
+    """One or more foci on the axis, instead of objectives. The DOE is made of rings.
+
+    Attributes:
+        distances_m: distances behind the DOE.
+        through: whether light should be in focus all the way from the first to the last of two distances: an extended
+            depth of focus. Otherwise each is a focus of its own: one is a lens, two are a bifocal lens.
+        widths_m: for each distance the full width at half maximum that the focus should have at most; between two it
+            grows as a power of the distance. By default 1.15 times those of an ideal lens, 1.03 wavelength x distance /
+            aperture.
+        weights: how much each distance counts, if not all alike. The logarithm of the light on the axis is weighted, so
+            that twice the weight is about twice the light.
+        colours: names of the colours for which the distances are, one each, if not all colours for every distance.
+    """
+
+    distances_m: tuple[Distance, ...] = Field(min_length=1, examples=['["5 mm", "1200 mm"]'])
+    through: bool = optional(False)
+    widths_m: tuple[Width, ...] | None = optional()
+    weights: tuple[Positive, ...] | None = optional()
+    colours: tuple[str, ...] | None = optional()
+
+
+def focus_problems(spec: "Spec") -> Iterator[InputError]:
+    """Return every rule that the foci of a spec break."""
+    focus: Any = spec.focus
+    if focus is None:
+        return
+    count = len(focus.distances_m)
+    for name, values in (("widths", focus.widths_m), ("weights", focus.weights), ("colours", focus.colours)):
+        if values is not None and len(values) != count:
+            cure = f"Give {count}, or leave it out."
+            yield InputError(f"focus.{name}", f"must be one for each of the {count} distances", f"{len(values)}", cure)
+    if focus.through and (count != 2 or focus.distances_m[0] >= focus.distances_m[1]):
+        rule, got = "a focus all the way has two distances, the nearer first", f"{count}"
+        yield InputError("focus.distances", rule, got, 'Give two, such as ["5 mm", "1200 mm"].')
+    for name in ("weights", "colours"):
+        if focus.through and getattr(focus, name) is not None:
+            rule = "a focus all the way is for all distances and colours alike"
+            yield InputError(f"focus.{name}", rule, name, "Remove it, or through.")
+    known = [colour.name for colour in spec.optics.colours]
+    for index, name in enumerate(focus.colours or ()):
+        if name not in known:
+            cure = f"Choose one of {', '.join(known)}."
+            yield InputError(f"focus.colours[{index}]", "must be a colour of the spec", f'"{name}"', cure)
+    for table in ("spots", "area"):
+        if getattr(spec, table) is not None:
+            yield InputError("focus", f"takes the place of {table}", "both", f"Remove [focus] or [{table}].")
+    if spec.sensor.distance_m is None:
+        cure = "Give sensor.distance instead of optics.focal_length."
+        yield InputError("sensor.distance", "foci lie behind a DOE without a lens", "a lens", cure)
+    yield from beside_problems(spec, "focus")
+    yield from _reach(spec)
+
+
+def _reach(spec: "Spec") -> Iterator[InputError]:
+    """The rule that the rings can send light to a focus as small as is wanted."""
+    focus: Any = spec.focus
+    shortest = min(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
+    least = AIRY_WIDTH * 2 * spec.doe.pitch_m  # of sines up to wavelength / (2 pitch)
+    for index, width in enumerate(focus.widths_m or ()):
+        if width < least:
+            rule = f"rings of {format_length(spec.doe.pitch_m)} focus light to {least / UM:.3g} um at least"
+            cure = f"Choose a wider one, or a pitch of at most {width / 2 / AIRY_WIDTH / UM:.3g} um."
+            yield InputError(f"focus.widths[{index}]", rule, format_length(width), cure)
+    for index, distance in enumerate(focus.distances_m[: 2 if focus.widths_m else 0]):
+        airy = AIRY_WIDTH * shortest * distance / spec.doe.aperture_m
+        # An aperture of which only a ring is lit has a focus of 0.7 of this width, and much light beside it.
+        if focus.widths_m and index < len(focus.widths_m) and focus.widths_m[index] < 0.7 * airy:
+            width = format_length(focus.widths_m[index])
+            rule = f"this aperture focuses light to {0.7 * airy / UM:.3g} um at least at {format_length(distance)}"
+            yield InputError(f"focus.widths[{index}]", rule, width, "Choose a wider one, or a larger aperture.")

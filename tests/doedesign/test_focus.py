@@ -1,0 +1,244 @@
+"""Foci on the axis: lenses, several foci, colours, an extended depth of focus; refused mistakes, resumed runs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import doedesign
+from doedesign.focus.depth import focus_of_design
+from doedesign.focus.foci import Foci
+from doedesign.prediction import on_target
+from doedesign.runs.folder import claim_run
+from doedesign.runs.level_maps import open_design
+from fab.errors import InputError
+from fab.process import Process, Variation
+from sim.optic import HeightOptic
+from sim.psf_bank import psf
+from sim.surface import as_fabricated
+
+SMALL = """
+name = "small"
+[optics]
+wavelengths = ["532 nm"]
+design_wavelength = "532 nm"
+[doe]
+samples = 160
+pitch = "2 um"
+aperture = "320 um"
+material = "fused_silica"
+[process]
+levels = 16
+level_step = "72 nm"
+[scene]
+far = ["inf"]
+[sensor]
+distance = "4 mm"
+pitch = "1 um"
+resolution = [640, 480]
+window = 64
+[focus]
+distances = ["4 mm"]
+[optimize]
+steps = 120
+"""
+BIFOCAL = ['focus.distances=["3 mm","6 mm"]']
+COLOURS = ['optics.wavelengths=["640 nm","532 nm","450 nm"]']
+
+
+@pytest.fixture
+def spec_file(tmp_path: Path) -> Path:
+    file = tmp_path / "small.toml"
+    file.write_text(SMALL)
+    return file
+
+
+def designed(file: Path, *overrides: str):
+    spec = doedesign.load_spec(file, list(overrides))
+    design = doedesign.optimize(spec)
+    table = on_target(design, HeightOptic.of(design.camera, design.nominal_height_m))
+    assert table is not None
+    assert table.name == "focus"
+    return design, focus_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+
+
+def test_one_focus_is_a_lens(spec_file: Path):
+    """Sixteen levels leave 98.7 % of an ideal lens's light, cells of 0.15 waves at the rim 96.3 % of that."""
+    design, table = designed(spec_file)
+    assert table.strength[0] == pytest.approx(0.987 * 0.963, abs=0.01)
+    # Cells take light from the rim, which makes an Airy disc a little wider.
+    airy = 1.029 * 532e-9 * 4e-3 / 320e-6
+    assert (table.width_m[0] > airy).all()
+    assert table.width_m[0] == pytest.approx([airy] * 2, rel=0.05)
+    # Half of an Airy disc's light lies within its full width at half maximum, 0.476; a little more within 1.15 of it.
+    assert table.share[0] == pytest.approx(0.55, abs=0.06)
+    lens = doedesign.load_spec(spec_file, [])
+    waves = -(np.hypot(_radius(design), 4e-3) - 4e-3) / 532e-9
+    ideal = HeightOptic.of(design.camera, np.float32(np.mod(waves, 1) / design.camera.waves_per_metre(532e-9)))
+    assert lens.focus is not None
+    other = doedesign.focus_table(ideal, Foci.shown(lens.focus, design.camera))
+    assert table.strength[0] == pytest.approx(other.strength[0] * 0.987, abs=0.01)
+    assert table.width_m[0] == pytest.approx(other.width_m[0], rel=0.02)
+
+
+def _radius(design: doedesign.Design) -> np.ndarray:
+    grid = design.camera.grid
+    return np.hypot(grid.axis_m("y")[:, None], grid.axis_m("x"))
+
+
+def test_the_image_on_the_sensor_agrees(spec_file: Path):
+    """The angular spectrum, which shares nothing with the sum along the axis, finds as much light in the focus."""
+    design, table = designed(spec_file)
+    bank = psf(HeightOptic.of(design.camera, design.nominal_height_m))
+    wanted = table.foci.width_m[0] / 2
+    own = bank.encircled_energy([wanted])[0, 0, 0]
+    # PSFs have the Fresnel loss; a pixel of 1 um in a circle of 7.9 um is coarse.
+    assert own == pytest.approx(table.share[0] * table.fresnel, rel=0.05)
+
+
+def test_two_foci_share_the_light(spec_file: Path):
+    _, even = designed(spec_file, *BIFOCAL)
+    # A splitter of two, the ceiling of 1 x 2 spots, has 0.405 in each with any phase.
+    assert even.strength.min() > 0.33
+    assert even.strength.max() < 0.45
+    assert even.worst < 1
+    _, uneven = designed(spec_file, *BIFOCAL, "focus.weights=[3.0,1.0]")
+    assert uneven.strength[0] > 2 * uneven.strength[1]
+
+
+def test_every_colour_has_its_own_focus(spec_file: Path):
+    own = ['focus.distances=["4 mm","5 mm","6 mm"]', 'focus.colours=["640nm","532nm","450nm"]']
+    _, table = designed(spec_file, *COLOURS, *own, "optimize.steps=200")
+    assert [table.camera.colours[k].name for k in table.foci.colour] == ["640nm", "532nm", "450nm"]
+    # A lens of 4 mm for red has its blue focus at 5.7 mm, and that of green at 4.8: it is not far from there.
+    assert table.strength.min() > 0.25
+    assert table.worst < 1.05
+
+
+def test_one_distance_for_all_colours(spec_file: Path):
+    design, table = designed(spec_file, *COLOURS, "optimize.steps=200")
+    assert len(table.strength) == 3
+    assert table.strength.min() > 0.25
+    red = HeightOptic.of(design.camera, np.float32(np.mod(-(_radius(design) ** 2) / 8e-3 / 532e-9, 1) * 1.15e-6))
+    assert focus_of_design(design, red).strength.min() < 0.1  # as a Fresnel lens has it
+
+
+@pytest.mark.slow
+def test_light_stays_in_focus_all_the_way(spec_file: Path):
+    way = ['focus.distances=["2 mm","40 mm"]', "focus.through=true", 'focus.widths=["6 um","70 um"]']
+    _, table = designed(spec_file, *way, "optimize.steps=600")
+    assert len(table.strength) == 60
+    assert table.worst < 1.0
+    assert table.width_m[0].max() <= 6e-6
+    assert table.width_m[-1].max() <= 70e-6
+
+
+def test_more_planes_where_foci_are_short(spec_file: Path):
+    way = ['focus.distances=["2 mm","40 mm"]', "focus.through=true", 'focus.widths=["6 um","70 um"]']
+    spec = doedesign.load_spec(spec_file, way)
+    assert spec.focus is not None
+    foci = Foci.wanted(spec.focus, doedesign.camera_from_spec(spec))
+    steps = np.diff(foci.distance_m)
+    assert (steps <= 0.26 * foci.width_m[1:] ** 2 / 532e-9).all()
+    assert foci.width_m[[0, -1]] == pytest.approx([6e-6, 70e-6])
+    assert foci.weight.sum() == pytest.approx(1)
+
+
+def test_too_many_planes_are_refused(spec_file: Path):
+    large = ["doe.samples=4000", 'doe.aperture="8 mm"', 'focus.distances=["20 mm","100 mm"]', "focus.through=true"]
+    spec = doedesign.load_spec(spec_file, [*large, 'focus.widths=["4.2 um","4.8 um"]'])
+    assert spec.focus is not None
+    with pytest.raises(InputError, match="at most 4000 planes can be designed for at once, but got 8"):
+        Foci.wanted(spec.focus, doedesign.camera_from_spec(spec))
+
+
+def test_a_stopped_design_goes_on_to_the_same_bytes(spec_file: Path, tmp_path: Path):
+    few = [*BIFOCAL, "optimize.steps=40", "optimize.checkpoint_every=10"]
+    whole = doedesign.optimize(spec_file, tmp_path / "whole", overrides=few)
+    spec = doedesign.load_spec(spec_file, few)
+    stops = [15, 36]
+
+    class Stopped(Exception):
+        pass
+
+    from doedesign.focus.design import FocusTask
+
+    original = FocusTask.steps
+
+    def until(self: FocusTask, state):
+        for found in original(self, state):
+            yield found
+            if stops and found[0].step >= stops[0]:
+                stops.pop(0)
+                raise Stopped
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FocusTask, "steps", until)
+        for _ in range(2):
+            with pytest.raises(Stopped):
+                doedesign.optimize(spec_file, tmp_path / "parts", overrides=few)
+    parts = doedesign.optimize(spec_file, tmp_path / "parts", overrides=few)
+    np.testing.assert_array_equal(parts.level_map.level, whole.level_map.level)
+    assert parts.history == whole.history
+    assert spec.focus is not None
+
+
+def test_a_run_holds_table_and_picture(spec_file: Path, tmp_path: Path):
+    doedesign.optimize(spec_file, tmp_path / "run", overrides=[*BIFOCAL, "optimize.steps=20"])
+    lines = (tmp_path / "run" / "focus.csv").read_text().splitlines()
+    assert lines[0] == "distance_mm,colour,wanted_um,width_y_um,width_x_um,strength,share"
+    assert [line.split(",")[0] for line in lines[1:]] == ["3", "6"]
+    assert (tmp_path / "run" / "focus.png").stat().st_size > 10_000
+    assert open_design(tmp_path / "run", False).spec is not None
+    with claim_run(tmp_path / "run", doedesign.load_spec(spec_file, [*BIFOCAL, "optimize.steps=20"]), {}, []) as run:
+        assert run.done
+
+
+def test_a_plate_with_errors_is_followed(spec_file: Path):
+    """Etches 5 % too deep take light from the foci and leave it in the 0th order."""
+    design, _ = designed(spec_file, *BIFOCAL)
+    deep = Variation(common_depth_scale=0.05)
+    found = [
+        on_target(design, as_fabricated(design.level_map.level, design.camera, Process(design.levels), v))
+        for v in (Variation(), deep)
+    ]
+    assert all(table is not None for table in found)
+    drawn, made = (table.measures() for table in found if table is not None)
+    assert made["on_target"] < drawn["on_target"]
+    assert made["focus_width"] == pytest.approx(drawn["focus_width"], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "rule"),
+    [
+        (['focus.widths=["5 um","6 um"]'], "focus.widths", "one for each of the 1 distances"),
+        (["focus.through=true"], "focus.distances", "two distances, the nearer first"),
+        (['focus.distances=["5 mm","2 mm"]', "focus.through=true"], "focus.distances", "the nearer first"),
+        (
+            [*BIFOCAL, "focus.through=true", "focus.weights=[1.0,2.0]"],
+            "focus.weights",
+            "all distances and colours alike",
+        ),
+        (['focus.colours=["pink"]'], "focus.colours[0]", "a colour of the spec"),
+        (['focus.widths=["3 um"]'], "focus.widths[0]", "rings of 2 um focus light to 4.12 um at least"),
+        (
+            ['focus.distances=["40 mm"]', 'focus.widths=["20 um"]'],
+            "focus.widths[0]",
+            "focuses light to 47.9 um at least",
+        ),
+        (['scene.far=["1 m"]'], "scene.far", "collimated"),
+        (["optimize.start=random"], "optimize.start", "starts and levels of their own"),
+    ],
+)
+def test_what_cannot_be_is_refused(spec_file: Path, overrides: list[str], key: str, rule: str):
+    with pytest.raises(InputError) as error:
+        doedesign.load_spec(spec_file, overrides)
+    assert key in str(error.value)
+    assert rule in str(error.value)
+
+
+def test_foci_need_no_lens(spec_file: Path):
+    text = SMALL.replace("[optics]", '[optics]\nfocal_length = "4 mm"').replace('distance = "4 mm"\n', "")
+    spec_file.write_text(text)
+    with pytest.raises(InputError, match="behind a DOE without a lens"):
+        doedesign.load_spec(spec_file)
