@@ -145,7 +145,8 @@ def focus_table(doe: CellOptic, foci: Foci) -> FocusTable:
         own = [line for line in camera.lines if line.colour == colour]
         whole = sum(line.factor for line in own)
         for line in own:
-            field, most = profiles(doe, line, _PLACES * width, float(distance))
+            behind = np.asarray(doe.field(line))
+            field, most = profiles(camera, behind, line, _PLACES * width, float(distance))
             along += line.factor / whole * np.abs(field) ** 2
             axis += line.factor / whole * abs(field[0, len(_PLACES) // 2]) ** 2
             ideal += line.factor / whole * most**2

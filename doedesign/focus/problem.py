@@ -56,7 +56,7 @@ class FocusProblem(eqx.Module):
     def of(cls, foci: Foci, camera: Camera) -> "FocusProblem":
         """The problem of foci for a camera without a lens."""
         bare, pitch, count = HeightOptic.of(camera), camera.grid.pitch_m, ring_count(camera)
-        cells = [Octant.of(bare, line, pitch / FINER) for line in camera.lines]
+        cells = [Octant.of(camera, np.asarray(bare.field(line)), line, pitch / FINER) for line in camera.lines]
         kernels, rates, owners = [], [], []
         for number in range(len(foci.distance_m)):
             places, distance = np.array(_SHARES) * foci.width_m[number], float(foci.distance_m[number])

@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy.special import j0
 
-from sim.camera import SpectralLine
-from sim.optic import CellOptic
+from sim.camera import Camera, SpectralLine
 
 _BINS = 8192  # of direction sines; a profile is then right to 1e-5
 
@@ -36,9 +35,9 @@ class Octant(NamedTuple):
     ring: Int[np.ndarray, " cell"]
 
     @classmethod
-    def of(cls, bare: CellOptic, line: SpectralLine, ring_m: float) -> "Octant":
-        """Open cells of a bare aperture in the light of a line, on rings of some width."""
-        grid, light = bare.camera.grid, _field(bare, line)
+    def of(cls, camera: Camera, field: Complex[np.ndarray, "y x"], line: SpectralLine, ring_m: float) -> "Octant":
+        """Open cells of a bare aperture, from the field behind it, on rings of some width."""
+        grid, light = camera.grid, _flat(camera, field, line)
         rows, columns = np.nonzero(light)
         y, x = np.abs(grid.axis_m("y")[rows]), np.abs(grid.axis_m("x")[columns])
         # Whole numbers of half cells.
@@ -70,12 +69,11 @@ class Octant(NamedTuple):
         return np.stack(found)
 
 
-def _field(doe: CellOptic, line: SpectralLine) -> Complex[np.ndarray, "y x"]:
-    """Field behind a DOE, without the curvature of a wave to its camera's own sensor."""
-    camera = doe.camera
+def _flat(camera: Camera, field: Complex[np.ndarray, "y x"], line: SpectralLine) -> Complex[np.ndarray, "y x"]:
+    """The field without the curvature of a wave to the camera's own sensor."""
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
     waves = -camera.curvature_per_m() / (2 * line.wavelength_m) * square
-    return np.asarray(doe.field(line)) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+    return field * np.exp(2j * np.pi * (waves - np.rint(waves)))
 
 
 def _towards_axis(
@@ -92,13 +90,18 @@ def _towards_axis(
 
 
 def profiles(
-    doe: CellOptic, line: SpectralLine, places_m: Float[np.ndarray, " n"], distance_m: float
+    camera: Camera,
+    field: Complex[np.ndarray, "y x"],
+    line: SpectralLine,
+    places_m: Float[np.ndarray, " n"],
+    distance_m: float,
 ) -> tuple[Complex[np.ndarray, "axis n"], float]:
     """Amplitude of a DOE along y and along x through the axis, at a distance behind it.
 
     Args:
-        doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
-        line: wavelength, and mode of the beam.
+        camera: cells, aperture and sensor of the DOE.
+        field: behind it, as the camera's sensor wants it (`sim.optic.CellOptic.field`).
+        line: wavelength.
         places_m: places along either axis.
         distance_m: of the places behind the DOE.
 
@@ -106,9 +109,9 @@ def profiles(
         amplitudes along y and x, whose squares are shares of the incident power per square metre, Fresnel loss left
         out; and the amplitude on the axis that an ideal lens would make of this light.
     """
-    camera, wavelength = doe.camera, line.wavelength_m
+    wavelength = line.wavelength_m
     y, x = camera.grid.axis_m("y")[:, None], camera.grid.axis_m("x")[None, :]
-    pitch, field = camera.grid.pitch_m, _field(doe, line)
+    pitch, field = camera.grid.pitch_m, _flat(camera, field, line)
     light, path = _towards_axis(field, y, x, distance_m, wavelength, pitch)
     sines = y / path / wavelength, x / path / wavelength
     scale = 1 / np.sqrt(np.pi * camera.aperture_m**2 / 4)

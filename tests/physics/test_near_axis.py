@@ -23,6 +23,11 @@ def thin(waves: np.ndarray, own: Camera) -> HeightOptic:
     return HeightOptic.of(own, np.float32(np.mod(waves, 1.0) / own.waves_per_metre(WAVE)))
 
 
+def light_of(doe: HeightOptic, places_m: np.ndarray, distance_m: float) -> tuple[np.ndarray, float]:
+    line = doe.camera.lines[0]
+    return profiles(doe.camera, np.asarray(doe.field(line)), line, places_m, distance_m)
+
+
 def radius_of(own: Camera) -> np.ndarray:
     return np.hypot(own.grid.axis_m("y")[:, None], own.grid.axis_m("x"))
 
@@ -31,7 +36,7 @@ def radius_of(own: Camera) -> np.ndarray:
 def test_behind_a_round_opening_light_on_the_axis_is_that_of_the_closed_form(distance: float):
     """The first Rayleigh-Sommerfeld integral of a disc: |1 - z / R exp(i k (R - z))|² on the axis."""
     own = camera(400, pitch_m=0.3e-6)
-    field, _ = profiles(HeightOptic.of(own), own.lines[0], np.zeros(1), distance)
+    field, _ = light_of(HeightOptic.of(own), np.zeros(1), distance)
     rim, area = own.aperture_m / 2, np.pi * own.aperture_m**2 / 4
     path = np.hypot(rim, distance)
     wanted = abs(1 - distance / path * np.exp(2j * np.pi / WAVE * (path - distance))) ** 2 / area
@@ -44,7 +49,7 @@ def test_the_focus_of_an_ideal_lens_is_an_airy_disc():
     distance, waves = 60e-3, -(np.hypot(radius_of(own), 60e-3) - 60e-3) / WAVE
     airy = WAVE * distance / own.aperture_m
     places = np.array([0.0, 0.5145, 1.22]) * airy
-    field, ideal = profiles(thin(waves, own), own.lines[0], places, distance)
+    field, ideal = light_of(thin(waves, own), places, distance)
     light = np.abs(field) ** 2
     # A cell of the rim takes a tenth of a wave off the lens's slope: 1 - (pi / 10)² / 6 of its light.
     assert light[:, 0] == pytest.approx([ideal**2] * 2, rel=0.02)
@@ -60,7 +65,7 @@ def test_profiles_are_those_of_a_sum_over_parts_of_cells(distance: float):
     waves = np.random.default_rng(3).uniform(0, 1, own.grid.shape)
     doe = thin(waves, own)
     places = np.linspace(-1, 1, 5) * WAVE * distance / own.aperture_m
-    found, _ = profiles(doe, own.lines[0], places, distance)
+    found, _ = light_of(doe, places, distance)
     at = (np.arange(60 * parts) - (60 * parts - 1) / 2) * PITCH / parts
     field = np.kron(np.asarray(doe.coverage) * np.exp(2j * np.pi * waves), np.ones((parts, parts)))
     area = np.pi * own.aperture_m**2 / 4
@@ -79,7 +84,7 @@ def test_profiles_are_those_of_a_sum_over_parts_of_cells(distance: float):
 def test_the_camera_s_own_sensor_does_not_matter():
     one, other = camera(60), replace(camera(60), distance_m=7e-3)
     waves = np.random.default_rng(0).uniform(0, 1, one.grid.shape)
-    light = [np.abs(profiles(thin(waves, own), own.lines[0], np.zeros(1), 30e-3)[0]) for own in (one, other)]
+    light = [np.abs(light_of(thin(waves, own), np.zeros(1), 30e-3)[0]) for own in (one, other)]
     np.testing.assert_allclose(*light, rtol=1e-4)
 
 
@@ -89,9 +94,9 @@ def test_rings_of_an_octant_make_the_light_of_the_plate(cells: int):
     ring_m, line = PITCH / 3, own.lines[0]
     number = (radius_of(own) / ring_m).astype(int)
     heights = np.random.default_rng(1).uniform(0, 1, number.max() + 1)
-    octant = Octant.of(HeightOptic.of(own), line, ring_m)
+    octant = Octant.of(own, np.asarray(HeightOptic.of(own).field(line)), line, ring_m)
     kernel = octant.kernel(np.zeros(1), 12e-3, line, PITCH, int(number.max()) + 1)
-    wanted, _ = profiles(thin(heights[number], own), line, np.zeros(1), 12e-3)
+    wanted, _ = light_of(thin(heights[number], own), np.zeros(1), 12e-3)
     area = np.pi * own.aperture_m**2 / 4
     found = kernel[0] @ np.exp(2j * np.pi * heights) / np.sqrt(area)
     # Bins of directions on one side, single precision on both.
