@@ -15,7 +15,7 @@ from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.process import Process, Variation
-from fab.units import format_length
+from fab.units import format_length, metres
 from sim.camera import Camera
 
 if TYPE_CHECKING:
@@ -156,6 +156,17 @@ class Design:
         errors, _ = self.plate_errors(made_by, variation, seed, draw)
         depths_m = self.depths_m if depths is None else depths_from(depths)
         return as_fabricated(self.level_map.level, self.camera, made_by, errors, depths_m=depths_m)
+
+    def write_phase(self, path: "str | Path", wavelength: "str | float") -> None:
+        """Write the phase of the design as a grid phase of Zemax OpticStudio (`fab.solids.height_files`).
+
+        Args:
+            path: the file, .DAT.
+            wavelength: in vacuum, metres or with a unit. The phase is positive where light is late.
+        """
+        from fab.solids.height_files import write_zemax_phase
+
+        write_zemax_phase(path, self.level_map, float(self.camera.waves_per_metre(metres(wavelength))))
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the level map; on `ax`, or on a new figure. Returns what it drew on."""

@@ -7,7 +7,8 @@ rounded neighbour of it. In an order every single height of each is read back.
 The grid sag of Zemax OpticStudio is the text that its manual describes: one line ``nx ny delx dely unitflag xdec ydec``
 (unit flag 0: millimetres), then one line ``z dz/dx dz/dy d2z/dxdy nodata`` per point, from the corner at -x, +y along x
 and then down row by row. Points are pixel centres. The derivatives are left 0; choose linear interpolation there, which
-does not use them, and know that it turns a vertical wall into a slope one pixel wide.
+does not use them, and know that it turns a vertical wall into a slope one pixel wide. A grid phase has the same form,
+with radians in the place of z; its unit flag is that of pitch and decentre alone.
 """
 
 import io
@@ -120,15 +121,38 @@ def write_zemax_sag(
     turned over must be mirrored in the optics program. A point takes 22 bytes: a 4400 x 4400 map makes 426 MB, so
     choose a window (at least 5 pixels either way); the decentre in the header puts it where it is.
     """
-    if Path(path).suffix.upper() != ".DAT":
-        raise InputError(str(path), "OpticStudio reads grid sags from .DAT files", Path(path).suffix, "Use .DAT.")
+    _write_grid(Path(path), level_map, _sag_lines(level_map.levels, side), window)
+
+
+def write_zemax_phase(
+    path: str | Path, level_map: LevelMap, waves_per_metre: float, window: PixelWindow | None = None
+) -> None:
+    """Write the phase of the relief as a grid phase of Zemax OpticStudio (radians, file suffix .DAT).
+
+    The deepest floor has phase 0, higher glass a positive one: it is positive where light is late, so that a lens that
+    makes light converge falls toward its rim. It is not wrapped. As light runs toward +z through a flat surface, x and
+    y are those of the map. Check the sign in the program's own plot of the surface's phase with a lens.
+
+    Args:
+        path: the file.
+        level_map: the relief.
+        waves_per_metre: of height, (n - 1) / wavelength for glass in air (`sim.Camera.waves_per_metre`).
+        window: part of the map, at least 5 pixels either way; the decentre in the header puts it where it is.
+    """
+    phase = 2 * np.pi * waves_per_metre * level_map.levels.heights_m()
+    _write_grid(Path(path), level_map, [f"{radians:14.9f} 0 0 0 0\r\n" for radians in phase], window)
+
+
+def _write_grid(path: Path, level_map: LevelMap, lines: list[str], window: PixelWindow | None) -> None:
+    """Write a grid of OpticStudio from the line of a point of every level."""
+    if path.suffix.upper() != ".DAT":
+        raise InputError(str(path), "OpticStudio reads grids from .DAT files", path.suffix, "Use .DAT.")
     grid = level_map.grid
     window = window or whole(grid)
     window.require(grid)
     if min(window.rows, window.columns) < _FEWEST_ZEMAX:
         rule = f"OpticStudio needs at least {_FEWEST_ZEMAX} points along either axis"
-        raise InputError("grid sag", rule, f"{window.rows} x {window.columns}", "Choose a larger window.")
-    lines = _sag_lines(level_map.levels, side)
+        raise InputError("grid", rule, f"{window.rows} x {window.columns}", "Choose a larger window.")
     table = np.frombuffer("".join(lines).encode(), dtype=np.uint8).reshape(len(lines), -1)
     x_mm, y_mm = (value / MM for value in window.centre_m(grid))
     pitch_mm = f"{grid.pitch_m / MM:.12g}"

@@ -242,3 +242,15 @@ def test_foci_need_no_lens(spec_file: Path):
     spec_file.write_text(text)
     with pytest.raises(InputError, match="behind a DOE without a lens"):
         doedesign.load_spec(spec_file)
+
+
+def test_the_phase_of_a_lens_falls_toward_its_rim(spec_file: Path, tmp_path: Path):
+    """The file for optics programs, unwrapped: as a lens of 4 mm has it."""
+    design, _ = designed(spec_file)
+    design.write_phase(tmp_path / "lens.DAT", "532 nm")
+    rows = np.loadtxt(tmp_path / "lens.DAT", skiprows=1)[:, 0].reshape(160, 160)
+    along = np.unwrap(rows[79, 80:150])
+    radius = (np.arange(70) + 0.5) * 2e-6
+    wanted = -2 * np.pi * (np.hypot(radius, 4e-3) - 4e-3) / 532e-9
+    # Levels are a sixteenth of a wave apart, rings of a third of a cell beside the middles of these.
+    assert np.abs(along - along.mean() - wanted + wanted.mean()).max() < 0.8

@@ -8,7 +8,7 @@ from fab.grid import Grid
 from fab.height import read_height
 from fab.levels import Levels, height_of
 from fab.solids.columns import PixelWindow, whole
-from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_sag
+from fab.solids.height_files import write_greymap, write_npy, write_tiff, write_zemax_phase, write_zemax_sag
 from fab.units import NM, UM
 from tests.fab.maps import level_map_from
 
@@ -108,6 +108,20 @@ def test_a_grid_sag_is_the_etch_depth_below_the_blank_surface(tmp_path, side, si
     depth_mm = (15 - level_map.level.astype(float)) * 75e-6
     # Nine decimals of a millimetre hold whole picometres, which 75 nm steps are.
     assert np.allclose(sag_mm, sign * depth_mm, rtol=0, atol=1e-15)
+
+
+def test_a_grid_phase_is_positive_where_there_is_more_glass(tmp_path):
+    level_map = some_map()
+    write_zemax_phase(tmp_path / "p.DAT", level_map, 0.46 / 550e-9)
+    with open(tmp_path / "p.DAT", encoding="ascii") as file:
+        assert [float(v) for v in file.readline().split()] == [10, 7, 1.85e-3, 1.85e-3, 0, 0, 0]
+    table = np.loadtxt(tmp_path / "p.DAT", skiprows=1)
+    assert not table[:, 1:].any()
+    radians = table[:, 0].reshape(7, 10)[::-1]
+    # Nine decimals.
+    assert np.allclose(radians, 2 * np.pi * 0.46 / 550e-9 * 75e-9 * level_map.level, rtol=0, atol=6e-10)
+    with pytest.raises(InputError, match="DAT"):
+        write_zemax_phase(tmp_path / "p.txt", level_map, 1e6)
 
 
 def test_a_window_of_a_grid_sag_lies_where_it_is_on_the_plate(tmp_path):
