@@ -1,12 +1,11 @@
 """Extended depth of focus beside classic formulas: widths and light of the foci from 5 mm to 1.2 m behind one plate.
 
-    python -m bench.focus            about two minutes
+    python -m bench.focus            about five minutes
 
 The judge shares nothing with the engine: it takes the level map alone, parts every cell into 3 x 3 squares, and sums
 the first Rayleigh-Sommerfeld integral over all of them in double precision, at places along a line of its own. The
 plate is that of `doedesign new edof`: 850 nm, an aperture of 1.8 mm, cells of 3 um. (S. Banerji et al., Optica 7, 214,
-2020, measured 6.6 um at 5 mm and 524 um at 1200 mm; their aperture and rings are not given where this was written, and
-are those of the template.)
+2020, measured 6.6 um at 5 mm and 524 um at 1200 mm; the template's aperture and rings are not taken from there.)
 """
 
 import time

@@ -18,17 +18,14 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from fab.errors import InputError
 from fab.files import read_npy
 from fab.units import metres
-from sim.rigorous.crossed import require_fmmax
+from sim.rigorous.crossed import layered_orders, require_fmmax
 
 PERIOD_M, WAVELENGTH_M, GLASS, ORDERS, TERMS = 7.2e-6, 632.8e-9, 1.46, 3, 800
 _PIXELS = 180
@@ -88,39 +85,12 @@ def rigorous_scores(design: np.ndarray, height_m: float, terms: int = TERMS) -> 
     Raises:
         InputError: fmmax is missing.
     """
-    fmmax: Any = require_fmmax()
-    # Lengths in wavelengths: fmmax loses digits with those in metres. Its arrays are `[x, y]`.
-    with jax.enable_x64(True), threadpool_limits(1):
-        period = PERIOD_M / WAVELENGTH_M
-        lattice = fmmax.LatticeVectors(u=jnp.array([period, 0.0]), v=jnp.array([0.0, period]))
-        expansion = fmmax.generate_expansion(lattice, terms, fmmax.Truncation.CIRCULAR)
-        number = np.asarray(expansion.basis_coefficients)
-
-        def layer(permittivity: np.ndarray) -> Any:
-            return fmmax.eigensolve_isotropic_media(
-                wavelength=jnp.asarray(1.0),
-                in_plane_wavevector=jnp.zeros(2),
-                primitive_lattice_vectors=lattice,
-                permittivity=jnp.asarray(permittivity),
-                expansion=expansion,
-                formulation=fmmax.Formulation.JONES_DIRECT_FOURIER,
-            )
-
-        pattern = 1.0 + (GLASS**2 - 1.0) * design
-        layers = [layer(np.array([[GLASS**2]])), layer(pattern), layer(np.array([[1.0]]))]
-        matrix = fmmax.stack_s_matrix(layers, [jnp.asarray(each) for each in (0.0, height_m / WAVELENGTH_M, 0.0)])
-        # Amplitudes are those of the magnetic field along x, then along y.
-        count, zeroth = len(number), int(np.flatnonzero((number == 0).all(1))[0])
-        light = jnp.zeros((2 * count, 2), complex).at[[count + zeroth, zeroth], [0, 1]].set(1.0)
-        none = jnp.zeros_like(light)
-        incident, _ = fmmax.amplitude_poynting_flux(light, none, layers[0])
-        passed, _ = fmmax.amplitude_poynting_flux(matrix.s11 @ light, none, layers[-1])
-        shares = np.asarray(passed).reshape(2, count, 2).sum(0) / np.asarray(incident).sum(0)
-    found = np.zeros((2, 2 * ORDERS + 1, 2 * ORDERS + 1))
-    inside = (np.abs(number) <= ORDERS).all(1)
-    x, y = number[inside].T + ORDERS
-    found[:, y, x] = shares[inside].T
-    return Score(found[0]), Score(found[1])
+    formulation = require_fmmax().Formulation.JONES_DIRECT_FOURIER
+    pattern = 1.0 + (GLASS**2 - 1.0) * design.T
+    layers = [np.array([[GLASS**2]]), pattern, np.array([[1.0]])]
+    found = layered_orders(layers, [0.0, height_m, 0.0], (PERIOD_M, PERIOD_M), WAVELENGTH_M, terms, formulation)
+    along_x, along_y = found.within(ORDERS, ORDERS)
+    return Score(along_x), Score(along_y)
 
 
 def main() -> int:

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 
 from doedesign.areas.problem import AreaLight, AreaProblem
@@ -21,6 +20,7 @@ from doedesign.areas.target import AreaTarget
 from doedesign.areas.transport import transport_phase
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
+from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
 from doedesign.spec import Spec, input_files
 from doedesign.spots.superposition import Staircase
 from fab.errors import InputError
@@ -100,7 +100,7 @@ class AreaTask:
         return self._begun(phase, jnp.ones(grid.shape, jnp.float32), 0)
 
     def _begun(self, phase: Array, free: Array, step: int) -> AreaState:
-        return AreaState(phase, free, _optimiser().init(phase), step)
+        return AreaState(phase, free, lbfgs_memory(phase, _MEMORY), step)
 
     @property
     def _like(self) -> Any:
@@ -176,11 +176,6 @@ class AreaTask:
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 
 
-def _optimiser() -> optax.GradientTransformationExtraArgs:
-    search = optax.scale_by_zoom_linesearch(max_linesearch_steps=12, initial_guess_strategy="one")
-    return optax.lbfgs(memory_size=_MEMORY, linesearch=search)
-
-
 @eqx.filter_jit
 def _step(
     problem: AreaProblem, phase: Array, free: Array, memory: Any, uniformity: Array
@@ -191,10 +186,5 @@ def _step(
     def loss_of(moved: Array) -> Array:
         return problem.loss(jnp.where(free > 0, moved, start), uniformity)
 
-    optimiser = _optimiser()
-    value: Any
-    value, gradient = optax.value_and_grad_from_state(loss_of)(phase, state=memory)
-    updates, memory = optimiser.update(gradient, memory, phase, value=value, grad=gradient, value_fn=loss_of)
-    light = problem.judge(phase)
-    moved: Any = optax.apply_updates(phase, updates)
-    return moved, memory, value, light
+    moved, memory, value = lbfgs_step(loss_of, phase, memory, _MEMORY)
+    return moved, memory, value, problem.judge(phase)

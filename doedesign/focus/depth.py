@@ -90,19 +90,19 @@ class FocusTable:
         }
 
     def measures(self) -> dict[str, float]:
-        """Numbers that a tolerance study follows."""
+        """Numbers that a tolerance study follows; a lost focus counts as ten times as wide, for means need a number."""
         return {"on_target": float(self.foci.weight @ self.share), "focus_width": min(self.worst, 10.0)}
 
     def describe(self) -> str:
         """One line."""
         ends = sorted({0, len(self.strength) - 1})
+        strengths = " to ".join(f"{100 * s:.2g}" for s in sorted({self.strength.min(), self.strength.max()}))
         words = ", ".join(f"{_um(self.width_m[k].max())} um at {self.foci.words(k, self.camera)}" for k in ends)
         worst = "?" if np.isinf(self.worst) else f"{self.worst:.2f}"
         return (
             f"focus {words} wide; at worst {worst} times the width wanted, of {len(self.strength)} looked at; "
-            f"{100 * self.strength.min():.2g} to {100 * self.strength.max():.2g} % of an ideal lens's light on the "
-            f"axis (ceiling: none known), 0th order {100 * self.zeroth_order:.3g} %; Fresnel loss of "
-            f"{100 * (1 - self.fresnel):.1f} % apart"
+            f"{strengths} % of an ideal lens's light on the axis (ceiling: none known), 0th order "
+            f"{100 * self.zeroth_order:.3g} %; Fresnel loss of {100 * (1 - self.fresnel):.1f} % apart"
         )
 
     def to_csv(self) -> str:

@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, Int
 
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
+from doedesign.design.lbfgs import lbfgs_memory, lbfgs_step
 from doedesign.focus.foci import Foci
 from doedesign.focus.problem import FINER, FocusLight, FocusProblem, ring_count, ring_numbers
 from doedesign.spec import Spec
@@ -120,7 +120,7 @@ class FocusTask:
 
     def _begun(self, radians: Array) -> FocusState:
         level = jnp.zeros(radians.shape, jnp.int32)
-        return FocusState(radians, level, jnp.asarray(False), _optimiser().init(radians), 0)
+        return FocusState(radians, level, jnp.asarray(False), lbfgs_memory(radians, _MEMORY), 0)
 
     def _first_heights(self) -> Float[np.ndarray, " ring"]:
         focus: Any = self.spec.focus
@@ -195,11 +195,6 @@ class FocusTask:
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 
 
-def _optimiser() -> optax.GradientTransformationExtraArgs:
-    search = optax.scale_by_zoom_linesearch(max_linesearch_steps=12, initial_guess_strategy="one")
-    return optax.lbfgs(memory_size=_MEMORY, linesearch=search)
-
-
 @eqx.filter_jit
 def _free_step(
     problem: FocusProblem, rings: RingHeights, radians: Array, memory: Any
@@ -209,13 +204,8 @@ def _free_step(
     def loss_of(radians: Array) -> Array:
         return problem.loss(problem.field(rings.height_m(radians)))
 
-    optimiser = _optimiser()
-    value: Any
-    value, gradient = optax.value_and_grad_from_state(loss_of)(radians, state=memory)
-    updates, memory = optimiser.update(gradient, memory, radians, value=value, grad=gradient, value_fn=loss_of)
-    light = problem.judge(problem.field(rings.height_m(radians)))
-    moved: Any = optax.apply_updates(radians, updates)
-    return moved, memory, value, light
+    moved, memory, value = lbfgs_step(loss_of, radians, memory, _MEMORY)
+    return moved, memory, value, problem.judge(problem.field(rings.height_m(radians)))
 
 
 @eqx.filter_jit

@@ -65,11 +65,12 @@ class FocusProblem(eqx.Module):
             for k in own:
                 line = camera.lines[k]
                 kernel = cells[k].kernel(places, distance, line, pitch, count)
-                kernels.append(kernel / np.abs(kernel[0]).sum() * np.sqrt(line.factor / whole))
+                share = np.sqrt(line.factor / whole) / np.abs(kernel[0]).sum()
+                kernels.append((kernel * share).astype(np.complex64))
                 rates.append(camera.waves_per_metre(line.wavelength_m))
                 owners.append(number)
         return cls(
-            jnp.asarray(np.stack(kernels), jnp.complex64),
+            jnp.asarray(np.stack(kernels)),
             jnp.asarray(np.array(rates), jnp.float32),
             jnp.asarray(np.array(owners)),
             jnp.asarray(foci.weight, jnp.float32),
@@ -102,7 +103,7 @@ class FocusProblem(eqx.Module):
 
 
 def ring_count(camera: Camera) -> int:
-    """Rings out to the farthest corner of the grid's inscribed circle and a cell beyond."""
+    """Number of rings out to the rim of the clear aperture and a cell beyond, for cells that it cuts."""
     return int(np.ceil((camera.aperture_m / 2 / camera.grid.pitch_m + 1) * FINER))
 
 

@@ -39,12 +39,9 @@ def plot_focus(table: "FocusTable", ax: "Axes | None" = None) -> "FigureBase":
         panes[0].legend(loc="upper left", title="dots: wanted")
         panes[1].set(xlabel="distance (mm)", ylabel="%", yscale="log")
         panes[1].set_title("— light over an ideal lens's\n– – share within the width wanted", fontsize=7, loc="left")
-        ratio = foci.distance_m.max() / foci.distance_m.min()
-        for pane in panes[:2]:
-            if ratio > 4:
-                pane.set_xscale("log")
-        if ratio > 4:
-            panes[0].set_yscale("log")
+        if foci.distance_m.max() > 4 * foci.distance_m.min():
+            panes[0].set(xscale="log", yscale="log")
+            panes[1].set(xscale="log")
         first = np.flatnonzero(foci.colour == foci.colour[0])
         rows = table.light[first].mean(1)
         box = (table.places[0], table.places[-1], 0, len(rows))

@@ -1,9 +1,9 @@
 """Light near the axis at distances behind a DOE without a lens: the first Rayleigh-Sommerfeld integral.
 
-A point at the distance z behind the DOE and x from the axis, both much nearer to each other than the rim is to either,
-sees a cell at r with the phase 2 pi (R - x r / R) / lambda, R = sqrt(r² + z²). What this leaves out is (x r)² / (2 R³)
-and x² r² / (4 z³) waves times 1 / lambda: for the focus of an aperture as sharp as light allows, about its wavelength
-over the distance. The obliquity z / R and the falling off with R are kept, and cells are squares, so any angle will do.
+A point at the distance z behind the DOE and a small x beside the axis sees a cell at r with the phase
+2 pi (R - x r / R) / lambda, R = sqrt(r² + z²), and x² / (2 R) besides, in which cells hardly differ. The next term,
+x² r² / (2 R³ lambda) waves, is left out: in a focus as wide as lambda z / D it is lambda / (8 z) at the rim, nothing.
+The obliquity z / R and the falling off with R are kept, and cells are squares, so any angle will do.
 
 (J. W. Goodman, *Introduction to Fourier Optics*, §3.5.)
 """

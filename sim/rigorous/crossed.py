@@ -96,37 +96,69 @@ def crossed_orders(
     Raises:
         InputError: fmmax is missing.
     """
-    fmmax = require_fmmax()
     height_m = np.asarray(height_m, np.float64)
+    raster, (ny, nx) = np.ones((_SAMPLES, _SAMPLES)), height_m.shape
+    between = list(pairwise(np.unique(height_m)[::-1]))
+    patterned = [np.kron(np.where(low < height_m, index**2, 1.0), raster) for _, low in between]
+    permittivity = [np.array([[1.0]]), *patterned, np.array([[index**2]])]
+    thickness_m = [0.0, *(float(high - low) for high, low in between), 0.0]
+    return layered_orders(permittivity, thickness_m, (ny * cell_m, nx * cell_m), wavelength_m, terms)
+
+
+def layered_orders(
+    permittivity: Sequence[np.ndarray],
+    thickness_m: Sequence[float],
+    period_m: tuple[float, float],
+    wavelength_m: float,
+    terms: int,
+    formulation: Any = None,
+) -> CrossedOrders:
+    """Solve Maxwell's equations for layers that repeat along x and y, lit through the first at normal incidence.
+
+    Args:
+        permittivity: `[y, x]` raster over a period of every layer, along the light; `[1, 1]` for the half-spaces
+            before and behind, and any other layer that is alike everywhere.
+        thickness_m: of every layer; of the half-spaces, 0 for amplitudes at their faces.
+        period_m: along y and along x.
+        wavelength_m: vacuum wavelength.
+        terms: orders that are kept, about; those nearest to the 0th. Compare two numbers to be sure.
+        formulation: one of fmmax's instead of the directions of the nearest walls, which are those of square cells.
+
+    Raises:
+        InputError: fmmax is missing.
+    """
+    fmmax = require_fmmax()
+    thickness, period = [each / wavelength_m for each in thickness_m], [each / wavelength_m for each in period_m]
     # Its matrices are made slower by several threads, which wait for each other: twice to ten times.
     with jax.enable_x64(True), threadpool_limits(1):
-        return _solve(fmmax, height_m / wavelength_m, cell_m / wavelength_m, index, terms)
+        return _solve(fmmax, permittivity, thickness, period, terms, formulation or _directions)
 
 
-def _solve(fmmax: Any, height: Float[np.ndarray, "y x"], cell: float, index: float, terms: int) -> CrossedOrders:
+def _solve(
+    fmmax: Any,
+    permittivity: Sequence[np.ndarray],
+    thickness: Sequence[float],
+    period: Sequence[float],
+    terms: int,
+    formulation: Any,
+) -> CrossedOrders:
     """Solve with lengths in wavelengths. fmmax has arrays `[x, y]`."""
     import jax.numpy as jnp
 
-    ny, nx = height.shape
-    lattice = fmmax.LatticeVectors(u=jnp.array([nx * cell, 0.0]), v=jnp.array([0.0, ny * cell]))
+    lattice = fmmax.LatticeVectors(u=jnp.array([period[1], 0.0]), v=jnp.array([0.0, period[0]]))
     expansion = fmmax.generate_expansion(lattice, terms, fmmax.Truncation.CIRCULAR)
     number = np.asarray(expansion.basis_coefficients)
-
-    def layer(permittivity: np.ndarray) -> Any:
-        return fmmax.eigensolve_isotropic_media(
+    layers = [
+        fmmax.eigensolve_isotropic_media(
             wavelength=jnp.asarray(1.0),
             in_plane_wavevector=jnp.zeros(2),
             primitive_lattice_vectors=lattice,
-            permittivity=jnp.asarray(permittivity),
+            permittivity=jnp.asarray(layer.T),
             expansion=expansion,
-            formulation=_directions,
+            formulation=formulation,
         )
-
-    raster = np.ones((_SAMPLES, _SAMPLES))
-    between = list(pairwise(np.unique(height)[::-1]))
-    patterned = [layer(np.kron(np.where(low < height.T, index**2, 1.0), raster)) for _, low in between]
-    layers = [layer(np.array([[1.0]])), *patterned, layer(np.array([[index**2]]))]
-    thickness = [0.0, *(high - low for high, low in between), 0.0]
+        for layer in permittivity
+    ]
     matrix = fmmax.stack_s_matrix(layers, [jnp.asarray(each) for each in thickness])
     # Amplitudes are those of the magnetic field along x, then along y.
     count, zeroth = len(number), int(np.flatnonzero((number == 0).all(1))[0])

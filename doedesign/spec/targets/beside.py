@@ -25,8 +25,8 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
         )
         yield InputError("scene.far", rule, "others", cure)
     if spec.optics.propagation != "far_field":
-        got = f'"{spec.optics.propagation}"'
-        yield InputError("optics.propagation", "they are computed by the far field", got, "Leave it out.")
+        rule, got = f"[{table}] chooses by itself how light is computed", f'"{spec.optics.propagation}"'
+        yield InputError("optics.propagation", rule, got, "Leave it out.")
     if spec.process.chooses_depths:
         yield InputError("process.etch_depths", "the depths must be known", '"optimize"', "Give them, or leave it out.")
     for name, usual in _OWN:

@@ -28,7 +28,7 @@ class FocusSpec(SpecTable, frozen=True):
             depth of focus. Otherwise each is a focus of its own: one is a lens, two are a bifocal lens.
         widths_m: for each distance the full width at half maximum that the focus should have at most; between two it
             grows as a power of the distance. By default 1.15 times those of an ideal lens, 1.03 wavelength x distance /
-            aperture.
+            aperture: too little for a beam that does not fill the aperture, which has foci of its own width.
         weights: how much each distance counts, if not all alike. The logarithm of the light on the axis is weighted, so
             that twice the weight is about twice the light.
         colours: names of the colours for which the distances are, one each, if not all colours for every distance.
@@ -70,7 +70,19 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
         cure = "Give sensor.distance instead of optics.focal_length."
         yield InputError("sensor.distance", "foci lie behind a DOE without a lens", "a lens", cure)
     yield from beside_problems(spec, "focus")
+    yield from _beam(spec)
     yield from _reach(spec)
+
+
+def _beam(spec: "Spec") -> Iterator[InputError]:
+    """The rule that the beam is a single wave along the axis: light of any other has no focus there."""
+    beam = spec.illumination
+    if beam is not None and any(value != 1.0 for value in beam.m_squared):
+        cure = "Leave it out, and look at the finished design in the real beam."
+        yield InputError("illumination.m_squared", "foci are designed for a single mode", f"{beam.m_squared}", cure)
+    for name in ("centre", "angle"):
+        if beam is not None and any(beam.centre_m if name == "centre" else beam.angles_rad):
+            yield InputError(f"illumination.{name}", "foci lie on the axis of the beam", "beside it", "Leave it out.")
 
 
 def _reach(spec: "Spec") -> Iterator[InputError]:
@@ -83,10 +95,11 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
             rule = f"rings of {format_length(spec.doe.pitch_m)} focus light to {least / UM:.3g} um at least"
             cure = f"Choose a wider one, or a pitch of at most {width / 2 / AIRY_WIDTH / UM:.3g} um."
             yield InputError(f"focus.widths[{index}]", rule, format_length(width), cure)
-    for index, distance in enumerate(focus.distances_m[: 2 if focus.widths_m else 0]):
-        airy = AIRY_WIDTH * shortest * distance / spec.doe.aperture_m
-        # An aperture of which only a ring is lit has a focus of 0.7 of this width, and much light beside it.
-        if focus.widths_m and index < len(focus.widths_m) and focus.widths_m[index] < 0.7 * airy:
-            width = format_length(focus.widths_m[index])
-            rule = f"this aperture focuses light to {0.7 * airy / UM:.3g} um at least at {format_length(distance)}"
-            yield InputError(f"focus.widths[{index}]", rule, width, "Choose a wider one, or a larger aperture.")
+        # An aperture of which only a ring is lit has a focus of 0.7 of an Airy disc's width, and much light beside it.
+        if index < len(focus.distances_m):
+            distance = focus.distances_m[index]
+            thinnest = 0.7 * AIRY_WIDTH * shortest * distance / spec.doe.aperture_m
+            if width < thinnest:
+                rule = f"this aperture focuses light to {thinnest / UM:.3g} um at least at {format_length(distance)}"
+                cure = "Choose a wider one, or a larger aperture."
+                yield InputError(f"focus.widths[{index}]", rule, format_length(width), cure)
