@@ -12,7 +12,7 @@ import numpy as np
 from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, light_cost
-from doedesign.design.metrics import design_metrics, pattern_metrics
+from doedesign.design.metrics import design_metrics, drawn_patterns
 from doedesign.design.objectives import Objective, Term, source_digests
 from doedesign.design.optimize import (
     OptimizationState,
@@ -43,7 +43,7 @@ from fab.files import canonical_json, write_atomic
 from fab.height import HeightMap
 from fab.levels import Levels
 from fab.plots.height import plot_height
-from fab.units import NM
+from fab.units import NM, format_length
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.metrics import without_infinities
@@ -230,8 +230,8 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
     bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
     rows = design_metrics(drawn, bank, near, lens)
     metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light}
-    if patterns := pattern_metrics(spec, camera, bank, terms):
-        metrics["patterns"] = patterns
+    if patterns := drawn_patterns(spec, camera, bank, terms):
+        metrics["patterns"] = without_infinities([pattern.summary() for pattern in patterns])
     if spec.process.chooses_depths:
         metrics["etches"] = _etch_metrics(camera, design)
     remark = ""
@@ -257,10 +257,11 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
     if design.history:
         save(plot_history(design.history), run.path("history.png"))
         names.append("history.png")
-    if targets := [term.target for term in terms if term.target is not None]:
-        achieved = bank.energy[0, bank.depths_m.index(far[0])]
-        efficiency, uniformity = (patterns[0][name] for name in ("efficiency", "uniformity"))
-        picture = plot_pattern(targets[0], achieved, camera, efficiency=efficiency, uniformity=uniformity)
-        save(picture, run.path("pattern.png"))
-        names.append("pattern.png")
+    for number, one in enumerate(patterns, 1):
+        named = [] if one.colour is None or one.depth_m is None else [one.colour, format_length(one.depth_m)]
+        picture = plot_pattern(
+            one.target, one.light, camera, efficiency=one.efficiency, uniformity=one.uniformity, title=", ".join(named)
+        )
+        names.append("pattern.png" if number == 1 else f"pattern_{number}.png")
+        save(picture, run.path(names[-1]))
     return names

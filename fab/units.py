@@ -88,7 +88,12 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
 
 
 def format_length(length_m: float) -> str:
-    """Return a length as ASCII ("75 nm") in the largest unit of m, mm, um, nm of which it has one, to twelve digits."""
+    """Return a length as ASCII ("75 nm") in the largest unit of m, mm, um, nm of which it has one, to twelve digits.
+
+    An infinite one, such as the depth of a collimated beam, is "inf", as `metres` reads it.
+    """
+    if math.isinf(length_m):
+        return f"{length_m:g}"
     size = abs(length_m)
     for unit_m, name in _LENGTH_STEPS:
         if size >= unit_m * (1 - 1e-12):

@@ -1,13 +1,16 @@
 """Table of a design's numbers, the same for every design, whatever it was optimised for."""
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import binary_erosion
 
 from doedesign.design.objectives import Term
-from doedesign.design.patterns import spot_centres_m
+from doedesign.design.patterns import offset_m, spot_centres_m
 from doedesign.spec import Spec
 from fab.units import parse_length
 from sim.camera import Camera
@@ -39,38 +42,76 @@ def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], l
     return rows
 
 
-def pattern_metrics(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[dict[str, float]]:
-    """Efficiency and uniformity of every `target_pattern` objective, for the first colour and far depth.
+class DrawnPattern(NamedTuple):
+    """The light that should equal a target.
 
-    efficiency: energy on the target per incident energy (inside the spots of a spot pattern; where the target is
-        above half its peak otherwise). uniformity: 1 - (max - min) / (max + min) over spots, or 1 - standard
-        deviation / mean over the pixels of an area that are a full Airy radius inside it.
+    Attributes:
+        target: light wanted per pixel, summing to 1.
+        light: shares of the incident light per pixel.
+        efficiency: energy on the target per incident energy (inside the spots of a spot pattern; where the target is
+            above half its peak otherwise).
+        uniformity: 1 - (max - min) / (max + min) over spots, or 1 - standard deviation / mean over the pixels of an
+            area that are a full Airy radius inside it.
+        colour: name of the colour channel, where the objective names colours or depths.
+        depth_m: depth of the source, metres, likewise.
     """
-    far = bank.energy[0, bank.depths_m.index(spec.scene.far_m[0])]
-    rows = []
+
+    target: Float[np.ndarray, "y x"]
+    light: Float[np.ndarray, "y x"]
+    efficiency: float
+    uniformity: float
+    colour: str | None = None
+    depth_m: float | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Its numbers, for metrics."""
+        named = {} if self.colour is None else {"colour": self.colour, "depth_m": self.depth_m}
+        return {"efficiency": self.efficiency, "uniformity": self.uniformity, **named}
+
+
+def drawn_patterns(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[DrawnPattern]:
+    """What a design draws for every `target_pattern` objective, for the colours and depths that it names.
+
+    Where it names none, it is judged for the first colour and far depth.
+    """
+    drawn = []
     for objective, term in zip(spec.objectives, terms, strict=True):
         if (target := term.target) is None:
             continue
-        if objective.options.get("pattern") == "spots":
-            shares = _spot_energies(camera, far, objective.options)
-            efficiency = shares.sum()
-            uniformity = 1 - (shares.max() - shares.min()) / (shares.max() + shares.min())
-        else:
-            area = target > target.max() / 2
-            efficiency = far[area].sum(dtype=np.float64)
-            radius = airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m
-            reach = int(np.ceil(radius))
-            disc = radius_map_m((2 * reach + 1, 2 * reach + 1), 1.0) <= radius
-            inner = far[binary_erosion(area, disc)]
-            uniformity = 1 - inner.std() / inner.mean() if inner.size and inner.mean() > 0 else 0.0
-        rows.append({"efficiency": float(efficiency), "uniformity": float(uniformity)})
-    return rows
+        named = bool(objective.colours or objective.depths_m)
+        colours = term.cases.colours or range(len(camera.colours) if named else 1)
+        depths = (objective.depths_m or spec.scene.far_m)[: None if named else 1]
+        for c, depth_m in product(colours, depths):
+            one = replace(camera, colours=(camera.colours[c],))
+            light = bank.energy[c, bank.depths_m.index(depth_m)]
+            place = (camera.colours[c].name, depth_m) if named else (None, None)
+            drawn.append(DrawnPattern(target, light, *_pattern_numbers(one, light, target, objective.options), *place))
+    return drawn
+
+
+def _pattern_numbers(
+    camera: Camera, light: Float[np.ndarray, "y x"], target: Float[np.ndarray, "y x"], options: Mapping[str, Any]
+) -> tuple[float, float]:
+    """Efficiency and uniformity of a pattern in the one colour of a camera."""
+    if options.get("pattern") == "spots":
+        shares = _spot_energies(camera, light, options)
+        return float(shares.sum()), float(1 - (shares.max() - shares.min()) / (shares.max() + shares.min()))
+    area = target > target.max() / 2
+    efficiency = light[area].sum(dtype=np.float64)
+    radius = airy_radius_m(camera, mean_wavelength_m(camera.colours[0])) / camera.pixel_m
+    reach = int(np.ceil(radius))
+    disc = radius_map_m((2 * reach + 1, 2 * reach + 1), 1.0) <= radius
+    inside: Any = binary_erosion(area, disc)
+    inner = light[inside]
+    uniformity = 1 - inner.std() / inner.mean() if inner.size and inner.mean() > 0 else 0.0
+    return float(efficiency), float(uniformity)
 
 
 def _spot_energies(camera: Camera, psf: Float[np.ndarray, "y x"], options: Any) -> Float[np.ndarray, " spot"]:
     radius = spot_radius_m(camera, mean_wavelength_m(camera.colours[0]))
     axis = camera.axis_m()
     centres = spot_centres_m(tuple(options["count"]), parse_length(str(options["spacing"])))
+    centres += offset_m(options, "objective")
     return np.array(
         [psf[np.hypot(axis[:, None] - y, axis[None, :] - x) <= radius].sum(dtype=np.float64) for y, x in centres]
     )

@@ -7,12 +7,14 @@ spec alone never runs code: the function is given to `doedesign.optimize`, or im
     def dark_centre(psfs: PsfSet, *, power: float = 1.0) -> Array:
         return jnp.mean(jnp.sum(psfs.near, axis=(-2, -1))) ** power
 
-Energies are per unit power incident on the clear aperture, so light that is lost anywhere counts as lost.
+Energies are per unit power incident on the clear aperture, so light that is lost anywhere counts as lost. A term of a
+spec may look at some colours and depths only, and at the worst of them instead of their mean (`PsfSet.lowest`).
 """
 
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -24,6 +26,7 @@ from jaxtyping import Array, Float
 
 from doedesign.design.patterns import target_image
 from doedesign.spec import Spec
+from doedesign.spec.models import ObjectiveSpec
 from doedesign.spec.values import OBJECTIVES
 from fab.errors import InputError
 from fab.files import sha256_file
@@ -42,12 +45,57 @@ class PsfSet(eqx.Module):
         far: `[w, f, y, x]` PSFs of scene depths.
         lens_participation: `[w, n]` sum of squared pixel energies of the plain lens at the same near depths.
         camera: optics and sensor.
+        worst: whether the worst colour and depth counts, in place of their mean.
     """
 
     near: Float[Array, "w n y x"]
     far: Float[Array, "w f y x"]
     lens_participation: Float[Array, "w n"]
     camera: Camera = eqx.field(static=True)
+    worst: bool = eqx.field(static=True, default=False)
+
+    def lowest(self, values: Float[Array, "*s"]) -> Array:
+        """Mean of what should be large, by colour and depth; the lowest of it where the worst counts."""
+        return jnp.min(values) if self.worst else jnp.mean(values)
+
+    def highest(self, values: Float[Array, "*s"]) -> Array:
+        """Mean of what should be small, by colour and depth; the highest of it where the worst counts."""
+        return jnp.max(values) if self.worst else jnp.mean(values)
+
+
+class Cases(NamedTuple):
+    """Colours and depths that a term looks at, as positions in a `PsfSet`; None for all. `worst` as there."""
+
+    colours: tuple[int, ...] | None = None
+    near: tuple[int, ...] | None = None
+    far: tuple[int, ...] | None = None
+    worst: bool = False
+
+    @classmethod
+    def of(cls, objective: ObjectiveSpec, spec: Spec) -> "Cases":
+        """Cases of an objective of a spec."""
+        names, depths_m = [colour.name for colour in spec.optics.colours], objective.depths_m
+        colours = tuple(map(names.index, objective.colours)) or None
+        sides = (spec.scene.near_m, spec.scene.far_m)
+        near, far = (tuple(i for i, d in enumerate(side) if d in depths_m) if depths_m else None for side in sides)
+        return cls(colours, near, far, objective.over == "worst")
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera with these colours only."""
+        chosen = self.colours
+        return camera if chosen is None else replace(camera, colours=tuple(camera.colours[i] for i in chosen))
+
+    def among(self, psfs: PsfSet) -> PsfSet:
+        """The PSFs of these cases."""
+        if self == Cases():
+            return psfs
+        every = psfs.near.shape[0], psfs.near.shape[1], psfs.far.shape[1]
+        c, n, f = (
+            np.arange(count) if some is None else np.array(some, int)
+            for some, count in zip(self[:3], every, strict=True)
+        )
+        near, far, lens = psfs.near[c][:, n], psfs.far[c][:, f], psfs.lens_participation[c][:, n]
+        return PsfSet(near, far, lens, self.camera(psfs.camera), self.worst)
 
 
 class Term(NamedTuple):
@@ -55,12 +103,17 @@ class Term(NamedTuple):
 
     name: str
     weight: float
-    value: partial[Array]
+    function: partial[Array]
+    cases: Cases = Cases()
+
+    def value(self, psfs: PsfSet) -> Array:
+        """Value for the PSFs of all colours and depths of a step."""
+        return self.function(self.cases.among(psfs))
 
     @property
     def target(self) -> Float[np.ndarray, "y x"] | None:
         """Target image of a `target_pattern`: energy per pixel, summing to 1."""
-        return self.value.keywords.get("target")
+        return self.function.keywords.get("target")
 
 
 def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
@@ -72,9 +125,9 @@ def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
 
 
 def far_spot(psfs: PsfSet) -> Array:
-    """Share of the scene's light that misses the sharp spot, 0-1, averaged over colours and far depths."""
+    """Share of the scene's light that misses the sharp spot, 0-1, over colours and far depths."""
     inside = jnp.einsum("wfyx,wyx->wf", psfs.far, spot_weights(psfs.camera))
-    return 1.0 - jnp.mean(inside)
+    return 1.0 - psfs.lowest(inside)
 
 
 def near_spread(psfs: PsfSet) -> Array:
@@ -83,17 +136,17 @@ def near_spread(psfs: PsfSet) -> Array:
     The coherent part of the light cannot tell depths apart, so a design with far-spot energy s keeps at least s² of
     it (design.md §4): with weights 1 for `far_spot` and w for this term the ideal DOE has s = 1 / (2w).
     """
-    return jnp.mean(participation(psfs.near) / psfs.lens_participation)
+    return psfs.highest(participation(psfs.near) / psfs.lens_participation)
 
 
 def window_loss(psfs: PsfSet) -> Array:
-    """Share of the light that misses the sensor window, 0-1, averaged over colours and depths.
+    """Share of the light that misses the sensor window, 0-1, over colours and depths.
 
     Without it `near_spread` and `far_spot` agree on sending unwanted light to angles beyond the window, where it
     becomes stray light on the rest of the sensor.
     """
     images = jnp.concatenate([psfs.near, psfs.far], axis=1)
-    return 1.0 - jnp.mean(jnp.sum(images, axis=(-2, -1)))
+    return 1.0 - psfs.lowest(jnp.sum(images, axis=(-2, -1)))
 
 
 def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
@@ -109,12 +162,12 @@ def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
     delta = spots / spots.sum(axis=(1, 2), keepdims=True)
     far = jnp.sum((psfs.far - delta[:, None]) ** 2, axis=(-2, -1)) / np.sum(delta**2, axis=(1, 2))[:, None]
     near = jnp.sum((psfs.near - even) ** 2, axis=(-2, -1)) / (even**2 * psfs.camera.window**2)
-    return jnp.mean(far) + near_weight * jnp.mean(jnp.log1p(near))
+    return psfs.highest(far) + near_weight * psfs.highest(jnp.log1p(near))
 
 
 def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     """Squared distance of every far PSF from a target that holds all light, relative to the target's own square."""
-    return jnp.mean(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
+    return psfs.highest(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
 
 
 BUILT_IN: dict[str, Objective] = {name: globals()[name] for name in OBJECTIVES}
@@ -138,14 +191,16 @@ def terms_from_spec(
     for i, objective in enumerate(spec.objectives):
         where = f"objective[{i}] {objective.name}"
         options: dict[str, Any] = dict(objective.options)
+        cases = Cases.of(objective, spec)
         if objective.name == "target_pattern":
-            options = {"target": target_image(camera, options, files.get(f"objective[{i}].options.image"), where)}
+            image = files.get(f"objective[{i}].options.image")
+            options = {"target": target_image(cases.camera(camera), options, image, where)}
         if objective.name not in known:
             rule, cure = "a spec runs no code by itself", "Give the function by `objectives`, if you trust it."
             raise InputError(where, rule, "a function of the user's own", cure)
         function = known[objective.name]
         _require_options(function, options, where)
-        terms.append(Term(objective.name, objective.weight, partial(function, **options)))
+        terms.append(Term(objective.name, objective.weight, partial(function, **options), cases))
     return tuple(terms)
 
 

@@ -1,6 +1,6 @@
 """Target images for DOEs that draw: beam splitters, diffusers, any picture. All hold unit energy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.errors import InputError
+from fab.grid import Grid
 from fab.pictures import TIFF_FILES, read_display, read_pixels
 from fab.units import parse_length
+from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.light import linear_from_srgb
-from sim.metrics import airy_radius_m, disc_weights
+from sim.metrics import airy_radius_m
 
 Image = Float[np.ndarray, "y x"]
 
@@ -35,6 +37,19 @@ def spot_centres_m(count: tuple[int, int], spacing_m: float) -> Float[np.ndarray
     return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
+def offset_m(options: Mapping[str, Any], where: str) -> tuple[float, float]:
+    """Middle (y, x) of a pattern on the sensor, metres, of the option `offset = ["x", "y"]`; `where` as above."""
+    texts = options.get("offset", ("0 m", "0 m"))
+    rule, cure = "must be two lengths, [x, y]", 'For example offset = ["100 um", "0 um"].'
+    if not (isinstance(texts, tuple) and len(texts) == 2):
+        raise InputError(f"{where}: offset", rule, repr(texts), cure)
+    try:
+        x, y = (parse_length(str(text)) for text in texts)
+    except ValueError as error:
+        raise InputError(f"{where}: offset", rule, repr(texts), cure) from error
+    return y, x
+
+
 def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
     """Ideal-lens images (Airy patterns) at the points of a grid."""
     from scipy.special import j1
@@ -44,6 +59,7 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
         rule = "must be two positive whole numbers"
         raise InputError(f"{where}: count", rule, repr(count), "For example count = [5, 5].")
     centres = spot_centres_m(count, positive_length(options.get("spacing"), f"{where}: spacing"))
+    centres += offset_m(options, where)
     axis = camera.axis_m()
     if np.abs(centres).max() > axis[-1]:
         rule = f"spots must lie within the window, {2 * axis[-1] * 1e3:.4g} mm"
@@ -62,20 +78,24 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
 
 def _square(camera: Camera, options: dict[str, Any], where: str) -> Image:
     half = positive_length(options.get("width"), f"{where}: width") / 2
-    share = np.clip((half - np.abs(camera.axis_m())) / camera.pixel_m + 0.5, 0.0, 1.0)
-    return share[:, None] * share[None, :]
+    y, x = (
+        np.clip((half - np.abs(camera.axis_m() - middle)) / camera.pixel_m + 0.5, 0.0, 1.0)
+        for middle in offset_m(options, where)
+    )
+    return y[:, None] * x[None, :]
 
 
 def _disc(camera: Camera, options: dict[str, Any], where: str) -> Image:
     radius = positive_length(options.get("diameter"), f"{where}: diameter") / 2
-    return disc_weights((camera.window, camera.window), camera.pixel_m, radius).astype(np.float64)
+    shape, centre = (camera.window, camera.window), offset_m(options, where)
+    return circle_coverage(Grid(shape, camera.pixel_m), 2 * radius, centre).astype(np.float64)
 
 
 # Every pattern with its options.
 _PATTERNS: dict[str, tuple[Callable[[Camera, dict[str, Any], str], np.ndarray], set[str]]] = {
-    "spots": (_spots, {"count", "spacing"}),
-    "square": (_square, {"width"}),
-    "disc": (_disc, {"diameter"}),
+    "spots": (_spots, {"count", "spacing", "offset"}),
+    "square": (_square, {"width", "offset"}),
+    "disc": (_disc, {"diameter", "offset"}),
 }
 
 
@@ -101,8 +121,8 @@ def _picture(camera: Camera, path: Path) -> Image:
 def target_image(camera: Camera, options: dict[str, Any], picture: Path | None, where: str) -> Image:
     """Target energies per pixel of the sensor window, summing to 1, float32: a picture, or a pattern of the options.
 
-    `pattern` is "spots" (count, spacing), "square" (width) or "disc" (diameter); `where` is the key of the objective,
-    for messages.
+    `pattern` is "spots" (count, spacing), "square" (width) or "disc" (diameter), each with an `offset` [x, y] on the
+    sensor; `where` is the key of the objective, for messages.
     """
     if picture is not None:
         target = _picture(camera, picture)

@@ -58,22 +58,31 @@ class Problem(eqx.Module):
 
 
 class SourceSet(NamedTuple):
-    """Everything a step may look at, as in `StepSources`, and the largest displacement of the image, metres or 0."""
+    """Everything a step may look at, as in `StepSources`.
+
+    Attributes:
+        near: as in `StepSources`.
+        far: as there.
+        lens: as there.
+        displacement_m: largest displacement of the image, metres or 0.
+        whole: whether every step looks at all depths.
+    """
 
     near: tuple[tuple[Any, ...], ...]
     far: tuple[tuple[Any, ...], ...]
     lens: Float[np.ndarray, "w n"]
     displacement_m: float
+    whole: bool = False
 
     def look(self, seed: int, step: int) -> StepSources:
-        """Sources of a step: depths in shuffled rounds, so that each is seen equally often.
+        """Sources of a step: depths in shuffled rounds, so that each is seen equally often, or all of them.
 
         They depend on the two numbers alone, so a resumed run repeats them.
         """
 
         def pick(count: int, salt: int) -> list[int]:
-            if count == 0:
-                return []
+            if count == 0 or self.whole:
+                return list(range(count))
             order = np.random.default_rng((seed, salt, step // count)).permutation(count)
             return [int(order[step % count])]
 
@@ -84,8 +93,9 @@ class SourceSet(NamedTuple):
         return self._chosen(pick(len(self.near[0]), 0), pick(len(self.far[0]), 1), offset)
 
     def first_look(self) -> StepSources:
-        """The first near and far depth, with the image on the axis."""
-        return self._chosen([0] if self.near[0] else [], [0] if self.far[0] else [], None)
+        """The first near and far depth, or all of them, with the image on the axis."""
+        near, far = (list(range(len(side[0])))[: None if self.whole else 1] for side in (self.near, self.far))
+        return self._chosen(near, far, None)
 
     def _chosen(self, near: list[int], far: list[int], offset_m: Array | None) -> StepSources:
         near_sources, far_sources = (
@@ -111,7 +121,8 @@ def problem_of(
     if spec.scene.near_m:
         bank = psf(HeightOptic.of(camera), depths=spec.scene.near_m)
         lens = np.asarray(participation(jnp.asarray(bank.energy)))
-    return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0)
+    whole = any(objective.compares for objective in spec.objectives)
+    return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0, whole)
 
 
 def _is_sparse(spec: Spec) -> bool:

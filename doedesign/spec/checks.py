@@ -139,7 +139,7 @@ def _lens(spec: Spec) -> Iterator[InputError]:
 def _scene(spec: Spec) -> Iterator[InputError]:
     near, far, least_m = spec.scene.near_m, spec.scene.far_m, _nyquist_length_m(spec)
     if near and max(near) >= min(far):
-        got = f"{format_length(max(near))} near and {_depth_text(min(far))} far"
+        got = f"{format_length(max(near))} near and {format_length(min(far))} far"
         rule = "every near depth must be smaller than every far depth"
         yield InputError("scene.near", rule, got, "Move the obstruction closer or the scene away.")
     # Neighbouring cells must see a source less than half a wave apart: the bound of eq. 6 for the depth.
@@ -221,6 +221,32 @@ def _objectives(spec: Spec) -> Iterator[InputError]:
             rule = f'"{objective.name}" looks at near depths, so scene.near must hold one'
             cure = "Add a depth to scene.near or remove the objective."
             yield InputError(f"objective[{index}].name", rule, "an empty scene.near", cure)
+        yield from _cases(spec, index)
+
+
+def _cases(spec: Spec, index: int) -> Iterator[InputError]:
+    """Rules for the colours and depths that an objective names."""
+    objective, scene = spec.objectives[index], spec.scene
+    colours = [colour.name for colour in spec.optics.colours]
+    for name in objective.colours:
+        if name not in colours:
+            rule, cure = "must be colour channels of the spec", nearest(name, colours)
+            yield InputError(f"objective[{index}].colours", rule, f'"{name}"', cure)
+    if not objective.depths_m:
+        return
+    looks = {"far_spot": ("far",), "target_pattern": ("far",), "near_spread": ("near",), "handcrafted": ("near", "far")}
+    depths = {"near": scene.near_m, "far": scene.far_m}
+    wanted = looks.get(objective.name, ())
+    allowed = [depth for side in wanted or depths for depth in depths[side]]
+    listed = ", ".join(map(format_length, allowed))
+    for depth_m in objective.depths_m:
+        if depth_m not in allowed:
+            rule = f'depths that "{objective.name}" looks at in this scene are: {listed or "none"}'
+            yield InputError(f"objective[{index}].depths", rule, format_length(depth_m), "Name some of these.")
+    for side in wanted:
+        if not set(depths[side]) & set(objective.depths_m):
+            rule = f'"{objective.name}" needs a {side} depth'
+            yield InputError(f"objective[{index}].depths", rule, "none", f"Add one of scene.{side}.")
 
 
 def _process(spec: Spec) -> Iterator[InputError]:
@@ -340,11 +366,7 @@ def _limit_warnings(spec: Spec) -> Iterator[str]:
         where, depths = _DEPTHS_OF.get(limit.quantity, "depth"), (*near, *far)
         if limit.quantity in _DEPTHS_OF:
             depths = near if where == "near depth" else far
-        at = "" if limit.depth_m is None else f" at {_depth_text(limit.depth_m)}"
+        at = "" if limit.depth_m is None else f" at {format_length(limit.depth_m)}"
         if limit.depth_m not in (None, *depths) or not depths:
-            listed = ", ".join(_depth_text(depth_m) for depth_m in depths) or "none"
+            listed = ", ".join(format_length(depth_m) for depth_m in depths) or "none"
             yield f"limit[{index}]: {limit.quantity}{at} limits nothing; the scene's {where}s are: {listed}."
-
-
-def _depth_text(depth_m: float) -> str:
-    return "inf" if math.isinf(depth_m) else format_length(depth_m)

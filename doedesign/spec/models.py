@@ -25,6 +25,7 @@ from doedesign.spec.values import (
     STARTS,
     ColourName,
     Count,
+    FarDepth,
     Options,
     OptionsTable,
     Pitch,
@@ -203,11 +204,23 @@ class ObjectiveSpec(SpecTable, frozen=True):
         name: a built-in objective, or a function of the user's own as "module:function".
         weight: factor of the term; a negative one maximises it.
         options: keyword arguments of the term. `image` is a path relative to the spec file.
+        colours: names of the colour channels it looks at; all of them if none is named.
+        depths_m: depths of the scene it looks at; all of them if none is given.
+        over: "mean" of its colours and depths, or the "worst" of them. Where a term has depths of its own or asks for
+            the worst, every step looks at all depths, not at one near and one far one in turn.
     """
 
     name: ObjectiveName = Field(examples=['"far_spot"'])
     weight: Annotated[float, Field(strict=True)] = 1.0
     options: OptionsTable = Options()
+    colours: tuple[ColourName, ...] = optional(())
+    depths_m: tuple[FarDepth, ...] = optional(())
+    over: Literal["mean", "worst"] = optional("mean")
+
+    @property
+    def compares(self) -> bool:
+        """Whether it needs all depths of the scene at once."""
+        return bool(self.depths_m) or self.over == "worst"
 
 
 class Spec(SpecTable, frozen=True):

@@ -115,7 +115,7 @@ class Sample:
         rows = self.rows_of(limit.quantity, limit.colour, limit.depth_m) if limit.quantity in self.values else []
         if not rows:
             rule = "must match a colour and depth"
-            places = ", ".join(f"{c} at {_depth_text(z)}" for c, z in self.places)
+            places = ", ".join(f"{c} at {format_length(z)}" for c, z in self.places)
             raise InputError(f"limit on {limit.quantity}", rule, limit_text(limit), f"One of {places}.")
         values = self.values[limit.quantity][:, rows]
         low, high = -math.inf if limit.min is None else limit.min, math.inf if limit.max is None else limit.max
@@ -232,9 +232,5 @@ def limit_text(limit: LimitSpec) -> str:
     """A limit in words: "zeroth_order <= 0.05 for 656nm"."""
     bounds = [f"{sign} {bound:g}" for sign, bound in ((">=", limit.min), ("<=", limit.max)) if bound is not None]
     place = f" for {limit.colour}" if limit.colour else ""
-    place += f" at {_depth_text(limit.depth_m)}" if limit.depth_m is not None else ""
+    place += f" at {format_length(limit.depth_m)}" if limit.depth_m is not None else ""
     return f"{limit.quantity} {' and '.join(bounds)}{place}"
-
-
-def _depth_text(depth_m: float) -> str:
-    return "inf" if math.isinf(depth_m) else format_length(depth_m)

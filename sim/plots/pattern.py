@@ -23,12 +23,13 @@ def plot_pattern(
     *,
     efficiency: float,
     uniformity: float,
+    title: str = "",
     ax: "Axes | None" = None,
 ) -> "FigureBase":
     """Draw a target pattern and the PSF that should equal it (shares of the light per pixel) on one colour scale.
 
     Colours follow the square root of the energy, so that ghosts of one per cent show. Efficiency and uniformity (1 for
-    perfect) are written above.
+    perfect) are written above, and a `title` above the target.
     """
     from matplotlib.colors import PowerNorm
     from matplotlib.ticker import MaxNLocator
@@ -38,7 +39,10 @@ def plot_pattern(
     images = [shrunk(image, round(_SIDE * DPI)) for image in (target, achieved)]
     # Speckle has rare pixels many times brighter than the rest, which would darken an even target.
     top = max(float(images[0].max()), float(np.quantile(images[1], 0.9995)), 1e-30)
-    titles = ("target", f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %")
+    titles = (
+        f"target {title}".strip(),
+        f"achieved: efficiency {100 * efficiency:.1f} %, uniformity {100 * uniformity:.1f} %",
+    )
     with panels(ax, (8.3, 3.95), layout="compressed") as figure:
         panes = figure.subplots(1, 2, sharex=True, sharey=True)
         norm, box = PowerNorm(0.5, 0.0, top, clip=True), extent_of(target.shape, camera.pixel_m, UM)

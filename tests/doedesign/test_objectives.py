@@ -151,6 +151,22 @@ def test_squares_and_discs_are_as_large_as_they_say() -> None:
     assert not disc[r > 83e-6].any()
 
 
+def test_patterns_are_moved_by_their_offset() -> None:
+    """By whole pixels, nothing but the place changes; x before y, as everywhere in a spec."""
+    for options in (
+        {"pattern": "square", "width": "50 um"},
+        {"pattern": "disc", "diameter": "60 um"},
+        {"pattern": "spots", "count": (2, 1), "spacing": "40 um"},
+    ):
+        centred = target_image(CAMERA, options, None, "objective")
+        moved = target_image(CAMERA, options | {"offset": ("40 um", "-20 um")}, None, "objective")
+        # Far rings of spots that fall over the window's edge are a few thousandths of their peak.
+        np.testing.assert_allclose(moved[5:40, 15:], centred[10:45, 5:-10], atol=3e-3 * centred.max())
+    for offset in ("40 um", ("40 um",), ("40", "3 um"), (1, 2)):
+        with pytest.raises(InputError, match=r"offset: must be two lengths, \[x, y\]"):
+            target_image(CAMERA, {"pattern": "disc", "diameter": "60 um", "offset": offset}, None, "objective")
+
+
 @pytest.mark.parametrize("width", ["0 um", "-3 um", "3", "wide"])
 def test_a_length_that_is_none(width: str) -> None:
     with pytest.raises(InputError, match='For example width = "250 um"') as caught:
@@ -214,6 +230,67 @@ def test_the_objectives_are_those_of_the_spec() -> None:
         without = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), CAMERA)
         value = float(BUILT_IN[name](without, **given.get(name, {})))
         assert np.isnan(value) == (name in NEAR_OBJECTIVES), name
+
+
+THREE = [
+    "optics.wavelengths=['656 nm', '589 nm', '486 nm']",
+    "scene.near=['5 mm', '10 mm']",
+    "scene.far=['1 m', 'inf']",
+]
+
+
+def three_colours(*objectives: str) -> tuple[tuple[Any, ...], PsfSet, np.ndarray, np.ndarray]:
+    """Terms of a spec of three colours and two depths on either side, and PSFs that hold random light."""
+    spec = load_spec(EXAMPLES / "quick.toml", [*THREE, f"objective=[{', '.join(objectives)}]"])
+    from doedesign.build import camera_from_spec
+
+    camera, rng = camera_from_spec(spec), np.random.default_rng(3)
+    near, far = rng.uniform(0, 1, (2, 3, 2, camera.window, camera.window)).astype(np.float32) / camera.window**2
+    psfs = PsfSet(jnp.asarray(near), jnp.asarray(far), jnp.full((3, 2), 1e-6), camera)
+    return terms_from_spec(spec, camera, {}), psfs, near, far
+
+
+def test_terms_of_some_colours_and_depths_and_of_the_worst_of_them() -> None:
+    """Each against the sums over light that it should look at."""
+    terms, psfs, near, far = three_colours(
+        "{ name = 'window_loss', over = 'worst' }",
+        "{ name = 'window_loss', colours = ['486nm'] }",
+        "{ name = 'window_loss', depths = ['10 mm', 'inf'], over = 'worst' }",
+        "{ name = 'near_spread', colours = ['656nm', '486nm'], depths = ['10 mm'] }",
+        "{ name = 'near_spread', over = 'worst' }",
+        "{ name = 'far_spot', depths = ['1 m'], over = 'worst' }",
+        "{ name = 'far_spot', colours = ['589nm'] }",
+    )
+    light = np.concatenate([near, far], 1, dtype=np.float64).sum((2, 3))
+    squares = (near.astype(np.float64) ** 2).sum((2, 3)) / 1e-6
+    spots = np.einsum("wfyx,wyx->wf", far.astype(np.float64), spot_weights(psfs.camera))
+    wanted = [
+        1 - light.min(),
+        1 - light[2].mean(),
+        1 - light[:, [1, 3]].min(),
+        squares[[0, 2], 1].mean(),
+        squares.max(),
+        1 - spots[:, 0].min(),
+        1 - spots[1].mean(),
+    ]
+    for term, value in zip(terms, wanted, strict=True):
+        assert float(term.value(psfs)) == pytest.approx(value, rel=1e-5), term.name
+
+
+@pytest.mark.parametrize(
+    ("objective", "words"),
+    [
+        ("{ name = 'far_spot', colours = ['green'] }", r"objective\[0\].colours: must be colour channels of the spec"),
+        ("{ name = 'far_spot', depths = ['5 mm'] }", 'depths that "far_spot" looks at in this scene are: 1 m, inf'),
+        ("{ name = 'near_spread', depths = ['7 mm'] }", "looks at in this scene are: 5 mm, 10 mm, but got 7 mm"),
+        ("{ name = 'handcrafted', depths = ['5 mm'] }", '"handcrafted" needs a far depth'),
+        ("{ name = 'far_spot', over = 'best' }", r"objective\[0\].over"),
+        ("{ name = 'far_spot', depths = ['1'] }", r"objective\[0\].depths\[0\]"),
+    ],
+)
+def test_colours_and_depths_that_are_not_there(objective: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        three_colours(objective)
 
 
 def test_users_objective(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,6 +45,14 @@ def test_a_step_is_the_same_again_and_others_differ():
     assert (offsets.min(0) < -0.9e-6).all()
 
 
+def test_where_depths_are_compared_a_step_looks_at_all_of_them():
+    whole = SOURCES._replace(whole=True)
+    for found in (whole.first_look(), whole.look(5, 3)):
+        assert found.near == NEAR
+        assert found.far == FAR
+        assert np.asarray(found.lens).tolist() == LENS.tolist()
+
+
 def test_without_near_depths_or_displacement():
     found = SourceSet(((), ()), FAR, LENS[:, :0], 0.0)
     for look in (found.first_look(), found.look(0, 7)):
