@@ -162,7 +162,7 @@ def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
         from doedesign.spots.design import SpotTask
 
         task = SpotTask.from_spec(spec)
-    elif spec.area is not None:
+    elif spec.areas:
         from doedesign.areas.design import AreaTask
 
         task = AreaTask.from_spec(spec)

@@ -16,7 +16,7 @@ from sim.psf_bank import PsfBank, psf
 from sim.surface import FabricatedDoe, as_fabricated
 
 if TYPE_CHECKING:
-    from doedesign.areas.shape import AreaTable
+    from doedesign.areas.shape import AreaTable, AreaTables
     from doedesign.focus.depth import FocusTable
     from doedesign.spots.orders import OrderTable
 
@@ -47,7 +47,7 @@ def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[di
     return metric_rows(bank.metric_inputs(design.near_m, surface, nominal, aimed=aimed), "fabricated")
 
 
-def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | FocusTable | None":
+def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | AreaTables | FocusTable | None":
     """Light on what a design should make, spots, an area or foci, of the design as drawn or as fabricated.
 
     None for a design that should make none of them.
@@ -62,9 +62,10 @@ def on_target(design: Design, doe: CellOptic) -> "OrderTable | AreaTable | Focus
         from doedesign.spots.design import orders_of_design
 
         return orders_of_design(design, doe)
-    from doedesign.areas.shape import area_of_design
+    from doedesign.areas.shape import AreaTables, areas_of_design
 
-    return area_of_design(design, doe)
+    tables = areas_of_design(design, doe)
+    return tables[0] if len(tables) == 1 else AreaTables(tables)
 
 
 @lru_cache(maxsize=1)

@@ -5,7 +5,7 @@ first, and the others make up for them (F. Wyrowski, J. Opt. Soc. Am. A 7, 961, 
 make stays small.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from doedesign.areas.problem import AreaLight, AreaProblem
-from doedesign.areas.target import AreaTarget
+from doedesign.areas.problem import AreaLight, AreaProblem, AreaSet
+from doedesign.areas.target import AreaTarget, camera_for
 from doedesign.areas.transport import transport_phase
 from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
@@ -25,13 +25,14 @@ from doedesign.spec import Spec, input_files
 from doedesign.spots.superposition import Staircase
 from fab.errors import InputError
 from fab.level_map import LevelMap
-from fab.levels import Levels
+from fab.levels import Levels, quantise_wrapped
 from fab.units import format_length
 from sim.camera import Camera
 
 _MEMORY = 8  # steps that L-BFGS remembers
 _FREE = 0.5  # share of the steps with a free phase
 _BLOCK = 5  # steps between two sets of cells that are set to levels
+_TRIALS = 64  # phases per wave among which a start for several areas is sought
 
 
 class AreaState(NamedTuple):
@@ -56,48 +57,72 @@ class AreaTask:
         spec: the spec.
         camera: its optics.
         levels: its staircase.
-        target: where light should go.
+        targets: where light should go.
         problem: what is designed.
     """
 
     spec: Spec
     camera: Camera
     levels: Levels
-    target: AreaTarget
-    problem: AreaProblem
+    targets: tuple[AreaTarget, ...]
+    problem: AreaSet
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "AreaTask":
-        """Prepare the task of a spec that has an area.
+        """Prepare the task of a spec that has areas.
 
         Raises:
             InputError: a sensor without a lens that is too near, or a picture that cannot be drawn.
         """
-        assert spec.area is not None
-        camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
-        if camera.propagation != "far_field":
-            least, got = (format_length(float(f"{d:.3g}")) for d in (camera.far_from_m, camera.distance_m or 0))
-            rule = f"an area without a lens needs a sensor at least {least} away"
-            cure = "Move the sensor, or choose a smaller aperture or window."
-            raise InputError("sensor.distance", rule, got, cure)
-        target = AreaTarget.of(spec.area, camera, input_files(spec).get("area.picture"))
-        return cls(spec, camera, levels, target, AreaProblem.of(target, camera))
+        camera, levels, files = camera_from_spec(spec), levels_from_spec(spec.process), input_files(spec)
+        first = camera.lines[0].wavelength_m
+        targets, problems = [], []
+        for index, area in enumerate(spec.areas):
+            seen, key = camera_for(area, camera), spec.area_key(index)
+            if seen.propagation != "far_field":
+                least, got = (format_length(float(f"{d:.3g}")) for d in (seen.far_from_m, seen.distance_m or 0))
+                rule = f"an area without a lens needs a sensor at least {least} away"
+                cure = "Move the sensor, or choose a smaller aperture or window."
+                where = "sensor.distance" if area.distance_m is None else f"{key}.distance"
+                raise InputError(where, rule, got, cure)
+            own = seen.lines[0].wavelength_m
+            turn = 1.0 if own == first else float(camera.waves_per_metre(own) / camera.waves_per_metre(first))
+            targets.append(AreaTarget.of(area, seen, files.get(f"{key}.picture")))
+            problems.append(AreaProblem.of(targets[-1], seen, turn))
+        one_colour = all(problem.turn == 1 for problem in problems)
+        span = None if one_colour else float(2 * np.pi * camera.waves_per_metre(first) * levels.period_m)
+        return cls(spec, camera, levels, tuple(targets), AreaSet(tuple(problems), span))
 
     def initial_state(self) -> AreaState:
-        """The phase that carries the beam to the area as rays would, or a random one."""
-        assert self.spec.area is not None
-        if self.spec.area.start == "random":
-            shape, rng = self.camera.grid.shape, np.random.default_rng(self.spec.optimize.seed)
-            phase = jnp.asarray(rng.uniform(0, 2 * np.pi, shape), jnp.float32)
-            return self._begun(phase, jnp.ones(shape, jnp.float32), 0)
-        amplitudes, grid = np.asarray(self.problem.amplitudes), self.camera.grid
+        """The phase that carries the beam to the areas as rays would, or a random one.
+
+        Where there are several, every cell has the phase whose light comes nearest to what all of them ask for.
+        """
+        grid = self.camera.grid
+        if self._random:
+            rng = np.random.default_rng(self.spec.optimize.seed)
+            phase = rng.uniform(0, self.problem.span or 2 * np.pi, grid.shape)
+        elif len(self.targets) == 1:
+            phase = self._carrying(0)
+        else:
+            asked = [self._carrying(i) for i in range(len(self.targets))]
+            phase = _nearest_to_all(asked, [p.turn for p in self.problem.problems], self.problem.span or 2 * np.pi)
+        return self._begun(jnp.asarray(phase, jnp.float32), jnp.ones(grid.shape, jnp.float32), 0)
+
+    @property
+    def _random(self) -> bool:
+        return self.spec.areas[0].start == "random"
+
+    def _carrying(self, index: int) -> Float[np.ndarray, "y x"]:
+        """The phase that carries the beam to an area as rays would, of the wavelength that lights it."""
+        area, target, grid = self.spec.areas[index], self.targets[index], self.camera.grid
+        amplitudes = np.asarray(self.problem.problems[index].amplitudes)
         light: Any = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
-        wavelength = self.camera.lines[0].wavelength_m
-        directions = self.target.sines_y / wavelength, self.target.sines_x / wavelength
-        phase = transport_phase(light, (grid.axis_m("y"), grid.axis_m("x")), self.target.value, directions)
+        wavelength = camera_for(area, self.camera).lines[0].wavelength_m
+        directions = target.sines_y / wavelength, target.sines_x / wavelength
+        phase = transport_phase(light, (grid.axis_m("y"), grid.axis_m("x")), target.value, directions)
         # The wave has a phase already, that of the lowest mode and of a sensor out of focus.
-        phase = jnp.asarray(phase - np.angle(amplitudes[0]), jnp.float32)
-        return self._begun(phase, jnp.ones(grid.shape, jnp.float32), 0)
+        return phase - np.angle(amplitudes[0])
 
     def _begun(self, phase: Array, free: Array, step: int) -> AreaState:
         return AreaState(phase, free, lbfgs_memory(phase, _MEMORY), step)
@@ -120,22 +145,22 @@ class AreaTask:
     @property
     def begins(self) -> str:
         """How a design begins, in words."""
-        assert self.spec.area is not None
-        random = self.spec.area.start == "random"
-        return "starting from random phases" if random else "carrying the beam to the area by optimal transport"
+        return "starting from random phases" if self._random else "carrying the beam to the area by optimal transport"
 
     def steps(self, state: AreaState) -> Iterator[tuple[AreaState, dict[str, Any]]]:
         """Do the remaining steps one by one; yields the state, and the line of the history."""
-        names, count = list(AreaLight._fields), self.spec.optimize.steps
-        assert self.spec.area is not None
+        areas, count = self.spec.areas, self.spec.optimize.steps
+        names = [
+            f"{name} {i}" if len(areas) > 1 else name for i, _ in enumerate(areas, 1) for name in AreaLight._fields
+        ]
+        weights = jnp.asarray([area.uniformity for area in areas], jnp.float32)
         while state.step < count:
             step = state.step
             if (share := self.settled(step)) and step % _BLOCK == 0:
                 state = self._settle(state, share)
-            uniformity = jnp.float32(self.spec.area.uniformity)
-            phase, memory, loss, light = _step(self.problem, state.phase, state.free, state.memory, uniformity)
+            phase, memory, loss, light = _step(self.problem, state.phase, state.free, state.memory, weights)
             state = AreaState(phase, state.free, memory, step + 1)
-            terms = [float(part) for part in light]
+            terms = [float(part) for one in light for part in one]
             yield state, {"step": step, "loss": float(loss), "terms": terms, "names": names}
 
     def settled(self, step: int) -> float:
@@ -150,8 +175,12 @@ class AreaTask:
     def _settle(self, state: AreaState, share: float) -> AreaState:
         """Set cells near to a level to it, and forget what L-BFGS knows of the others."""
         phase = np.asarray(state.phase, np.float64)
-        nearest = np.angle(self.staircase.light)[self.level(phase)]
-        away = np.angle(np.exp(1j * (phase - nearest)))
+        if (span := self.problem.span) is None:
+            nearest = np.angle(self.staircase.light)[self.level(phase)]
+            away = np.angle(np.exp(1j * (phase - nearest)))
+        else:
+            nearest = self._rate * self.levels.heights_m()[self.level(phase)]
+            away = np.mod(phase - nearest + span / 2, span) - span / 2
         set_ = np.abs(away) <= share * np.abs(away).max()
         phase = np.where(set_, phase - away, phase)
         free = np.asarray(state.free) * ~set_
@@ -160,12 +189,18 @@ class AreaTask:
     @property
     def staircase(self) -> Staircase:
         """Levels as light of the first wavelength sees them."""
-        rate = self.camera.waves_per_metre(self.camera.lines[0].wavelength_m)
-        return Staircase.of(2 * np.pi * rate * self.levels.heights_m())
+        return Staircase.of(self._rate * self.levels.heights_m())
+
+    @property
+    def _rate(self) -> float:
+        """Radians of phase of the first wavelength per metre of height."""
+        return 2 * np.pi * self.camera.waves_per_metre(self.camera.lines[0].wavelength_m)
 
     def level(self, phase: Float[np.ndarray, "y x"]) -> Any:
-        """Level nearest to every phase."""
-        return self.staircase.level(np.exp(1j * phase))
+        """Level nearest to every phase: in the light of the one colour, or in height where there are several."""
+        if self.problem.span is None:
+            return self.staircase.level(np.exp(1j * phase))
+        return quantise_wrapped(phase / self._rate, self.levels)
 
     def finished(self, state: AreaState, history: list[dict[str, Any]]) -> Design:
         """The design of a state."""
@@ -176,15 +211,26 @@ class AreaTask:
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 
 
+def _nearest_to_all(
+    asked: Sequence[Float[np.ndarray, "y x"]], turns: Sequence[float], span: float
+) -> Float[np.ndarray, "y x"]:
+    """Phases from 0 to a span whose light is nearest to several others, each `turns` times as fast."""
+    best, light = np.zeros(asked[0].shape), np.full(asked[0].shape, -np.inf)
+    for phase in np.arange(0, span, 2 * np.pi / _TRIALS):
+        found = sum(np.cos(turn * phase - wanted) for turn, wanted in zip(turns, asked, strict=True))
+        best, light = np.where(found > light, phase, best), np.maximum(found, light)
+    return best
+
+
 @eqx.filter_jit
 def _step(
-    problem: AreaProblem, phase: Array, free: Array, memory: Any, uniformity: Array
-) -> tuple[Array, Any, Array, AreaLight]:
+    problem: AreaSet, phase: Array, free: Array, memory: Any, weights: Array
+) -> tuple[Array, Any, Array, tuple[AreaLight, ...]]:
     """One step of L-BFGS over the free cells: phase and memory; the loss before it and its parts."""
     start = phase
 
     def loss_of(moved: Array) -> Array:
-        return problem.loss(jnp.where(free > 0, moved, start), uniformity)
+        return problem.loss(jnp.where(free > 0, moved, start), weights)
 
     moved, memory, value = lbfgs_step(loss_of, phase, memory, _MEMORY)
     return moved, memory, value, problem.judge(phase)

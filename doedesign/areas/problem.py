@@ -1,7 +1,8 @@
 """Light of a phase on the lattice of an area: two matrix products, exact for square cells, and its gradient.
 
 All that lies off the lattice is left free. What is asked of a design is its merit: the share of light on the area, less
-so many times its contrast, to which a border in the wrong place is added.
+so many times its contrast, to which a border in the wrong place is added. Of several areas, each in a colour and a
+plane of its own, the worst counts most.
 """
 
 from typing import NamedTuple
@@ -18,6 +19,8 @@ from sim.optic import CellOptic, HeightOptic
 
 # By how much light on the edges of an area may differ from what is wanted without harm, over that inside.
 _LEEWAY = 0.1
+# How much more a worse area counts: by e where its merit is less by one over this.
+_SHARPNESS = 12.0
 
 
 class AreaLight(NamedTuple):
@@ -89,24 +92,26 @@ class AreaProblem(eqx.Module):
         along_y: `[v, y]` factors of the rows, exp(-2 pi i u y) with the cell's sinc, for the rows of the lattice.
         along_x: `[u, x]` the same of the columns.
         score: how the light on the lattice is judged.
+        turn: phase of its wavelength over that of the first, for the same height.
     """
 
     amplitudes: Complex[Array, "mode y x"]
     along_y: Complex[Array, "v y"]
     along_x: Complex[Array, "u x"]
     score: AreaScore
+    turn: float = eqx.field(static=True, default=1.0)
 
     @classmethod
-    def of(cls, target: AreaTarget, camera: Camera) -> "AreaProblem":
-        """The problem of a target for the first wavelength of a camera."""
+    def of(cls, target: AreaTarget, camera: Camera, turn: float = 1.0) -> "AreaProblem":
+        """The problem of a target for the first wavelength of a camera; for `turn` see above."""
         rows, columns = lattice_factors(target, camera)
         bare = mode_fields(HeightOptic.of(camera))
         fields, along_y, along_x = (jnp.asarray(part, jnp.complex64) for part in (bare, rows, columns))
-        return cls(fields, along_y, along_x, AreaScore.of(target))
+        return cls(fields, along_y, along_x, AreaScore.of(target), turn)
 
     def light(self, phase: Float[Array, "y x"]) -> Float[Array, "v u"]:
-        """Share of the incident light on every sample of the lattice."""
-        wave = jnp.exp(1j * phase)
+        """Share of the incident light on every sample of the lattice; `phase` is that of the first wavelength."""
+        wave = jnp.exp(1j * phase if self.turn == 1 else 1j * self.turn * phase)
 
         def of_mode(amplitude: Array) -> Array:
             field = self.along_y @ (amplitude * wave) @ self.along_x.T
@@ -124,11 +129,40 @@ class AreaProblem(eqx.Module):
         return 1.0 - light.efficiency + uniformity * jnp.sqrt(light.contrast**2 + light.misplaced**2)
 
 
-def mode_fields(doe: CellOptic) -> Complex[np.ndarray, "mode y x"]:
-    """Field behind a DOE for the first wavelength, by mode of the beam; its squares sum to the light that passes."""
+class AreaSet(eqx.Module):
+    """A DOE to be designed for one area or several.
+
+    Attributes:
+        problems: those of its areas.
+        span: phase of the first wavelength over the whole height of the staircase, radians, after which heights begin
+            again; None where all areas have the first colour, whose phase repeats after 2 pi.
+    """
+
+    problems: tuple[AreaProblem, ...]
+    span: float | None = eqx.field(static=True, default=None)
+
+    def judge(self, phase: Float[Array, "y x"]) -> tuple[AreaLight, ...]:
+        """Efficiency, contrast and misplaced light of every area."""
+        return tuple(problem.judge(self._within(phase)) for problem in self.problems)
+
+    def loss(self, phase: Float[Array, "y x"], weights: Float[Array, " area"]) -> Float[Array, ""]:
+        """One less the merit, for the `uniformity` of every area; of several areas a smooth maximum."""
+        phase = self._within(phase)
+        losses = [problem.loss(phase, weight) for problem, weight in zip(self.problems, weights, strict=True)]
+        if len(losses) == 1:
+            return losses[0]
+        return jax.scipy.special.logsumexp(_SHARPNESS * jnp.stack(losses), b=1 / len(losses)) / _SHARPNESS
+
+    def _within(self, phase: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        return phase if self.span is None else jnp.mod(phase, self.span)
+
+
+def mode_fields(doe: CellOptic, colour: int = 0) -> Complex[np.ndarray, "mode y x"]:
+    """Field behind a DOE for a colour's first wavelength, by mode of the beam; its squares sum to what passes."""
     camera = doe.camera
     power = camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
-    modes = zip(camera.shares, camera.lines, strict=False)  # those of the first wavelength come first
+    lines = [line for line in camera.lines if line.colour == colour]
+    modes = zip(camera.shares, lines, strict=False)  # those of the first wavelength come first
     return np.stack([np.float32(np.sqrt(share * power)) * np.asarray(doe.field(line)) for share, line in modes])
 
 

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
-from doedesign.areas.target import FLAT, OUTER, AreaTarget
+from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, in_plane
 from doedesign.design.design import Design
 from doedesign.spec import input_files
+from fab.units import format_length
 from sim.camera import Camera
 from sim.metrics import zeroth_order
 from sim.optic import CellOptic
@@ -118,6 +119,11 @@ class AreaTable:
         """Name of its files and of its entry among metrics."""
         return "area"
 
+    @property
+    def place(self) -> str:
+        """The colour that lights it, and how far away it lies."""
+        return f"{self.camera.colours[0].name}, {format_length(float(f'{self.camera.sensor_distance_m:.4g}'))}"
+
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
         profiles = (("x", self.along_x), ("y", self.along_y))
@@ -172,23 +178,79 @@ class AreaTable:
         return plot_area(self, ax)
 
 
-def area_of_design(design: Design, doe: CellOptic) -> AreaTable:
-    """Light on the area of a design's spec, of the design as drawn or as fabricated."""
-    assert design.spec is not None
-    assert design.spec.area is not None
-    key = "area.picture"
-    picture = input_files(design.spec, key)[key] if design.spec.area.picture else None
-    return area_table(doe, AreaTarget.of(design.spec.area, design.camera, picture, _SAMPLES))
+@dataclass(frozen=True)
+class AreaTables:
+    """Light on the areas of a design that has several.
+
+    Attributes:
+        tables: one for each area, its camera with the one colour that lights it and with its sensor in its plane.
+    """
+
+    tables: tuple[AreaTable, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of its files and of its entry among metrics."""
+        return "area"
+
+    def summary(self) -> list[dict[str, Any]]:
+        """All numbers of every area, for metrics."""
+        return [
+            {"colour": one.camera.colours[0].name, "distance_m": one.camera.sensor_distance_m, **one.summary()}
+            for one in self.tables
+        ]
+
+    def measures(self) -> dict[str, float]:
+        """Numbers that a tolerance study follows: those of the worst area."""
+        every = [one.measures() for one in self.tables]
+        return {
+            "on_target": min(one["on_target"] for one in every),
+            "contrast": max(one["contrast"] for one in every),
+        }
+
+    def describe(self) -> str:
+        """A line for every area."""
+        return "\n".join(f"{one.place}: {one.describe()}" for one in self.tables)
+
+    def to_csv(self) -> str:
+        """The profiles of `AreaTable.to_csv`, each after the number of its area, from 1."""
+        head, lines = "", []
+        for number, one in enumerate(self.tables, 1):
+            head, *rows = one.to_csv().splitlines()
+            lines += [f"{number},{row}" for row in rows]
+        return "\n".join([f"area,{head}", *lines]) + "\n"
+
+    def plot(self, ax: "Axes | None" = None) -> "FigureBase":
+        """Draw the light of every area and its profiles; on `ax`, or on a new figure."""
+        from doedesign.report.areas import plot_areas
+
+        return plot_areas(self.tables, ax)
 
 
-def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
-    """Look at the area of a DOE, in the light of its first wavelength.
+def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
+    """Light on each of the areas of a design's spec, of the design as drawn or as fabricated."""
+    spec, tables = design.spec, []
+    assert spec is not None
+    for index, area in enumerate(spec.areas):
+        key = f"{spec.area_key(index)}.picture"
+        picture = input_files(spec, key)[key] if area.picture else None
+        target = AreaTarget.of(area, camera_for(area, design.camera), picture, _SAMPLES)
+        seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
+        number = 0 if area.colour is None else [colour.name for colour in doe.camera.colours].index(area.colour)
+        tables.append(area_table(seen, target, number))
+    return tuple(tables)
+
+
+def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable:
+    """Look at the area of a DOE, in the light of a colour's first wavelength.
 
     Args:
         doe: the DOE: as drawn, as fabricated, with or without the light of its walls.
         target: the area, on a lattice as fine as its light is to be seen.
+        colour: number of the colour.
     """
-    light, camera, score = light_on(doe, target), doe.camera, AreaScore.of(target)
+    camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
+    light, score = light_on(doe, target, colour), AreaScore.of(target)
     shares = jnp.asarray(light, jnp.float32)
     over, judged = light / max(float(score.inside(shares)), 1e-30), score.judge(shares)
     picture = target.shape == "picture"
@@ -199,7 +261,7 @@ def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
         float(judged.efficiency),
         float(judged.contrast),
         None if picture else _on_pixels(over, target, camera),
-        float(zeroth_order(doe)[0]),
+        float(zeroth_order(doe)[doe.wavelengths_m.index(camera.lines[0].wavelength_m)]),
         float(over[~target.lit].max(initial=0.0)),
         camera.transmission(camera.lines[0].wavelength_m),
         None if picture else _profile(over, target, camera, 1),
@@ -207,11 +269,12 @@ def area_table(doe: CellOptic, target: AreaTarget) -> AreaTable:
     )
 
 
-def light_on(doe: CellOptic, target: AreaTarget) -> Float[np.ndarray, "v u"]:
-    """Share of the incident light of the first wavelength on every sample of a lattice, Fresnel loss left out."""
-    rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, doe.camera))
+def light_on(doe: CellOptic, target: AreaTarget, colour: int = 0) -> Float[np.ndarray, "v u"]:
+    """Share of the incident light of a colour's first wavelength on each sample of a lattice, Fresnel loss left out."""
+    camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
+    rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, camera))
     light = np.zeros(target.value.shape)
-    for mode in mode_fields(doe):
+    for mode in mode_fields(doe, colour):
         field = rows @ mode @ columns.T
         light += field.real**2 + field.imag**2
     return light

@@ -1,6 +1,6 @@
 """An area to be lit, on a lattice of directions that is fine enough for all that light can draw."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +22,24 @@ OUTER, FLAT = 0.135, 0.9  # of the value inside: where an area begins, and where
 # The logistic function falls from 90 to 13.5 % over so many times its scale.
 _FALL = np.log(FLAT / (1 - FLAT)) + np.log((1 - OUTER) / OUTER)
 _MOST = 4096  # samples per axis
+_LEAST = 1.5  # edges: a rectangle so wide has 90 % of its value in the middle
 _STRAIGHT, _PLACES = 0.3, 13  # share of a side, on either side of its middle, that should be straight; places on it
 _TAPER = 3.0  # samples
+
+
+def camera_for(table: AreaSpec, camera: Camera) -> Camera:
+    """The camera whose first and only colour lights an area, with its sensor where the area lies."""
+    number = 0 if table.colour is None else [colour.name for colour in camera.colours].index(table.colour)
+    return replace(in_plane(table, camera), colours=(camera.colours[number],))
+
+
+def in_plane(table: AreaSpec, camera: Camera) -> Camera:
+    """A camera with its sensor where an area lies."""
+    if table.distance_m is None:
+        return camera
+    if camera.distance_m is not None:
+        return replace(camera, distance_m=table.distance_m)
+    return replace(camera, defocus_m=table.distance_m - camera.focal_length_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +90,7 @@ class AreaTarget:
 
         Raises:
             InputError: a picture that cannot be read, is dark, or reaches beyond what cells can light, or an area with
-                too much detail.
+                too much detail or too small to have a flat part.
         """
         light = None if picture is None else _picture_light(picture)
         size_m = table.size_m if light is None else (table.size_m[1] * light.shape[0] / light.shape[1], table.size_m[1])
@@ -103,7 +119,12 @@ class AreaTarget:
         sines = camera.sines_of(*(_border(table) + middle).T)
         rows, columns = (_between(axis, at) for axis, at in zip(axes, sines, strict=True))
         sines_y, sines_x = axes
-        return cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns))
+        target = cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns))
+        if not target.flat.any():
+            least, got = (format_length(float(f"{size:.3g}")) for size in (_LEAST * edge, min(filter(None, size_m))))
+            rule = f"light falls over {format_length(float(f'{edge:.3g}'))} there, so that an area needs {least}"
+            raise InputError("area", rule, got, "Choose a larger area, a larger aperture, or a nearer sensor.")
+        return target
 
 
 def finest_detail_m(camera: Camera) -> float:

@@ -1,5 +1,6 @@
 """The picture of an area of light: a map of it, and profiles through its middle."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,35 +18,56 @@ _SIDE = 3.4  # inches of the map
 _TOP = 1.4  # end of the colour scale: speckle is a few times brighter
 
 
+_NOTE = "Shares of the incident light; {:.1f} % that faces reflect are left out. Contrast: root mean square where 90 % "
+_NOTE += "of the light is wanted."
+
+
+def plot_areas(tables: "Sequence[AreaTable]", ax: "Axes | None" = None) -> "FigureBase":
+    """Draw several areas below each other, as `plot_area` does each, over the colour and the place of each."""
+    note = _NOTE.format(100 * (1 - tables[0].fresnel))
+    with panels(ax, (8.6, 4.1 * len(tables)), note=note) as figure:
+        parts = figure.subfigures(len(tables), 1, squeeze=False)
+        for table, part in zip(tables, parts[:, 0], strict=True):
+            part.suptitle(f"{table.place}: {_title(table)}", x=0.01, ha="left", parse_math=False)
+            _draw(table, part)
+    return figure
+
+
 def plot_area(table: "AreaTable", ax: "Axes | None" = None) -> "FigureBase":
     """Draw the light of an area over that of its flat part, and its profiles beside the wanted ones."""
-    target, camera = table.target, table.camera
+    note = f"{_NOTE.format(100 * (1 - table.fresnel))} 0th order {100 * table.zeroth_order:.2g} %."
+    with panels(ax, (5.2 if table.along_x is None else 8.6, 4.2), _title(table), note) as figure:
+        _draw(table, figure)
+    return figure
+
+
+def _title(table: "AreaTable") -> str:
+    """Efficiency and contrast of an area."""
     title = f"{100 * table.efficiency:.1f} % of the light, contrast {100 * table.contrast:.2g} %"
     if table.pixel_contrast is not None:
-        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {camera.pixel_m / UM:.3g} µm)"
-    note = (
-        f"Shares of the incident light; {100 * (1 - table.fresnel):.1f} % that faces reflect are left out. Contrast: "
-        f"root mean square where 90 % of the light is wanted. 0th order {100 * table.zeroth_order:.2g} %."
-    )
+        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {table.camera.pixel_m / UM:.3g} µm)"
+    return title
+
+
+def _draw(table: "AreaTable", figure: "FigureBase") -> None:
+    """Draw an area and its profiles side by side."""
+    target, camera = table.target, table.camera
+    profiles = [(name, p) for name, p in (("x", table.along_x), ("y", table.along_y)) if p is not None]
     y, _ = camera.image_m(target.sines_y, 0.0)
     _, x = camera.image_m(0.0, target.sines_x)
     box = [x[0] / UM, x[-1] / UM, y[0] / UM, y[-1] / UM]
-    profiles = [(name, p) for name, p in (("x", table.along_x), ("y", table.along_y)) if p is not None]
-    with panels(ax, (8.6 if profiles else 5.2, 4.2), title, note) as figure:
-        panes = np.atleast_1d(figure.subplots(1, 2 if profiles else 1, width_ratios=(1.0, 1.15)[: 1 + bool(profiles)]))
-        image = shrunk(table.light.astype(np.float32), round(_SIDE * DPI))
-        shown = panes[0].imshow(image, origin="lower", extent=box, vmin=0, vmax=_TOP, cmap=LIGHT)
-        panes[0].set(xlabel="x (µm)", ylabel="y (µm)")
-        panes[0].locator_params(nbins=5)
-        figure.colorbar(shown, ax=panes[0], label="light over that inside", shrink=0.8, extend="max")
-        for (name, profile), colour in zip(profiles, (LINE, MARK), strict=False):
-            size, place = profile.size_m, profile.place_m / UM
-            label = f"along {name}" + ("" if size is None else f": {size / UM:.5g} µm")
-            panes[1].plot(place, profile.light, color=colour, lw=1, label=label)
-            panes[1].plot(place, profile.wanted, color=colour, lw=0.8, ls=":")
-        if profiles:
-            panes[1].set(
-                xlabel="from the middle (µm)", ylim=(0, max(1.3, 1.05 * max(p.light.max() for _, p in profiles)))
-            )
-            panes[1].legend(loc="upper right", title="size at half the light; dots: wanted")
-    return figure
+    panes = np.atleast_1d(figure.subplots(1, 2 if profiles else 1, width_ratios=(1.0, 1.15)[: 1 + bool(profiles)]))
+    image = shrunk(table.light.astype(np.float32), round(_SIDE * DPI))
+    shown = panes[0].imshow(image, origin="lower", extent=box, vmin=0, vmax=_TOP, cmap=LIGHT)
+    panes[0].set(xlabel="x (µm)", ylabel="y (µm)")
+    panes[0].locator_params(nbins=5)
+    figure.colorbar(shown, ax=panes[0], label="light over that inside", shrink=0.8, extend="max")
+    for (name, profile), colour in zip(profiles, (LINE, MARK), strict=False):
+        size, place = profile.size_m, profile.place_m / UM
+        label = f"along {name}" + ("" if size is None else f": {size / UM:.5g} µm")
+        panes[1].plot(place, profile.light, color=colour, lw=1, label=label)
+        panes[1].plot(place, profile.wanted, color=colour, lw=0.8, ls=":")
+    if profiles:
+        top = max(1.3, 1.05 * max(p.light.max() for _, p in profiles))
+        panes[1].set(xlabel="from the middle (µm)", ylim=(0, top))
+        panes[1].legend(loc="upper right", title="size at half the light; dots: wanted")

@@ -26,7 +26,7 @@ from sim.surface import as_fabricated
 from sim.surface.leakage import SplitPsf, split_psf
 
 if TYPE_CHECKING:
-    from doedesign.areas.shape import AreaTable
+    from doedesign.areas.shape import AreaTable, AreaTables
     from doedesign.focus.depth import FocusTable
     from doedesign.spots.orders import OrderTable
 
@@ -55,7 +55,7 @@ class FabricatedPsfs(NamedTuple):
     splits: dict[tuple[int, int], SplitPsf]
     rows: dict[str, list[dict[str, Any]]]
     variation: Variation
-    aimed: "dict[str, OrderTable | AreaTable | FocusTable]"
+    aimed: "dict[str, OrderTable | AreaTable | AreaTables | FocusTable]"
 
 
 def fabricated(

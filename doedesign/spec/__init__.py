@@ -198,14 +198,15 @@ def input_files(spec: Spec, only: str | None = None) -> dict[str, Path]:
 
 def _pictures(spec: Spec) -> dict[str, str]:
     """Pictures that more than the optimisation looks at, by dotted key."""
-    tables = {"area": spec.area, "illumination": spec.illumination}
+    tables = {spec.area_key(i): area for i, area in enumerate(spec.areas)} | {"illumination": spec.illumination}
     return {f"{name}.picture": table.picture for name, table in tables.items() if table and table.picture}
 
 
 def kept_pictures(spec: Spec) -> dict[str, str]:
     """Names under which a run keeps its own copies of pictures, by dotted key, so that it needs nothing else."""
     names = _pictures(spec).items()
-    return {key: f"{key.replace('.', '_')}{Path(name).suffix.lower()}" for key, name in names}
+    plain = str.maketrans({"[": "_", "]": "", ".": "_"})
+    return {key: f"{key.translate(plain)}{Path(name).suffix.lower()}" for key, name in names}
 
 
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:

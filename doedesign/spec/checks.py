@@ -287,7 +287,8 @@ def _level_warning(spec: Spec) -> Iterator[str]:
     height_m = process.levels * process.level_step_m
     wave_m = full_wave_height_m(material, spec.optics.design_wavelength_m)
     waves = height_m / wave_m
-    if abs(waves - 1) <= _WAVE_TOLERANCE:
+    whole = max(1, round(waves))  # a relief of several waves parts colours
+    if abs(waves / whole - 1) <= _WAVE_TOLERANCE:
         return
     try:
         exact = f"of {material} is one wave at {full_wave_wavelength_m(material, height_m) / NM:.0f} nm"
@@ -296,8 +297,8 @@ def _level_warning(spec: Spec) -> Iterator[str]:
     yield (
         f"process.level_step: {process.levels} x {format_length(process.level_step_m)} = {_rounded(height_m)} {exact}; "
         f"at the design wavelength of {format_length(spec.optics.design_wavelength_m)} it is "
-        f"{waves:.4f} waves, {100 * (waves - 1):+.1f} % off, so the top of the staircase does not meet its foot. "
-        f'A level_step of "{wave_m / process.levels / NM:.2f} nm" would.'
+        f"{waves:.4f} waves, {100 * (waves / whole - 1):+.1f} % off, so the top of the staircase does not meet its "
+        f'foot. A level_step of "{whole * wave_m / process.levels / NM:.2f} nm" would.'
     )
 
 

@@ -116,8 +116,11 @@ def _mistake(details: ErrorDetails, raw: Mapping[str, Any], root: type[SpecTable
 def key_as_written(key: str, raw: Mapping[str, Any]) -> str:
     """Return a dotted key of the full form ("optics.colours[1].wavelengths") as the file has it.
 
-    A colour may have been made from `optics.wavelengths`, a sigma from `process.errors.overlay_x = "1 um"`.
+    A colour may have been made from `optics.wavelengths`, a sigma from `process.errors.overlay_x = "1 um"`, and the
+    only area is no array.
     """
+    if isinstance(raw.get("area"), Mapping):
+        key = key.replace("area[0]", "area", 1) if key.startswith("area[0]") else key
     optics = raw.get("optics")
     if isinstance(optics, Mapping) and "colours" not in optics:
         key = _COLOURS_KEY.sub(r"optics.wavelengths\1", key)

@@ -6,10 +6,19 @@ compared, hashed and stored by value. Rules between two tables are in `checks`; 
 
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
@@ -226,8 +235,9 @@ class ObjectiveSpec(SpecTable, frozen=True):
 class Spec(SpecTable, frozen=True):
     """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-    `objectives` are the terms of the loss, unless `spots`, an `area` or a `focus` say where light should go, and
-    `limits` the conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML.
+    `objectives` are the terms of the loss, unless `spots`, `areas` or a `focus` say where light should go, and
+    `limits` the conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML. One area is `[area]`, several are
+    `[[area]]`.
     """
 
     name: SpecName = Field(examples=['"automotive"'])
@@ -241,7 +251,7 @@ class Spec(SpecTable, frozen=True):
     optimize: OptimizeSpec = OptimizeSpec()
     objectives: tuple[ObjectiveSpec, ...] = ()
     spots: SpotsSpec | None = optional()
-    area: AreaSpec | None = optional()
+    areas: tuple[AreaSpec, ...] = optional(())
     focus: FocusSpec | None = optional()
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
@@ -250,10 +260,32 @@ class Spec(SpecTable, frozen=True):
     train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_area(cls, table: Any, info: ValidationInfo) -> Any:
+        """Take one table for an array of one, in TOML and in JSON."""
+        if not isinstance(table, Mapping) or "area" not in table:
+            return table
+        areas = [table["area"]] if isinstance(table["area"], Mapping) else table["area"]
+        rest = {key: value for key, value in table.items() if key != "area"}
+        return rest | {"area" if info.context == FROM_TOML else "areas": areas}
+
+    @model_serializer(mode="wrap")
+    def _one_area_again(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write what `_one_area` reads, so that the digests of specs with one area stay."""
+        table = dump(self)
+        if areas := table.pop("areas", None):
+            table["area"] = areas[0] if len(areas) == 1 else areas
+        return table
+
     @property
     def aims(self) -> bool:
         """Whether a table of its own says where light should go."""
-        return any(table is not None for table in (self.spots, self.area, self.focus))
+        return bool(self.areas) or self.spots is not None or self.focus is not None
+
+    def area_key(self, index: int) -> str:
+        """Key of one of the areas in TOML."""
+        return "area" if len(self.areas) == 1 else f"area[{index}]"
 
     @property
     def image_distance_m(self) -> float:

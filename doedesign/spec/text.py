@@ -47,7 +47,8 @@ def variation_to_toml(variation: Variation, comments: Sequence[str] = ()) -> str
 
 def _table_lines(table: SpecTable, path: str) -> list[str]:
     values, tables = [], []
-    for name, value in table.given().items():
+    for name, given in table.given().items():
+        value = given[0] if name == "areas" and len(given) == 1 else given  # the only one is no array
         key = toml_key(name)
         inner = f"{path}.{key}".removeprefix(".")
         if isinstance(value, SpecTable) and not value.inline:

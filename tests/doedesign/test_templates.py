@@ -20,6 +20,7 @@ from tests.pictures import leave_out_pictures
 SMALL = {
     "axicon": ["doe.samples=200", "doe.aperture=0.4 mm", "sensor.distance=12 mm"],
     "bifocal": ["doe.samples=160", "doe.aperture=0.32 mm", 'focus.distances=["4 mm", "8 mm"]', "optimize.steps=60"],
+    "colours": ["doe.samples=128", "doe.pitch=4 um", "optimize.steps=40"],
     "diffuser": ["doe.samples=128", "doe.aperture=0.256 mm", "optimize.steps=40"],
     "edof": ["doe.samples=100", "doe.aperture=0.3 mm", 'focus.distances=["5 mm", "20 mm"]', "optimize.steps=40"],
     "fan_out": ["doe.samples=96", "doe.aperture=0.192 mm", "spots.count=[3, 3]", "spots.period=48 um"],
@@ -32,7 +33,13 @@ SMALL = {
 }
 SMALL["edof"] += ['focus.widths=["16 um", "66 um"]']
 SMALL["see_through"] += ["sensor.window=48", "optimize.steps=3"]
-LEAST = {"diffuser": 0.7, "fan_out": 0.8, "splitter": 0.75, "top_hat": 0.9}  # of the light where it should go
+LEAST = {
+    "colours": 0.25,
+    "diffuser": 0.7,
+    "fan_out": 0.8,
+    "splitter": 0.75,
+    "top_hat": 0.9,
+}  # of the light where it should go
 
 
 def test_all_are_here() -> None:

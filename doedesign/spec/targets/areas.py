@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from doedesign.spec.targets.beside import beside_problems
-from doedesign.spec.values import NotNegative, length
+from doedesign.spec.values import ColourName, NotNegative, length, nearest
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
 from fab.units import UM, format_length
@@ -21,7 +21,7 @@ Shape = Literal["rectangle", "ellipse", "ring", "line", "picture"]
 
 
 class AreaSpec(SpecTable, frozen=True):
-    """An area to be lit, instead of objectives. Its phase is free.
+    """An area to be lit, instead of objectives. Its phase is free. There may be several, as [[area]].
 
     Attributes:
         shape: "rectangle" and "ellipse" (`width` and `height`), "ring" (`width`, `inner`), "line" (`width` along x, or
@@ -38,6 +38,9 @@ class AreaSpec(SpecTable, frozen=True):
             its contrast, standard deviation over mean, is made as large as it can be. 0 is for light alone.
         start: "transport" carries the beam to the area as rays would: without speckle, for the beam that is described
             and where it is aimed at the DOE. "random" mixes the light of all its parts: with speckle, for any beam.
+            Areas in several planes keep their shapes better from "random".
+        colour: the colour channel that should light it, by name; the first if left out.
+        distance_m: where it lies, from the lens, or from the DOE without one; on the sensor if left out.
     """
 
     shape: Shape = Field(examples=['"rectangle"'])
@@ -50,6 +53,8 @@ class AreaSpec(SpecTable, frozen=True):
     dark_m: Annotated[float, length(0.0, 1.0)] = optional(0.0)
     uniformity: NotNegative = optional(1.0)
     start: Literal["transport", "random"] = optional("transport")
+    colour: ColourName | None = optional()
+    distance_m: Annotated[float, length(10 * UM, 100.0)] | None = optional()
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -73,39 +78,54 @@ _ROOM = 1.15  # how much farther than its area light is looked at
 
 
 def area_problems(spec: "Spec") -> Iterator[InputError]:
-    """Return every rule that the area of a spec breaks."""
-    area: Any = spec.area
-    if area is None:
+    """Return every rule that the areas of a spec break."""
+    if not spec.areas:
         return
+    if spec.spots is not None:
+        yield InputError("area", "takes the place of spots", "both", "Remove [area] or [spots].")
+    yield from beside_problems(spec, "area")
+    for index, area in enumerate(spec.areas):
+        yield from _problems(spec, area, spec.area_key(index))
+    starts = {area.start for area in spec.areas}
+    if len(starts) > 1:
+        yield InputError("area[0].start", "all areas have one start", "several", "Write the same in each.")
+
+
+def _problems(spec: "Spec", area: Any, key: str) -> Iterator[InputError]:
+    """Rules that one area breaks."""
     needed, allowed = _KEYS[area.shape]
     complete = True
     for name in needed:
         if getattr(area, name) is None:
             complete = False
             cure = f"Add `{toml_key(name)}`, or choose another shape."
-            yield InputError(f"area.{toml_key(name)}", f'shape "{area.shape}" needs it', "nothing", cure)
+            yield InputError(f"{key}.{toml_key(name)}", f'shape "{area.shape}" needs it', "nothing", cure)
     for name in _SHAPING:
         if getattr(area, name) is not None and name not in (*needed, *allowed):
             rule = f'shape "{area.shape}" takes: {", ".join(map(toml_key, (*needed, *allowed)))}'
-            yield InputError(f"area.{toml_key(name)}", rule, toml_key(name), "Remove it.")
+            yield InputError(f"{key}.{toml_key(name)}", rule, toml_key(name), "Remove it.")
     if area.shape == "line" and (area.width_m is None) == (area.height_m is None):
         complete = False
-        yield InputError("area", "a line has a width or a height", "both or none", "Give one of them.")
+        yield InputError(key, "a line has a width or a height", "both or none", "Give one of them.")
     if area.shape == "ring" and complete and area.inner_m >= area.width_m:
         rule = f"must be smaller than the width, {format_length(area.width_m)}"
-        yield InputError("area.inner", rule, format_length(area.inner_m), "Choose a smaller one.")
-    if spec.spots is not None:
-        yield InputError("area", "takes the place of spots", "both", "Remove [area] or [spots].")
-    yield from beside_problems(spec, "area")
-    if complete:
-        yield from _reach(spec)
+        yield InputError(f"{key}.inner", rule, format_length(area.inner_m), "Choose a smaller one.")
+    colours = {colour.name: colour.wavelengths_m[0] for colour in spec.optics.colours}
+    if area.colour is not None and area.colour not in colours:
+        rule, cure = "must be a colour channel of the spec", nearest(area.colour, colours)
+        yield InputError(f"{key}.colour", rule, f'"{area.colour}"', cure)
+    elif complete:
+        first = spec.optics.colours[0].name
+        yield from _reach(spec, area, key, colours[area.colour or first])
+    focal = spec.optics.focal_length_m
+    if area.distance_m is not None and focal is not None and area.distance_m <= focal / 2:
+        rule = f"must be beyond half the focal length, {format_length(focal)}"
+        yield InputError(f"{key}.distance", rule, format_length(area.distance_m), "Choose a larger one.")
 
 
-def _reach(spec: "Spec") -> Iterator[InputError]:
-    """The rule that the DOE's cells can send light to every corner of the area."""
-    area: Any = spec.area
-    optics, pitch = spec.optics, spec.doe.pitch_m
-    wavelength, distance = optics.colours[0].wavelengths_m[0], spec.image_distance_m
+def _reach(spec: "Spec", area: Any, key: str, wavelength: float) -> Iterator[InputError]:
+    """The rule that the DOE's cells can send light to every corner of an area."""
+    optics, pitch, distance = spec.optics, spec.doe.pitch_m, area.distance_m or spec.image_distance_m
     most = wavelength / (2 * pitch)
     half = [size / 2 + area.dark_m for size in area.size_m]
     y, x = (abs(at) + reach for at, reach in zip(area.offset_m[::-1], half, strict=True))
@@ -114,4 +134,4 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         rule = f"cells of {format_length(pitch)} light places up to {most * distance / _ROOM / UM:.4g} um from the axis"
         finer = format_length(float(f"{wavelength / (2 * sine * _ROOM):.4g}"))
         cure = f"Choose a smaller area, or a pitch of at most {finer}."
-        yield InputError("area", rule, f"{max(y, x) / UM:.4g} um", cure)
+        yield InputError(key, rule, f"{max(y, x) / UM:.4g} um", cure)

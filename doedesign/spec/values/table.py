@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 # Arrays of tables: one entry is one [[objective]].
 _SINGULAR = {"objectives": "objective", "limits": "limit", "particles": "particle", "pinholes": "pinhole"}
+_SINGULAR |= {"areas": "area"}
 # Of quantities for both axes, which may be one number for both.
 _SINGULAR |= {"diameters_m": "diameter", "angles_rad": "angle"}
 
