@@ -11,7 +11,6 @@ from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,7 +22,7 @@ from sim.metrics import METRICS, MetricInputs, encircled_energy, near_and_far, p
 from sim.optic import ON_AXIS, CellOptic, Optic, Propagation
 from sim.propagation.farfield import FarField
 from sim.rigorous.edge_optic import optic_as_drawn
-from sim.tracing import in_jit, is_traced, on_host, stacked
+from sim.tracing import compiled_quickly, in_jit, is_traced, on_host, stacked
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -318,5 +317,4 @@ def _compiled_quickly() -> Callable[..., Array]:
     On a CPU the work is in transforms and products that come compiled: at the lowest level of optimisation the rest is
     as fast, to the same bits, and compiles in two thirds of the time.
     """
-    options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else {}
-    return eqx.filter_jit(_energy, compiler_options=options)  # pyright: ignore[reportCallIssue]
+    return eqx.filter_jit(_energy, compiler_options=compiled_quickly())  # pyright: ignore[reportCallIssue]

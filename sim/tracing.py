@@ -1,5 +1,6 @@
 """Arrays that may be traced by jax: sums run in double precision on the host, and in single precision under a trace."""
 
+import os
 from typing import Any
 
 import jax
@@ -36,3 +37,10 @@ def total(array: Any) -> Any:
 def stacked(arrays: list[Any], axis: int = 0) -> Any:
     """`stack` of arrays or numbers that may be traced."""
     return (jnp if is_traced(arrays) else np).stack(arrays, axis)
+
+
+def compiled_quickly() -> dict[str, Any]:
+    """Options of `jax.jit` that compile at XLA's lowest optimising level on a CPU; a level in XLA_FLAGS stays."""
+    level = "xla_backend_optimization_level"
+    chosen = jax.default_backend() != "cpu" or level in os.environ.get("XLA_FLAGS", "")
+    return {} if chosen else {level: 1}

@@ -19,6 +19,7 @@ import hypothesis
 import numpy as np
 import pytest
 from jaxtyping import install_import_hook
+from threadpoolctl import threadpool_limits
 
 ROOT = Path(__file__).parent.parent
 WITH_ARRAYS = [path for path in (ROOT / "doedesign").rglob("*.py") if "jaxtyping" in path.read_text("utf-8")]
@@ -28,6 +29,10 @@ WITH_ARRAYS = [path for path in (ROOT / "doedesign").rglob("*.py") if "jaxtyping
 for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(number) == signal.SIG_IGN:
         signal.signal(number, usual)
+
+# Every core has tests to run: threads that share a small product would only wait for each other, here and in children.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+threadpool_limits(1)
 
 # Programs are compiled once for all processes of a session: those of xdist, which find the name here, and those that
 # tests start. It must be said before anything imports jax.
@@ -62,8 +67,9 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_configure(config: pytest.Config) -> None:
     """Compile without optimisation where most programs run once; the long tests run the code that users run."""
     if config.option.markexpr != "slow":
-        quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
+        flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
+        flags += ["--xla_llvm_disable_expensive_passes=true", "--xla_cpu_use_fusion_emitters=false"]
+        os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 
 # Above this, a test process forgets the programs it compiled when a module of tests is done; jax itself never does.

@@ -15,7 +15,7 @@ from sim.surface.lines import LINE_DEGREES, line_moments
 from sim.surface.opening import Opening, through_opening
 from sim.surface.pieces import PRECISION, TILE, light_of, mask_states, own_states, summed
 from sim.surface.relief import EtchParameters, TilePlan, effective_bias
-from sim.tracing import in_jit, is_traced
+from sim.tracing import compiled_quickly, in_jit, is_traced
 
 
 def transmission_of(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
@@ -98,8 +98,7 @@ _compiled = jax.jit(_transmission, static_argnames=("plan",))
 @lru_cache(maxsize=1)
 def _compiled_quickly() -> Callable[..., Any]:
     """The same to the last bit but one, which a trace cannot hold: as fast, and compiled in two thirds of the time."""
-    options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else {}
-    return jax.jit(_transmission, static_argnames=("plan",), compiler_options=options)
+    return jax.jit(_transmission, static_argnames=("plan",), compiler_options=compiled_quickly())
 
 
 def _tile_moments(
