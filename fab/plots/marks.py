@@ -71,4 +71,4 @@ def _fill(axes: "Axes", shapes: "Shapes", window: tuple[int, ...], dbu_m: float,
             outlines.append(Outline(np.concatenate([points, points[:1]]), closed=True))
     if outlines:
         whole = Outline.make_compound_path(*outlines)
-        axes.add_patch(PathPatch(whole, facecolor=colour, linewidth=0, alpha=0.6, snap=False))
+        axes.add_artist(PathPatch(whole, facecolor=colour, linewidth=0, alpha=0.6, snap=False))

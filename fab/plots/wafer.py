@@ -31,18 +31,19 @@ def plot_wafer(
 
     cells = {cell.name: cell for cell in frame.cells}
     top, around = frame.cells[-1], frame.cells[-2]
+    # Patches are added as artists, since limits are given: looking for those of each takes a third of the time.
     with single(ax, (7.0, 7.6), title, _words(wafer, frame)) as axes:
         half = wafer.blank_m / 2 / MM
-        axes.add_patch(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f3f3f1", edgecolor=INK, lw=1.2))
+        axes.add_artist(Rectangle((-half, -half), 2 * half, 2 * half, facecolor="#f3f3f1", edgecolor=INK, lw=1.2))
         (outline,) = next(drawn for layer, drawn in around.shapes.items() if layer.number == _WAFER).polygons
-        axes.add_patch(Polygon(outline * (dbu_m / MM), facecolor="white", edgecolor=LINE, lw=1.2))
+        axes.add_artist(Polygon(outline * (dbu_m / MM), facecolor="white", edgecolor=LINE, lw=1.2))
         usable = (wafer.diameter_m / 2 - wafer.edge_exclusion_m) / MM
-        axes.add_patch(Circle((0, 0), usable, fill=False, edgecolor=FAINT, lw=0.8, ls="--"))
+        axes.add_artist(Circle((0, 0), usable, fill=False, edgecolor=FAINT, lw=0.8, ls="--"))
         side = frame.die_m / MM
         for (x_m, y_m), split in zip(frame.dies, frame.splits, strict=True):
             x, y = x_m / MM, y_m / MM
-            axes.add_patch(Rectangle((x - side / 2, y - side / 2), side, side, fill=False, ec=FAINT, lw=0.8))
-            axes.add_patch(Circle((x, y), aperture_m / 2 / MM, facecolor=CHROME, edgecolor="none"))
+            axes.add_artist(Rectangle((x - side / 2, y - side / 2), side, side, fill=False, ec=FAINT, lw=0.8))
+            axes.add_artist(Circle((x, y), aperture_m / 2 / MM, facecolor=CHROME, edgecolor="none"))
             if split:
                 axes.text(x - 0.46 * side, y + 0.46 * side, f"{split}", va="top", fontsize=SMALL)
         for reference in around.references:
@@ -84,5 +85,5 @@ def _fill(axes: "Axes", box: "Sequence[int]", dbu_m: float) -> tuple[float, ...]
     from matplotlib.patches import Rectangle
 
     x0, y0, x1, y1 = edges = tuple(edge * dbu_m / MM for edge in box)
-    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=MARK, edgecolor="none", alpha=0.75))
+    axes.add_artist(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=MARK, edgecolor="none", alpha=0.75))
     return edges

@@ -7,6 +7,7 @@ import pytest
 from scipy.special import j0
 
 import doedesign
+import doedesign.optimization as optimization
 from doedesign.focus.depth import focus_of_design
 from doedesign.focus.foci import Foci
 from doedesign.prediction import on_target
@@ -16,6 +17,7 @@ from fab.process import Process, Variation
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
+from tests.pictures import leave_out_pictures
 
 SMALL = """
 name = "small"
@@ -167,7 +169,8 @@ def test_too_many_planes_are_refused(spec_file: Path):
         Foci.wanted(spec.focus, doedesign.camera_from_spec(spec))
 
 
-def test_a_stopped_design_goes_on_to_the_same_bytes(spec_file: Path, tmp_path: Path):
+def test_a_stopped_design_goes_on_to_the_same_bytes(spec_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    leave_out_pictures(monkeypatch, optimization)
     few = [*BIFOCAL, "optimize.steps=40", "optimize.checkpoint_every=10"]
     whole = doedesign.optimize(spec_file, tmp_path / "whole", overrides=few)
     stops = [15, 36]

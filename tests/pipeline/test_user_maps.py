@@ -13,6 +13,7 @@ from tifffile import imwrite
 from fab.levels import Levels, quantise
 from sim.store import write_height
 from tests.orders import named
+from tests.pictures import leave_out_pictures_of_orders
 
 LEVELS, STEP_M, PITCH_UM = 16, 75e-9, 2.0
 FULL_M = (LEVELS - 1) * STEP_M
@@ -47,6 +48,11 @@ def write_map(path: Path, height_m: np.ndarray, kind: str) -> tuple[str, ...]:
     else:
         Image.fromarray(counts[::-1].copy()).save(path)
     return (*levels, *pitch, *scale)
+
+
+@pytest.fixture(autouse=True)
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_pictures_of_orders(monkeypatch)
 
 
 KINDS = ["npy", "npy counts", "npy float32, columns first", "exr", "tif", "tif metres", "png"]
