@@ -1,10 +1,13 @@
 """Levels: the staircase that lithography can make, and the nearest step for every height.
 
-Every level is a choice of masks: mask k opens where bit k of ``L - 1 - l`` is set and etches its depth there, so
-level l stands as high above the deepest floor as the depths of the masks that stay closed, those whose bit in l is set,
-add up to. The blank glass is the top level ``L - 1``. By default mask k etches ``2**k`` steps, and level l is l steps
-high. Any other depths will do; then the numbers of the levels are still choices of masks, but no longer an order of
-height. Splitting a level map into its masks (`planes`) and joining them are exact inverses, whatever the depths are.
+Every level is a choice of masks: mask k opens where bit k of the code ``L - 1 - l`` is set and etches its depth there.
+The blank glass is the top level ``L - 1``, and heights are counted from the deepest floor that a level has. By default
+mask k etches ``2**k`` steps, and level l is l steps high. Any other depths will do; then the numbers of the levels are
+still choices of masks, but no longer an order of height. Splitting a level map into its masks (`planes`) and joining
+them are exact inverses, whatever the depths are.
+
+L is any whole number. Where it is no power of two, a design has the codes 0 to ``L - 1`` alone, and masks that give a
+pixel another are refused; in glass the others occur where errors of a process let openings overlap.
 """
 
 import math
@@ -17,6 +20,9 @@ from fab.errors import InputError
 from fab.height import refuse_where, require_heights
 from fab.units import format_length
 
+# Numbers of levels; the most take six masks.
+FEWEST, MOST = 2, 64
+
 # Rows that are handled at once, so that a 4400 x 4400 map needs no second copy in float64.
 _ROWS = 256
 # Depths that agree so closely with 2^k steps are meant to be 2^k steps.
@@ -28,16 +34,16 @@ _APART = 1e-3
 
 @dataclass(frozen=True)
 class Levels:
-    """A staircase of `count` heights, made by log2(count) etches.
+    """A staircase of `count` heights, made by as few etches as have so many sets.
 
     Attributes:
-        count: number of levels L, a power of two from 2 to 64.
+        count: number of levels L, a whole number from 2 to 64.
         step_m: height of one step, metres; `count` steps are the height of one wave of the design, after which heights
             repeat.
         depths_m: how deep each mask etches, metres, mask 0 first; ``2**k * step_m`` where none are given.
 
     Raises:
-        InputError: a count that is not a power of two from 2 to 64, a step that is not positive, or depths that are not
+        InputError: a count that is not a whole number from 2 to 64, a step that is not positive, or depths that are not
             one per mask, not positive, or leave two levels at one height.
     """
 
@@ -46,10 +52,9 @@ class Levels:
     depths_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.count not in (2, 4, 8, 16, 32, 64):
-            raise InputError(
-                "levels", "must be a power of two from 2 to 64", self.count, "Choose 2, 4, 8, 16, 32 or 64."
-            )
+        if not isinstance(self.count, int) or not FEWEST <= self.count <= MOST:
+            cure = "Powers of two use every set of masks."
+            raise InputError("levels", f"must be a whole number from {FEWEST} to {MOST}", self.count, cure)
         if not 0 < self.step_m < math.inf:
             raise InputError("level step", "must be positive and finite", self.step_m, 'Give a step such as "75 nm".')
         binary = tuple(2**bit * self.step_m for bit in range(self.bits))
@@ -78,13 +83,18 @@ class Levels:
             raise InputError("etch depths", "no two levels may have the same height", got, cure)
 
     def _masks_in_words(self, level: int) -> str:
-        masks = [str(bit) for bit in range(self.bits) if not level >> bit & 1]
+        masks = [str(bit) for bit in range(self.bits) if self.count - 1 - level >> bit & 1]
         return f"mask{'s' * (len(masks) > 1)} {' + '.join(masks)}" if masks else "no mask"
 
     @property
     def bits(self) -> int:
-        """Number of etch masks, log2 of the count."""
-        return self.count.bit_length() - 1
+        """Number of etch masks, log2 of the count, rounded up."""
+        return (self.count - 1).bit_length()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every set of masks makes a level: whether the count is a power of two."""
+        return self.count == 1 << self.bits
 
     @property
     def is_binary(self) -> bool:
@@ -99,7 +109,7 @@ class Levels:
     @property
     def total_m(self) -> float:
         """Height of the blank glass above the deepest floor, metres."""
-        return (self.count - 1) * self.step_m if self.is_binary else math.fsum(self.depths_m)
+        return float(self.heights_m()[-1])
 
     def __str__(self) -> str:
         """Return "16 levels of 75 nm", or "4 levels by etches of 80 nm and 150 nm"."""
@@ -113,8 +123,9 @@ class Levels:
         """Return the height of every level above the deepest floor, metres, shape ``(count,)``."""
         if self.is_binary:
             return np.arange(self.count, dtype=np.float64) * np.float64(self.step_m)
-        closed = [[d for bit, d in enumerate(self.depths_m) if level >> bit & 1] for level in range(self.count)]
-        return np.array([math.fsum(depths) for depths in closed])
+        etched = [[-d for bit, d in enumerate(self.depths_m) if code >> bit & 1] for code in range(self.count)]
+        deepest = [-d for d in min(etched, key=math.fsum)]
+        return np.array([math.fsum(deepest + depths) for depths in reversed(etched)])
 
     def by_height(self) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """Return the levels from the lowest to the highest, and their heights, metres, both of shape ``(count,)``."""
@@ -222,4 +233,19 @@ def level_map_from_planes(bit_planes: NDArray[np.integer] | NDArray[np.bool_], l
     if bit_planes.size and (bit_planes.min() < 0 or bit_planes.max() > 1):
         raise InputError("bit planes", "every value must be 0 or 1", "another value", "Threshold the planes first.")
     shifted = bit_planes.astype(np.uint8) << np.arange(levels.bits, dtype=np.uint8)[:, None, None]
-    return np.uint8(levels.count - 1) - np.bitwise_or.reduce(shifted, axis=0)
+    return level_map_from_codes(np.bitwise_or.reduce(shifted, axis=0), levels)
+
+
+def level_map_from_codes(etched: NDArray[np.uint8], levels: Levels, where: str = "masks") -> NDArray[np.uint8]:
+    """Return the level map of the numbers ``[y, x]`` whose bit k says whether mask k etches.
+
+    Raises:
+        InputError: masks that `where` holds etch a pixel together and make no level.
+    """
+    top = np.uint8(levels.count - 1)
+    if not levels.is_full and (wrong := etched > top).any():
+        row, column = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
+        rule = f"must give every pixel one of the {levels.count} levels"
+        got = f"{np.count_nonzero(wrong)} with a set of masks of none, the first at row {row}, column {column}"
+        raise InputError(where, rule, got, "Draw the masks again.")
+    return top - etched

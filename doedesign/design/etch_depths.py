@@ -84,10 +84,14 @@ def light_cost(heights: HeightHistogram, levels: Levels) -> float:
     return float(1 - heights.weights @ kept)
 
 
-def recipe_depths_m(depths_m: Sequence[float] | NDArray[np.floating]) -> tuple[float, ...]:
-    """Return depths as a recipe holds them: shallow to deep, whole tenths of a nanometre."""
+def recipe_depths_m(depths_m: Sequence[float] | NDArray[np.floating], levels: Levels) -> tuple[float, ...]:
+    """Return depths of the etches of a staircase as a recipe holds them, whole tenths of a nanometre.
+
+    They go from shallow to deep where every set of masks makes a level; elsewhere other levels would come of that.
+    """
+    in_order = sorted(depths_m) if levels.is_full else depths_m
     # By way of text, so that 80.1 nm is the same number as in a spec.
-    return tuple(float(f"{round(float(depth) / NM, 1)!r}e-9") for depth in sorted(depths_m))
+    return tuple(float(f"{round(float(depth) / NM, 1)!r}e-9") for depth in in_order)
 
 
 def optimal_levels(heights: HeightHistogram, start: Levels) -> Levels:
@@ -125,7 +129,7 @@ def optimal_levels(heights: HeightHistogram, start: Levels) -> Levels:
     if not tried:
         return start
     try:
-        best = Levels(start.count, step, recipe_depths_m(min(tried, key=lambda one: one[0])[1] * step))
+        best = Levels(start.count, step, recipe_depths_m(min(tried, key=lambda one: one[0])[1] * step, start))
     except InputError:
         return start
     return best if light_cost(heights, best) < light_cost(heights, start) else start

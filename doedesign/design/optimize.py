@@ -162,7 +162,7 @@ def _chosen_levels(
     parametrization, camera = problem.parametrization, problem.camera
     start = parametrization.levels
     if (ratio := state.parameters.log_depth_ratio) is not None:
-        depths_m = recipe_depths_m(np.asarray(parametrization.depths_m(ratio)))
+        depths_m = recipe_depths_m(np.asarray(parametrization.depths_m(ratio)), start)
         with contextlib.suppress(InputError):  # two levels met
             return Levels(start.count, start.step_m, depths_m)
     area = circle_coverage(camera.grid, camera.aperture_m)

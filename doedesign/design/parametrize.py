@@ -78,7 +78,13 @@ class LevelParametrization(eqx.Module):
             return jnp.where(softness > 0, blended, stepped)
         depths = jnp.asarray(self.levels.depths_m, jnp.float32) if depths_m is None else depths_m
         level = self._nearest(height, depths)
-        stepped = sum(jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths))
+        if self.levels.is_full:
+            stepped = sum(jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths))
+        else:
+            stepped = sum(
+                depth * rise[level]
+                for depth, rise in zip(depths, self._closed(jax.lax.stop_gradient(depths)).T, strict=True)
+            )
         blended = softness * height + (1.0 - softness) * stepped
         return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
 
@@ -91,8 +97,7 @@ class LevelParametrization(eqx.Module):
         """Nearest level of a wrapped height if the etches have these depths (`fab.levels.wrapped_cells`)."""
         count, period = self.levels.count, self.levels.period_m
         depths = jax.lax.stop_gradient(depths_m)
-        closed = (np.arange(count)[:, None] >> np.arange(self.levels.bits)) & 1
-        places = jnp.mod(closed.astype(np.float32) @ depths, period)
+        places = jnp.mod(self._closed(depths) @ depths, period)
         order = jnp.argsort(places)
         places = places[order]
         # One comparison per level is faster than a search, and what follows fuses with it.
@@ -100,6 +105,18 @@ class LevelParametrization(eqx.Module):
         edge = (places[-1] + places[0] + period) / 2
         cell = jnp.where(height_m >= edge, 0, jnp.where(height_m < edge - period, count - 1, cell))
         return order[cell]
+
+    def _closed(self, depths_m: Float[Array, " k"]) -> Float[Array | np.ndarray, "level k"]:
+        """By how many of each depth a level stands above the deepest floor: masks that it closes, less those it opens.
+
+        "Closed" and "opened" as against the deepest level of these depths, which opens all masks if every set of them
+        makes a level.
+        """
+        count, bits = self.levels.count, np.arange(self.levels.bits)
+        opened = ((np.arange(count)[::-1, None] >> bits) & 1).astype(np.float32)
+        if self.levels.is_full:
+            return 1 - opened
+        return opened[jnp.argmax(opened @ depths_m)] - opened
 
     def depths_m(self, log_depth_ratio: Float[Array, " k"]) -> Float[Array, " k"]:
         """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""

@@ -22,6 +22,7 @@ from pydantic import (
 
 from doedesign.spec.values import ColourName, FarDepth, NotNegative, bounded, broken, known, length, share
 from doedesign.spec.values.table import SpecTable, optional
+from fab.levels import FEWEST, MOST
 from fab.process import DEVIATIONS, Deviation, Normal
 from fab.stock import IDEAL, STOCK
 from fab.units import MM, NM, UM
@@ -148,8 +149,8 @@ class DefectsSpec(SpecTable, frozen=True):
 
 
 def _level_count(count: int) -> int:
-    if count not in (2, 4, 8, 16, 32, 64):
-        raise broken("must be a power of two from 2 to 64, one bit per etch mask", "Choose 2, 4, 8, 16, 32 or 64.")
+    if not FEWEST <= count <= MOST:
+        raise broken(f"must lie from {FEWEST} to {MOST}", "Powers of two use every set of masks.")
     return count
 
 
@@ -157,10 +158,11 @@ class ProcessSpec(SpecTable, frozen=True):
     """Levels that the fab lab makes, and how well.
 
     Attributes:
-        levels: number of heights L, a power of two.
+        levels: number of heights L, from 2 to 64. As many masks are drawn as L - 1 has binary digits: 6 levels take the
+            three masks of 8, and leave its two deepest floors unused.
         level_step_m: height of one level; `levels` times this is the height of one wave of the design.
         etch_depths_m: depth of every mask, mask 0 first, where it is not 2^k level steps; "optimize" has
-            `doedesign optimize` choose them.
+            `doedesign optimize` choose them. Level L - 1 - c is etched by the masks of the binary digits of c.
         chrome_overlap_m: how far the chrome reaches over the edge of the relief, so that a chrome mask aligned a
             little off uncovers no blank glass. Light passes an opening of `doe.aperture` less twice this.
         stock: a process of `fab.stock.STOCK` that stands in for what is not given here.
@@ -192,7 +194,7 @@ class ProcessSpec(SpecTable, frozen=True):
     @property
     def masks(self) -> int:
         """Number of etch masks."""
-        return self.levels.bit_length() - 1
+        return (self.levels - 1).bit_length()
 
     @property
     def chooses_depths(self) -> bool:

@@ -3,8 +3,9 @@
     CD bars       lines and gaps of 1, 1.5, 2, 3 and 5 um, five side by side and one alone, along y and along x
     depth pads    etched squares of 20, 100 and 500 um, flat glass between them: the loss of depth in small openings
     staircases    all levels side by side, from the blank glass to the deepest floor, for one scan of a profilometer
-    gratings      a binary grating of the deepest etch, a blazed one of all etches, and an empty window beside them,
-                  each framed by chrome: the share of a laser beam that goes straight on shows all depth errors at once
+    gratings      a binary grating of the deepest etch, a blazed one of all sets of etches (those of no level, too), and
+                  an empty window beside them, each framed by chrome: the share of a laser beam that goes straight on
+                  shows all depth errors at once
 
 All is drawn on datatype 2 of each mask, words on datatype 3. Each mask has bars and pads of its own, apart from those
 of the others; staircases and gratings are what all masks make together. A line is a polygon, a gap is the blank space
@@ -105,12 +106,12 @@ def _stripes(codes: Sequence[int], bits: Sequence[int], width: int, height: int,
 
 
 def staircase(levels: Levels, bits: Sequence[int], step_m: float, dbu_m: float) -> Part:
-    """Draw all depths that some masks make together as one staircase down toward +x, 0.2 mm high, from the blank glass.
+    """Draw all levels that some masks make together as one staircase down toward +x, 0.2 mm high, from the blank glass.
 
     Steps are `step_m` (metres) wide. Places: on the blank glass before the first step and behind the last one,
     "staircase 16 levels, start" and "..., end": a scan from one to the other crosses every step once.
     """
-    codes = codes_by_depth(levels, bits)
+    codes = [code for code in codes_by_depth(levels, bits) if code < levels.count]
     step, height = round(step_m / dbu_m), round(_STAIR_UM * UM / dbu_m)
     name = f"staircase {len(codes)} levels"
     y = height * dbu_m / 2

@@ -39,6 +39,16 @@ CONVENTIONS = {
     "level map": "uint8 [y, x], row 0 at the lowest y; its digest is the SHA-256 of these bytes row by row",
     "plane digests": "SHA-256 of the rows packed to bytes, first pixel in the highest bit, 1 = etched",
 }
+# Where some sets of masks make no level, the masks that stay closed do not say how high a level is.
+_UNUSED_SETS = {
+    "levels": "level l of L lies as deep below the blank glass, level L-1, as the depths of the masks that open there "
+    "sum up to (L-1-l steps where mask k etches 2^k steps); the other sets of masks make no level"
+}
+
+
+def conventions_of(levels: Levels) -> dict[str, str]:
+    """Return in words how the numbers of an order of a staircase are meant, by what they are."""
+    return CONVENTIONS if levels.is_full else CONVENTIONS | _UNUSED_SETS
 
 
 @dataclass(frozen=True, config=_STRICT)

@@ -16,7 +16,7 @@ from fab.layout.frame import Frame, draw_frame
 from fab.layout.geometry import Cell, Layer, Layout, chrome_layer, merged, pixel_edges
 from fab.layout.part import Photomask
 from fab.manifest.cells import cell_entry
-from fab.manifest.records import CONVENTIONS, FORMAT, FileEntry, Manifest, ModelEntry
+from fab.manifest.records import FORMAT, FileEntry, Manifest, ModelEntry, conventions_of
 from fab.order.entries import chrome_entry, describe_edges, mask_entry, photomask_entry, split_entries, wafer_entry
 from fab.order.order import Order
 from fab.order.request import request_of
@@ -144,7 +144,7 @@ def manifest_of(
         name=level_map.name,
         geometry_sha256=order.geometry,
         source=dict(order.source),
-        conventions=CONVENTIONS,
+        conventions=conventions_of(levels),
         request=request_of(order),
         levels=levels.count,
         step_nm=round(levels.step_m / NM, 9),

@@ -32,7 +32,7 @@ from fab.order.papers import papers, request_digest
 from fab.order.request import order_from
 from fab.solids.write import model_entries
 from fab.verification.compare import Expected
-from fab.verification.files import check_bytes, check_files, reference_level
+from fab.verification.files import check_bytes, check_files, check_levels, reference_level
 from fab.verification.papers import paper_problems, picture_of_digest
 from fab.verification.report import Check, VerificationReport
 from fab.verification.values import differences
@@ -113,6 +113,8 @@ def verify_folder(folder: Path, known: FilesRead | None = None) -> VerificationR
             *byte_checks.values(),
             map_check,
         ]
+        if not level_map.levels.is_full:  # otherwise any masks will do
+            checks.append(check_levels(folder, recorded))
         expected = Expected(wanted, level_map.planes(), pixel_edges(level_map.grid))
         same = known.of_same(wanted.files, intact) if known else {}
         checks += check_files(folder, expected, drawing.model, intact, same)

@@ -53,14 +53,14 @@ def _pack(levels, top, out):  # pragma: no cover - compiled
                 out[bit, y, w] = _mirrored(word)
 
 
-def pack(level_map: NDArray[np.uint8], bits: int) -> Words:
-    """Split C-ordered levels ``[y, x]`` below ``2**bits`` into etch masks ``[bit, y, word]``, set where etched."""
+def pack(level_map: NDArray[np.uint8], levels: int) -> Words:
+    """Split C-ordered levels ``[y, x]`` below `levels` into etch masks ``[bit, y, word]``, set where etched."""
     ny, nx = level_map.shape
-    top = np.uint64(2**bits - 1)
+    top = np.uint64(levels - 1)
     if nx % 8:
         level_map = np.pad(level_map, ((0, 0), (0, -nx % 8)), constant_values=int(top))
     groups = level_map.view(np.uint64)
-    out = np.empty((bits, ny, -(-nx // 64)), dtype=np.uint64)
+    out = np.empty((int(top).bit_length(), ny, -(-nx // 64)), dtype=np.uint64)
     rows = [slice(ny * i // _THREADS, ny * (i + 1) // _THREADS) for i in range(_THREADS)]
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda part: _pack(groups[part], top, out[:, part]), rows))

@@ -307,7 +307,7 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
     grid, aperture_m = level_map.grid, level_map.aperture_m
     area = grid.count_inside_circle(aperture_m)
-    words = bits.pack(level_map.level, levels.bits)
+    words = bits.pack(level_map.level, levels.count)
     with ThreadPoolExecutor() as pool:
         tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)

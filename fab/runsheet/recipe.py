@@ -3,14 +3,14 @@
 The recipes are ordinary ones for fused silica: positive resist, reactive ions through it, chrome by lift-off or wet
 etch. Doses, bakes and times belong to the lab and are left blank; what follows from the order is filled in.
 
-Depth first: every etch has its own target, whatever another one did. If a staircase uses all its levels equally, the
+Depth first: every etch has its own target, whatever another one did. If a design uses all sets of masks equally, the
 light that goes where it should is a product with one factor per mask, cos^2(phi / 2) for a phase error phi of its
 depth; no other factor can make up for it. The choice that keeps the full depth right (`next_target_m`) puts its own
 mask wrong by as much, and so loses the factor twice.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from fab.layout.marks import alignment_notes
@@ -192,12 +192,18 @@ def _by_the_edge(sheet: RunSheet) -> str:
     return "By eye, middle on middle."
 
 
+def _deepest_m(etched: Sequence[Photomask], levels: Levels) -> float:
+    """Return the depth of the deepest floor of a DOE after some etches, metres."""
+    return max(sum((p.depth_m for p in etched if code >> (p.bit or 0) & 1), 0.0) for code in range(levels.count))
+
+
 def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
     """List the steps of a job, one per photomask in order of use."""
     chrome_m, deposition, process = sheet.chrome_m, sheet.deposition, sheet.process
-    steps, deepest_m = [], 0.0
+    etched: list[Photomask] = []
+    steps = []
     for number, (photomask, note) in enumerate(zip(sheet.photomasks, alignment_notes(sheet.photomasks), strict=True)):
-        deepest_m += photomask.depth_m
+        etched += [photomask] if photomask.bit is not None else []
         align = note if number else f"{_by_the_edge(sheet)} {note}"
         thickness_m, why = least_resist(photomask, chrome_m, deposition)
         how = "Acetone, isopropanol, water, then oxygen plasma or the lab's oxidising clean. Dry, 150 C for 10 min."
@@ -215,5 +221,5 @@ def steps_of(sheet: RunSheet) -> tuple[Step, ...]:
             if photomask.makes == "etch"
             else _chrome_actions(photomask, chrome_m, deposition)
         )
-        steps.append(Step(photomask, tuple(before), after, deepest_m))
+        steps.append(Step(photomask, tuple(before), after, _deepest_m(etched, sheet.level_map.levels)))
     return tuple(steps)

@@ -135,7 +135,9 @@ def _marks(sheet: RunSheet, photomask: Photomask, key: str, *kinds: str, prefix:
 
 def _etch_record(sheet: RunSheet, step: Step, later: tuple[Photomask, ...]) -> dict[str, Any]:
     """Describe the depth of one etch: times, pads, and what to do if it is off."""
-    photomask, following = step.photomask, later[0] if later else None
+    photomask = step.photomask
+    # The sum of all depths is the full one only where the deepest floor is made by all masks.
+    following = later[0] if later and sheet.level_map.levels.is_full else None
     corrections = []
     if following:
         corrections = [

@@ -92,7 +92,7 @@ def write_greymap(path: str | Path, level_map: LevelMap, bits: Literal[8, 16] = 
     """Write a grey PNG for greyscale and two-photon writers, first row at the highest y; return the metres per count.
 
     Black is the deepest floor and white the blank surface; between them counts are linear in height, rounded, and exact
-    for 2, 4 and 16 even levels. The text chunk "Description" says so.
+    for 2, 4, 6, 16, 18 and 52 even levels. The text chunk "Description" says so.
     """
     counts, scale_m = _full_scale(level_map.levels, 2**bits - 1)
     pixels = counts.astype(np.uint8 if bits == 8 else np.uint16)[level_map.level]

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.errors import CheckFailed, InputError
-from fab.files import read_npy, scratch_folder, sha256_file
+from fab.files import MANIFEST_NAME, read_npy, scratch_folder, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
@@ -35,7 +35,7 @@ from fab.layout.geometry import Layer, PixelEdges, pixel_edges
 from fab.layout.limits import MOST_AROUND
 from fab.layout.polygons import paint
 from fab.level_map import level_digest
-from fab.levels import Levels
+from fab.levels import Levels, level_map_from_codes
 from fab.manifest.records import FileEntry, Manifest
 from fab.solids.model import DoeModel
 from fab.solids.write import model_problems
@@ -80,12 +80,23 @@ def read_drawn_levels(
     Edges of the masks were moved outward by `moves`, database units (`Manifest.edge_moves`).
 
     Raises:
-        InputError: a file is missing or corrupt, or draws something else than planes of pixels.
+        InputError: a file is missing or corrupt, draws something else than planes of pixels, or a pixel has no level.
     """
     etched = np.zeros((edges.y.size - 1, edges.x.size - 1), dtype=np.uint8)
     for path in paths:
         _paint_cell(path, cell, edges, moves or (0,) * levels.bits, etched)
-    return np.uint8(levels.count - 1) - etched
+    return level_map_from_codes(etched, levels, " + ".join(map(str, paths)))
+
+
+def check_levels(folder: Path, manifest: Manifest) -> Check:
+    """Ask whether the masks of an order together give every pixel one of its levels."""
+    edges, moves = pixel_edges(manifest.grid()), manifest.edge_moves()
+    problems = ()
+    try:
+        read_drawn_levels(manifest.drawn_files(folder), manifest.staircase(), edges, manifest.doe_cell, moves)
+    except InputError as error:
+        problems = (f"they {error.rule}, but got {error.got}",)
+    return Check(MANIFEST_NAME, "all masks together, a level for every pixel", problems)
 
 
 def _paint_cell(

@@ -108,7 +108,9 @@ def test_heights_outside_the_aperture_do_not_count() -> None:
 
 
 def test_depths_are_what_a_recipe_holds() -> None:
-    assert recipe_depths_m([300.04e-9, 80.06e-9]) == (80.1e-9, 300.0e-9)
+    assert recipe_depths_m([300.04e-9, 80.06e-9], UNEVEN) == (80.1e-9, 300.0e-9)
+    # Of five levels, one is made by masks 0 and 1, none by 0 and 2: depths in another order would make others.
+    assert recipe_depths_m([610e-9, 80.06e-9, 300.04e-9], Levels(5, 150e-9)) == (610.0e-9, 80.1e-9, 300.0e-9)
 
 
 def test_where_nothing_is_better_2_to_the_k_steps_stay() -> None:
@@ -120,7 +122,17 @@ def test_where_nothing_is_better_2_to_the_k_steps_stay() -> None:
 # --- depths as parameters ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("levels", [UNEVEN, Levels(4, 300e-9, (500e-9, 150e-9)), Levels(8, 150e-9, (1e-7, 3e-7, 7e-7))])
+STAIRCASES = [
+    UNEVEN,
+    Levels(4, 300e-9, (500e-9, 150e-9)),
+    Levels(8, 150e-9, (1e-7, 3e-7, 7e-7)),
+    Levels(3, 400e-9, (350e-9, 820e-9)),
+    Levels(5, 240e-9, (600e-9, 250e-9, 700e-9)),  # the deepest floor is made by masks 0 and 1
+    Levels(6, 200e-9, (210e-9, 380e-9, 830e-9)),
+]
+
+
+@pytest.mark.parametrize("levels", STAIRCASES)
 def test_the_loop_takes_the_levels_that_are_drawn(levels: Levels) -> None:
     staircase = LevelParametrization.at("fused_silica", 550e-9, levels)
     radians = jnp.asarray(np.random.default_rng(2).uniform(-20, 20, 4000), jnp.float32)
@@ -149,19 +161,22 @@ def test_depths_given_as_2_to_the_k_steps_change_no_bit() -> None:
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.5])
-def test_gradient_of_the_heights_by_the_depths(softness: float) -> None:
-    staircase = LevelParametrization.at("fused_silica", 550e-9, UNEVEN)
+@pytest.mark.parametrize("levels", STAIRCASES)
+def test_gradient_of_the_heights_by_the_depths(softness: float, levels: Levels) -> None:
+    staircase = LevelParametrization.at("fused_silica", 550e-9, levels)
     rng = np.random.default_rng(3)
     radians, weight = (jnp.asarray(rng.uniform(0, 6, 500), jnp.float32) for _ in range(2))
 
     def total(depths: jax.Array) -> jax.Array:
         return jnp.vdot(weight, staircase.height_m(radians, jnp.float32(softness), depths))
 
-    depths = jnp.asarray(UNEVEN.depths_m, jnp.float32)
+    depths = jnp.asarray(levels.depths_m, jnp.float32)
     level = np.asarray(staircase.level(staircase.continuous_m(radians))).astype(int)
     for mask, slope in enumerate(np.asarray(jax.grad(total)(depths))):
-        # Linear in a depth as long as no cell changes its level: the cells that the mask leaves standing.
-        assert slope == pytest.approx((1 - softness) * float(np.sum(weight[(level >> mask & 1) == 1])), rel=1e-5)
+        # Linear in a depth as long as no cell changes its level: the deepest floor less what the mask etches.
+        deepest, own = (levels.count - 1 - n >> mask & 1 for n in (int(np.argmin(levels.heights_m())), level))
+        due = (1 - softness) * float(np.sum(weight * (deepest - own)))
+        assert slope == pytest.approx(due, rel=1e-5, abs=1e-3)
     # Straight through by the parameters, whatever the depths do.
     through = jax.grad(lambda r: jnp.vdot(weight, staircase.height_m(r, jnp.float32(0), depths)))(radians)
     np.testing.assert_allclose(through, weight * staircase.metres_per_radian, rtol=1e-5)

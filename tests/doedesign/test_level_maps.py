@@ -71,13 +71,13 @@ def test_a_continuous_run_is_rounded_when_it_is_drawn(tmp_path: Path, continuous
     np.testing.assert_allclose(kept, continuous_m, rtol=1e-6)  # float32, and not rounded
 
 
-@pytest.mark.parametrize("count", [0, -8, 3, 12, 128])
+@pytest.mark.parametrize("count", [0, -8, 1, 65, 128])
 def test_impossible_levels(tmp_path: Path, continuous_m: np.ndarray, count: int):
     run = finished(tmp_path, continuous_m)
-    with pytest.raises(InputError, match="power of two"):
+    with pytest.raises(InputError, match="from 2 to 64"):
         drawing_from(run.folder, count)
     np.save(tmp_path / "map.npy", continuous_m)
-    with pytest.raises(InputError, match="power of two"):
+    with pytest.raises(InputError, match="from 2 to 64"):
         drawing_from(tmp_path / "map.npy", count, step_m=STEP_M, pitch_m=1e-6)
 
 

@@ -26,8 +26,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_input_error_names_place_rule_value_and_cure():
-    error = InputError("spec.toml: levels", "must be a power of two", 12, "Choose 8 or 16.")
-    assert str(error) == "spec.toml: levels: must be a power of two, but got 12. Choose 8 or 16."
+    error = InputError("spec.toml: levels", "must be at least 2", 1, "Choose 8 or 16.")
+    assert str(error) == "spec.toml: levels: must be at least 2, but got 1. Choose 8 or 16."
     assert isinstance(error, ValueError)
 
 

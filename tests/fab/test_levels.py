@@ -5,11 +5,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fab.errors import InputError
-from fab.levels import Levels, height_of, quantise, require_levels
+from fab.levels import (
+    Levels,
+    height_of,
+    level_map_from_planes,
+    planes,
+    quantise,
+    quantise_wrapped,
+    require_levels,
+)
 from fab.units import NM
 
 SIXTEEN = Levels(16, 75 * NM)
-COUNTS = st.sampled_from([2, 4, 8, 16, 32, 64])
+COUNTS = st.integers(2, 64)
 
 
 def test_the_papers_staircase():
@@ -20,10 +28,50 @@ def test_the_papers_staircase():
         SIXTEEN.etch_depth_m(4)
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 12, 15, 17, 128, -2])
-def test_counts_that_are_no_power_of_two_are_refused(count):
-    with pytest.raises(InputError, match=r"power of two.*Choose"):
+@pytest.mark.parametrize("count", [0, 1, 65, 128, -2, 10**30, 6.0, True])
+def test_counts_that_are_no_whole_number_from_2_to_64_are_refused(count):
+    with pytest.raises(InputError, match=r"levels: must be a whole number from 2 to 64, but got"):
         Levels(count, 75 * NM)
+
+
+@pytest.mark.parametrize(
+    ("count", "depths_nm"),
+    [(2, [1]), (3, [1, 2]), (4, [1, 2]), (5, [1, 2, 4]), (6, [1, 2, 4]), (8, [1, 2, 4]), (9, [1, 2, 4, 8])],
+)
+def test_as_many_masks_as_have_so_many_sets(count, depths_nm):
+    levels = Levels(count, 1 * NM)
+    assert [levels.etch_depth_m(bit) / NM for bit in range(levels.bits)] == pytest.approx(depths_nm, rel=1e-12)
+    assert levels.is_full == (count in (2, 4, 8))
+    assert levels.heights_m().tolist() == [level * NM for level in range(count)]
+    assert (levels.total_m, levels.period_m) == ((count - 1) * NM, count * NM)
+
+
+def test_the_masks_of_six_levels():
+    levels = Levels(6, 75 * NM)
+    # From the floor, 5 steps below the blank glass, up: etches of 1 + 4, 4, 1 + 2, 2, 1 and 0 steps.
+    opened = planes(np.arange(6)[None], levels)[:, 0]
+    assert opened.T.tolist() == [[1, 0, 1], [0, 0, 1], [1, 1, 0], [0, 1, 0], [1, 0, 0], [0, 0, 0]]
+    assert np.array_equal(level_map_from_planes(opened[:, None], levels), np.arange(6)[None])
+
+
+def test_masks_that_make_no_level_are_refused():
+    levels = Levels(6, 75 * NM)
+    opened = np.zeros((3, 4, 5), np.uint8)
+    opened[2, 1, 2:] = 1
+    opened[1, 1, 3:] = 1
+    got = r"got 2 with a set of masks of none, the first at row 1, column 3"
+    with pytest.raises(InputError, match=rf"must give every pixel one of the 6 levels, but {got}"):
+        level_map_from_planes(opened, levels)
+    assert level_map_from_planes(opened, Levels(7, 75 * NM))[1].tolist() == [6, 6, 2, 0, 0]
+
+
+@pytest.mark.parametrize("count", [3, 5, 6, 12, 63])
+def test_heights_wrap_to_the_nearest_level_of_any_count(count):
+    levels = Levels(count, 75 * NM)
+    heights = np.random.default_rng(count).uniform(-1e-6, 9e-6, (7, 50))
+    off = np.mod(heights - height_of(quantise_wrapped(heights, levels), levels) + levels.period_m / 2, levels.period_m)
+    # The rounding of float64 on numbers of this size.
+    assert np.abs(off - levels.period_m / 2).max() <= 75 * NM / 2 + 1e-20
 
 
 @pytest.mark.parametrize("step_m", [0.0, -1e-9, float("nan"), float("inf")])

@@ -33,14 +33,15 @@ SWAPPED = Levels(4, STEP_M, (500 * NM, 150 * NM))
 @st.composite
 def staircases(draw: st.DrawFn) -> Levels:
     """Any number of levels, any depths that are not in each other's way."""
-    bits = draw(st.integers(1, 6))
+    count = draw(st.integers(2, 64))
+    bits = (count - 1).bit_length()
     step = draw(st.floats(10 * NM, 500 * NM))
     depths = draw(st.lists(st.floats(0.3, 2.0**bits), min_size=bits, max_size=bits))
     try:
-        return Levels(2**bits, step, tuple(depth * step for depth in depths))
+        return Levels(count, step, tuple(depth * step for depth in depths))
     except InputError:
         # Two levels met; a set that cannot meet stands in.
-        return Levels(2**bits, step, tuple(step * 2.2**k for k in range(bits)))
+        return Levels(count, step, tuple(step * 2.2**k for k in range(bits)))
 
 
 def test_the_height_of_a_level_is_what_the_closed_masks_leave():
@@ -52,7 +53,20 @@ def test_the_height_of_a_level_is_what_the_closed_masks_leave():
     assert str(Levels(2, STEP_M, (250 * NM,))) == "2 levels by an etch of 250 nm"
 
 
-@pytest.mark.parametrize("count", [2, 4, 8, 16, 32, 64])
+def test_of_fewer_levels_than_sets_of_masks_the_first_sets_remain():
+    depths = (250 * NM, 600 * NM, 700 * NM)
+    five = Levels(5, STEP_M, depths)
+    # Etched by no mask, by 0, by 1, by 0 + 1, and by 2; the fourth is the deepest, and 0 is its height.
+    np.testing.assert_allclose(850 * NM - five.heights_m()[::-1], np.array([0, 250, 600, 850, 700]) * NM, atol=1e-20)
+    assert (five.total_m, five.heights_m().min()) == (pytest.approx(850 * NM, rel=1e-12), 0.0)
+    assert depths_m(five) == pytest.approx(np.array([0, 250, 600, 700, 850]) * NM, rel=1e-12)
+    # 250 + 700 nm is no level of five, so a mask of 950 nm may stand beside it; of six it is a level made twice.
+    assert Levels(5, STEP_M, (250 * NM, 950 * NM, 700 * NM)).bits == 3
+    with pytest.raises(InputError, match=r"950 nm deep both by mask(s 0 \+ 2 and by mask 1| 1 and by masks 0 \+ 2)"):
+        Levels(6, STEP_M, (250 * NM, 950 * NM, 700 * NM))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 8, 12, 16, 32, 63, 64])
 def test_depths_of_2_to_the_k_steps_are_the_even_staircase_itself(count):
     step = 75 * NM
     even = Levels(count, step)

@@ -44,7 +44,7 @@ def test_any_change_by_hand_is_noticed(order_folder):
         (lambda d: d["masks"][1].pop("bit"), r"masks\[1\].*'bit'"),
         (lambda d: d.update(pitch_um="1.85"), "pitch_um"),
         (lambda d: d.update(levels=True), "levels"),
-        (lambda d: d.update(levels=12), "power of two"),
+        (lambda d: d.update(levels=65), "whole number from 2 to 64"),
         (lambda d: d.update(levels=8), "fit the levels"),
         (lambda d: d.update(shape=[3]), "fit the levels"),
         (lambda d: d.update(shape=[0, 3]), "grid"),

@@ -63,6 +63,23 @@ def test_nothing_is_broken_after_a_repair(make, line, space):
 MAPS = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 3))
 
 
+@pytest.mark.parametrize("count", [3, 5, 6])
+@pytest.mark.parametrize(("line", "space"), [(2, 2), (2, 3)])
+def test_a_repair_takes_levels_only(count, line, space):
+    """Masks that are repaired one by one would etch together what is no level."""
+    levels = Levels(count, 150e-9)
+    level = np.random.default_rng(count).integers(0, count, (61, 48)).astype(np.uint8)
+    out, cost, _, _ = repair_map(level, line, space, levels, rate=1 / levels.period_m)
+    assert cost.broken_before > 0
+    assert cost.broken_after == 0
+    assert set(np.unique(out)) <= set(range(count))
+    sets = np.tensordot(1 << np.arange(levels.bits), planes(out, levels).astype(int), axes=1)
+    assert sets.max() < count
+    for plane in planes(out, levels):
+        found = smallest_runs(plane)
+        assert all(run is None or run >= least for run, least in zip(found, (line, space), strict=True))
+
+
 @given(MAPS, st.integers(1, 3), st.integers(1, 3), st.floats(0.5, 1.5))
 @settings(max_examples=60)
 def test_no_narrow_line_or_space_is_ever_left(level_map, line, space, share):

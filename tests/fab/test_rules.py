@@ -44,7 +44,7 @@ def klayout_places(pairs: kdb.EdgePairs) -> set[tuple[int, ...]]:
 
 def own_places(plane, outside, fewest) -> set[tuple[int, ...]]:
     """All narrow places as boxes, from the functions that the check is made of."""
-    words = bits.pack(1 - plane, 1)[0]
+    words = bits.pack(1 - plane, 2)[0]
     left, alone, found = words if outside == bits.NONE else ~words, np.empty_like(words), set()
     whole = left
     for axis in (0, 1):
@@ -138,7 +138,7 @@ def test_erosion_keeps_the_pixels_that_begin_runs_of_any_length(axis, outside):
 def test_the_last_row_has_no_corners_whatever_the_array_held_before():
     plane = np.zeros((4, 70), np.uint8)
     plane[[1, 2, 2, 3], [5, 6, 64, 63]] = 1
-    words = bits.pack(1 - plane, 1)[0]
+    words = bits.pack(1 - plane, 2)[0]
     found = np.full_like(words, bits.ALL)
     assert bits.corners(words, found) == 2
     wanted = np.zeros((4, 128), np.uint8)

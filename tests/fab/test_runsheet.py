@@ -53,7 +53,7 @@ def page_of(content, pictures=PICTURES) -> Page:
     return Page(run_sheet_page(content, f"{STEM}_RUNSHEET.json", pictures).decode())
 
 
-@pytest.mark.parametrize("count", [2, 4, 16, 64])
+@pytest.mark.parametrize("count", [2, 4, 6, 16, 64])
 @pytest.mark.parametrize(("chrome", "zero_layer", "tone"), [("liftoff", False, "clear"), ("etch", True, "dark")])
 def test_the_page_is_sound_and_names_every_mask_depth_and_file(count, chrome, zero_layer, tone):
     levels = Levels(count, 75 * NM)
@@ -171,6 +171,18 @@ def test_the_correction_keeps_the_sum_of_all_etches():
     assert etch["next"] == "mask 1"
     assert {row["off_by_nm"]: row["next_target_nm"] for row in etch["corrections"]} == {-10: 85, -5: 80, 5: 70, 10: 65}
     assert record(sheet())["steps"][3]["etch"]["next"] is None
+
+
+def test_the_deepest_floor_of_six_levels_is_not_made_by_all_masks():
+    content = record(sheet(Levels(6, 75 * NM), (1, 0, 2)))
+    assert content["staircase_nm"] == [0, 75, 150, 225, 300, 375]
+    etches = [step["etch"] for step in content["steps"] if step.get("etch")]
+    # After 150 nm; after 150 + 75 nm; 300 + 75 nm, since no level has all three.
+    assert [etch["deepest_floor_nm"] for etch in etches] == [150, 225, 375]
+    # So no single other depth keeps the full one right.
+    assert [(etch["next"], etch["corrections"]) for etch in etches] == [(None, [])] * 3
+    assert "best single correction" not in page_of(content).text
+    assert "best single correction" in page_of(record(sheet())).text
 
 
 def test_line_widths_are_those_at_which_the_doe_comes_out_as_designed():

@@ -185,7 +185,7 @@ def test_cells_of_the_masks_stand_in_rows_of_two_with_150_um_of_blank_glass_betw
         assert beside[:, 0].min() - (x + 250_000) == 150_000
 
 
-@pytest.mark.parametrize("count", [2, 4, 8, 16, 32, 64])
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 8, 16, 32, 63, 64])
 def test_one_scan_of_the_staircase_meets_every_level_once_in_order(count):
     levels, plates = job(count)
     part = process_monitor(levels, plates, PITCH, NM, LINE)
@@ -207,6 +207,8 @@ def test_the_deepest_two_masks_make_a_wider_staircase():
     codes = [etched(part, plates, (x, y)) for x in np.arange(x0 + 1.5 * STEP_M, x1, 3 * STEP_M)]
     assert codes == [0, 4, 8, 12, 0]
     assert "staircase 4 levels, start" in process_monitor(*job(4), PITCH, NM, LINE).places
+    # Both of them together make no level of six.
+    assert "staircase 3 levels, start" in process_monitor(*job(6), PITCH, NM, LINE).places
 
 
 class Uneven(Levels):
@@ -224,13 +226,16 @@ def test_depths_that_are_no_binary_steps_are_sorted_by_depth():
     assert [etched(part, plates, (x + (n + 0.5) * STEP_M, y)) for n in range(9)] == [0, 4, 2, 6, 1, 5, 3, 7, 0]
 
 
-@pytest.mark.parametrize(("count", "pitch_um", "line_um"), [(2, 1.85, 2), (16, 1.85, 2), (16, 6.45, 2), (64, 1.0, 3)])
+@pytest.mark.parametrize(
+    ("count", "pitch_um", "line_um"), [(2, 1.85, 2), (6, 1.85, 2), (16, 1.85, 2), (16, 6.45, 2), (64, 1.0, 3)]
+)
 def test_gratings_are_whole_periods_of_printable_pixels(count, pitch_um, line_um):
     levels, plates = job(count)
     pitch = pitch_um * UM
     part = process_monitor(levels, plates, pitch, NM, line_um * UM)
     stripe = math.ceil(line_um / pitch_um) * pitch
-    binary, blazed = 4 * stripe, count * stripe
+    sets = 2**levels.bits
+    binary, blazed = 4 * stripe, sets * stripe
     deepest = plates[levels.bits - 1]
     lines = runs(part, deepest, part.places["grating binary"])
     near = [(a, b) for a, b in lines if abs(a) <= 800_000 and abs(b) <= 800_000]
@@ -238,12 +243,12 @@ def test_gratings_are_whole_periods_of_printable_pixels(count, pitch_um, line_um
     assert extent >= 1_000_000
     assert {b - a for a, b in near} == {round(binary / 2 / NM)}
     assert {b[0] - a[0] for a, b in itertools.pairwise(near)} == {round(binary / NM)}
-    # Along the blazed grating: rises level by level, then falls to the deepest floor.
+    # Along the blazed grating: all sets of masks, rising from the deepest.
     x, y = part.places["grating blazed"]
     periods = max(4, math.ceil(1 * MM / blazed * (1 - 1e-9)))
     start = x - periods * blazed / 2
-    codes = [etched(part, plates, (start + (n + 0.5) * stripe, y)) for n in range(periods * count)]
-    assert codes == [*range(count)][::-1] * periods
+    codes = [etched(part, plates, (start + (n + 0.5) * stripe, y)) for n in range(periods * sets)]
+    assert codes == [*range(sets)][::-1] * periods
     assert etched(part, plates, (start - 0.5 * stripe, y)) == 0
 
 

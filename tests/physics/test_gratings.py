@@ -32,7 +32,9 @@ def efficiency(camera: Camera, height: np.ndarray, order: int) -> float:
     return box(height, middle + order * PER_ORDER) / box(np.zeros_like(height), middle)
 
 
-@pytest.mark.parametrize(("levels", "percent"), [(2, 40.5), (4, 81.1), (8, 95.0), (16, 98.7)])
+@pytest.mark.parametrize(
+    ("levels", "percent"), [(2, 40.5), (3, 68.4), (4, 81.1), (5, 87.5), (6, 91.2), (8, 95.0), (16, 98.7)]
+)
 @pytest.mark.parametrize("cells_per_level", [1, 4])
 def test_blazed_grating(levels: int, percent: float, cells_per_level: int):
     """The same plate drawn with one cell per level or four: the cell's own sinc² makes both right."""

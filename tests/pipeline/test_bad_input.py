@@ -79,7 +79,7 @@ def test_spec_that_is_none(cli, tmp_path, text, words):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("process.levels=12", ["process.levels", "power of two", "12"]),
+        ("process.levels=65", ["process.levels", "from 2 to 64", "65"]),
         ("optimize.stepz=3", ["optimize.stepz", "steps"]),
         ("doe.pitch=2 kg", ["doe.pitch"]),
         ("doe.samples=63", ["doe.aperture", "samples x pitch"]),
@@ -351,8 +351,8 @@ def test_a_pickle_is_never_loaded(cli, tmp_path):
         (("--step", "75 nm", "--pitch", "2 um"), ["--levels"]),
         (("--levels", 16, "--pitch", "2 um"), ["--step"]),
         (("--levels", 16, "--step", "75 nm"), ["--pitch"]),
-        (("--levels", 12, "--step", "75 nm", "--pitch", "2 um"), ["power of two", "12"]),
-        (("--levels", 10**30, "--step", "75 nm", "--pitch", "2 um"), ["power of two"]),
+        (("--levels", 65, "--step", "75 nm", "--pitch", "2 um"), ["from 2 to 64", "65"]),
+        (("--levels", 10**30, "--step", "75 nm", "--pitch", "2 um"), ["from 2 to 64"]),
         (("--levels", 16, "--step", "75", "--pitch", "2 um"), ["--step", "unit"]),
         (("--levels", 16, "--step", "75 s", "--pitch", "2 um"), ["--step", "unit"]),
         (("--levels", 16, "--step", "0 nm", "--pitch", "2 um"), ["step", "positive"]),
@@ -388,7 +388,7 @@ def test_file_of_another_kind(cli, tmp_path, tiny):
 def test_a_run_brings_its_own_geometry(finished, cli):
     for option, value in {"--step": "75 nm", "--pitch": "1 um", "--scale": "1 nm", "--aperture": "1 mm"}.items():
         refuse(cli("masks", finished.run, option, value), option, "its own geometry")
-    refuse(cli("masks", finished.run, "--levels", 0), "power of two")
+    refuse(cli("masks", finished.run, "--levels", 0), "from 2 to 64")
 
 
 # --- mask orders that changed -------------------------------------------------------------------------------------
