@@ -116,7 +116,7 @@ class LevelParametrization(eqx.Module):
         opened = ((np.arange(count)[::-1, None] >> bits) & 1).astype(np.float32)
         if self.levels.is_full:
             return 1 - opened
-        return opened[jnp.argmax(opened @ depths_m)] - opened
+        return jnp.asarray(opened)[jnp.argmax(opened @ depths_m)] - opened
 
     def depths_m(self, log_depth_ratio: Float[Array, " k"]) -> Float[Array, " k"]:
         """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""

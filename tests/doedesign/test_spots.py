@@ -37,7 +37,9 @@ def problem(count: tuple[int, int], cells: int, levels: int) -> SpotProblem:
 # --- sums over cells --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("levels", "percent"), [(2, 40.5), (4, 81.1), (8, 95.0), (16, 98.7)])
+@pytest.mark.parametrize(
+    ("levels", "percent"), [(2, 40.5), (3, 68.4), (4, 81.1), (5, 87.5), (6, 91.2), (8, 95.0), (16, 98.7)]
+)
 def test_a_blazed_grating_has_its_efficiency_in_the_first_order(levels: int, percent: float):
     """sinc²(1/L), where a level is as wide as a cell: the cell's sinc is then all that the levels cost."""
     field = np.tile(even(levels).light, (1, 8))

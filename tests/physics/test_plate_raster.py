@@ -139,6 +139,12 @@ CASES = {
         1.5e-4,
         window=800,
     ),
+    # Where the masks overlap they etch 6 and 7 steps, which no level is.
+    "six levels": Case(
+        Levels(6, 200e-9),
+        Variation(overlay_x_m=(0.0, 10 * F, -8 * F), overlay_y_m=(3 * F, -10 * F, 4 * F), common_cd_bias_m=8 * F),
+        4e-3,
+    ),
     # Masks turned and grown about the middle of a wafer lie off by up to a whole cell at this die.
     "64 levels far from the wafer's middle": Case(
         Levels(64, 1200e-9 / 64),
@@ -156,7 +162,7 @@ CASES = {
 }
 
 
-QUICK = ("overlay", "almost closed gaps", "almost lost pixels")
+QUICK = ("overlay", "six levels", "almost closed gaps", "almost lost pixels")
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in CASES])

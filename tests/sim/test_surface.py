@@ -146,6 +146,19 @@ def test_overlay_by_several_pixels(level: np.ndarray, by: tuple[int, int]):
     np.testing.assert_allclose(np.asarray(surface.transmission), expected(moved), atol=SAME_LIGHT)
 
 
+def test_masks_that_overlap_make_floors_of_no_level():
+    """Six levels beside each other; the deepest mask of three lies a pixel off, on what the middle one etches."""
+    six = Levels(6, 200e-9)
+    level = np.full((CELLS, CELLS), 5, np.uint8)
+    level[10:30, 12:24] = np.repeat(np.arange(6), 2)
+    surface = plate(level, Variation(overlay_x_m=(0.0, 0.0, PITCH_M)), Process(six))
+    # Drawn are 5 5 4 4 3 3 2 2 1 1 0 0 steps; those of 4 come a pixel later, and 7 where 3 are etched anyway.
+    etched = np.array([1, 5, 4, 4, 7, 3, 2, 2, 1, 1, 0, 0])
+    depth_m = np.zeros((CELLS, CELLS))
+    depth_m[10:30, 12:24] = etched * 200e-9
+    np.testing.assert_allclose(np.asarray(surface.transmission), expected(1000e-9 - depth_m), atol=SAME_LIGHT)
+
+
 def test_a_mask_toward_plus_y_moves_an_opening_to_higher_rows():
     """Half a cell: the opening covers half of its own row and half of the next."""
     single = np.full((CELLS, CELLS), 15, np.uint8)
