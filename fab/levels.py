@@ -53,7 +53,7 @@ class Levels:
 
     def __post_init__(self) -> None:
         if not isinstance(self.count, int) or not FEWEST <= self.count <= MOST:
-            cure = "Powers of two use every set of masks."
+            cure = "For example 6 or 16; powers of two use every set of masks."
             raise InputError("levels", f"must be a whole number from {FEWEST} to {MOST}", self.count, cure)
         if not 0 < self.step_m < math.inf:
             raise InputError("level step", "must be positive and finite", self.step_m, 'Give a step such as "75 nm".')

@@ -150,7 +150,7 @@ class DefectsSpec(SpecTable, frozen=True):
 
 def _level_count(count: int) -> int:
     if not FEWEST <= count <= MOST:
-        raise broken(f"must lie from {FEWEST} to {MOST}", "Powers of two use every set of masks.")
+        raise broken(f"must lie from {FEWEST} to {MOST}", "For example 6 or 16; powers of two use every set of masks.")
     return count
 
 
