@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import gdstk
 import numpy as np
@@ -72,7 +73,8 @@ def test_gdstk_sees_the_level_of_every_pixel(order):
     points = [(float(u), float(v)) for v in y for u in x]
     depth_nm = np.zeros(len(points))
     for mask in manifest.masks:
-        cell = next(c for c in gdstk.read_gds(str(order / mask.file)).cells if c.name == manifest.doe_cell)
+        cells: list[Any] = gdstk.read_gds(str(order / mask.file)).cells
+        cell = next(c for c in cells if c.name == manifest.doe_cell)
         polygons = [p for p in cell.polygons if (p.layer, p.datatype) == (mask.layer, mask.datatype)]
         depth_nm += np.array(gdstk.inside(points, polygons)) * mask.depth_nm
     wanted = np.where(relief(order), 1000 - 200 * LEVEL.astype(float), 0)
