@@ -1,6 +1,7 @@
 """Optimisation of a spec into a design, in memory or in a run folder."""
 
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -33,11 +34,14 @@ from doedesign.runs.folder import (
     input_digests,
     load_checkpoint,
     save_checkpoint,
+    steps_of_run,
+    with_steps,
     write_history,
 )
 from doedesign.runs.level_maps import open_design, read_any_height, write_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files, load_spec, spec_warnings
+from fab.errors import InputError
 from fab.figure import save
 from fab.files import canonical_json, write_atomic
 from fab.height import HeightMap
@@ -61,6 +65,8 @@ if TYPE_CHECKING:
     from doedesign.spots.design import SpotState
 
 log = logging.getLogger("doedesign")
+
+_TRIED, _MANY = 4, 1000  # steps that are timed for a budget, of a run of so many
 
 
 def optimize(
@@ -101,6 +107,49 @@ def optimize(
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(steps(spec, problem, sources, state), spec, state, [])
     return finished_design(spec, problem, state, history)
+
+
+def steps_within(
+    spec: Spec, budget_s: float, out: str | Path | None = None, objectives: Mapping[str, Objective] | None = None
+) -> int:
+    """Number of steps of a spec that this machine does in a time.
+
+    A few steps are tried to learn how long one takes. A number chosen before is kept, so that a stopped run goes on.
+
+    Args:
+        spec: the spec; its own `optimize.steps` does not matter.
+        budget_s: seconds, the compilation of the first step included; the look at the design at the end comes on top.
+        out: run folder; where it has a run of this spec with another number of steps, it keeps that one.
+        objectives: as in `optimize`.
+
+    Raises:
+        InputError: a time that is not positive, or as `optimize`.
+    """
+    if not 0 < budget_s < float("inf"):
+        raise InputError("budget", "must be positive seconds", budget_s, "For example 60.")
+    if out is not None and (kept := steps_of_run(Path(out), spec)) is not None:
+        return kept
+    if not (spec.objectives or spec.aims):
+        raise InputError("budget", "there must be something to improve", "no objective", "Leave it out.")
+    start, ends = time.perf_counter(), []
+    for _ in _trial(with_steps(spec, _MANY), objectives):
+        ends.append(time.perf_counter())
+        if len(ends) > _TRIED or (len(ends) > 1 and ends[-1] - start > budget_s / 4):
+            break
+    first, each = ends[0] - start, (ends[-1] - ends[0]) / (len(ends) - 1)
+    steps = max(1, int((budget_s - first) / each))
+    log.info(f"a step takes {each:.2g} s after {first:.2g} s for the first: {steps} steps in {budget_s:g} s")
+    return steps
+
+
+def _trial(spec: Spec, objectives: Mapping[str, Objective] | None) -> Iterator[Any]:
+    """Steps of a spec from its start, one by one."""
+    if (task := _aimed_task(spec)) is not None:
+        yield from task.steps(task.initial_state())
+        return
+    files = input_files(spec)
+    problem, sources = problem_of(spec, files, objectives)
+    yield from steps(spec, problem, sources, initial_state(spec, problem, sources, files, _reader(spec)))
 
 
 def _optimize_in(
@@ -153,24 +202,29 @@ def _resume(
     return OptimizationState(parameters, adam, step), history
 
 
-def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
-    """Design what the spots, the area or the foci of a spec ask for; in a run, go on from its checkpoint.
-
-    None for a spec that has none of them.
-    """
+def _aimed_task(spec: Spec) -> Any:
+    """Task of the spots, the areas or the foci of a spec, which all have the same methods; None without them."""
     if spec.spots is not None:
         from doedesign.spots.design import SpotTask
 
-        task = SpotTask.from_spec(spec)
-    elif spec.areas:
+        return SpotTask.from_spec(spec)
+    if spec.areas:
         from doedesign.areas.design import AreaTask
 
-        task = AreaTask.from_spec(spec)
-    elif spec.focus is not None:
+        return AreaTask.from_spec(spec)
+    if spec.focus is not None:
         from doedesign.focus.design import FocusTask
 
-        task = FocusTask.from_spec(spec)
-    else:
+        return FocusTask.from_spec(spec)
+    return None
+
+
+def _aimed_design(spec: Spec, run: Run | None = None) -> Design | None:
+    """Design what the spots, the areas or the foci of a spec ask for; in a run, go on from its checkpoint.
+
+    None for a spec that has none of them.
+    """
+    if (task := _aimed_task(spec)) is None:
         return None
     stored, history = None if run is None else load_checkpoint(run, task.template), []
     if stored is None:

@@ -39,6 +39,7 @@ def optimize(
     *,
     out: Path | None = None,
     set_: Overrides = (),
+    budget: float | None = None,
     overwrite: Flag = False,
     allow_code: Flag = False,
     json_: AsJson = False,
@@ -48,16 +49,20 @@ def optimize(
     Args:
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
+        budget: Seconds that the steps may take: as many as this machine makes of them, in place of optimize.steps.
         overwrite: Where the folder has the run of another spec, remove it and all that was made of it.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
     """
     from doedesign.design.objectives import import_objectives
     from doedesign.optimization import optimize as work
+    from doedesign.optimization import steps_within
     from doedesign.spec import load_spec
 
     read = load_spec(spec, set_)
     folder = out or Path("runs") / read.name
     own = import_objectives(read) if allow_code else None
+    if budget is not None:
+        set_ = (*set_, f"optimize.steps={steps_within(read, budget, None if overwrite else folder, own)}")
     work(spec, folder, overrides=set_, objectives=own, overwrite=overwrite)
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
 

@@ -240,6 +240,21 @@ def _changed_keys(path: Path, spec: Spec) -> str:
     return ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
 
 
+def with_steps(spec: Spec, steps: int) -> Spec:
+    """The same spec with another number of steps."""
+    return spec.model_copy(update={"optimize": spec.optimize.model_copy(update={"steps": steps})})
+
+
+def steps_of_run(folder: Path, spec: Spec) -> int | None:
+    """Number of steps of the run in a folder if it has the spec but for that number; None for any other folder."""
+    try:
+        steps = load_spec(folder / "spec.toml").optimize.steps
+        same = _read_manifest(folder).spec_sha256 == spec_digest(with_steps(spec, steps))
+    except InputError:
+        return None
+    return steps if same else None
+
+
 def begin_run(run: Run) -> None:
     """Write the manifest of a claimed run that begins, its spec, and its pictures."""
     for key, name in kept_pictures(run.spec).items():

@@ -7,9 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from doedesign import optimization
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
 from doedesign.design.problem import losses, problem_of, view_of
+from doedesign.runs.folder import begin_run, claim_run
 from doedesign.spec import Spec, load_spec
+from fab.errors import InputError
 from fab.levels import quantise
 from sim.propagation.hankel import radial_profile
 
@@ -108,3 +111,26 @@ def test_looks_see_every_depth_equally_often() -> None:
     assert np.abs(offsets).max() <= spec.sensor.pixel_m / 2
     # The mean of 200 uniform numbers of half-width 1/2 pixel is within 4 sigma = 4 x 0.29 / sqrt(200) = 8 % of a pixel.
     assert np.abs(offsets.mean(axis=0)).max() < 0.08 * spec.sensor.pixel_m
+
+
+def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that adds a tenth of a second per look, after a first step of two seconds; a run keeps its number."""
+    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
+    monkeypatch.setattr(optimization, "_trial", lambda spec, objectives: iter(range(spec.optimize.steps)))
+    monkeypatch.setattr(optimization.time, "perf_counter", lambda: next(times))
+    assert optimization.steps_within(spec, 10.0) == 80  # (10 - 2) / 0.1
+    times = iter([0.0, 2.0, 2.1, 2.2])
+    assert optimization.steps_within(spec, 1.0) == 1  # too short a time for more
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="budget: must be positive seconds"):
+            optimization.steps_within(spec, wrong)
+    begun = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.steps=7"])
+    with claim_run(tmp_path / "run", begun, {}) as run:
+        begin_run(run)
+    assert optimization.steps_within(spec, 10.0, tmp_path / "run") == 7
+    other = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.seed=3"])
+    times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
+    assert optimization.steps_within(other, 10.0, tmp_path / "run") == 80
+    with pytest.raises(InputError, match="something to improve"):
+        optimization.steps_within(load_spec(EXAMPLES / "quick.toml", ["objective=[]", "optimize.steps=0"]), 10.0)
