@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import doedesign.optimization as optimization
+import doedesign.runs.fabricated
 from doedesign.build import camera_from_spec
 from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
@@ -15,7 +16,7 @@ from doedesign.runs.fabricated import fabricated
 from doedesign.spec import Spec, load_spec, spec_to_toml
 from fab.errors import InputError
 from fab.order.verify import verify
-from tests.pictures import leave_out_pictures
+from tests.pictures import leave_out_pictures, leave_out_pictures_of_orders
 
 SPEC = """
 name = "bare"
@@ -78,7 +79,8 @@ def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
 def test_a_run_leads_to_a_verified_order_and_to_a_plate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, distance: str, least: float
 ):
-    leave_out_pictures(monkeypatch, optimization)
+    leave_out_pictures(monkeypatch, optimization, doedesign.runs.fabricated)
+    leave_out_pictures_of_orders(monkeypatch)
     spec = spec_of(tmp_path, f'sensor.distance="{distance}"', f"optimize.start_options.focal_length='{distance}'")
     optimize(spec, tmp_path / "run")
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())

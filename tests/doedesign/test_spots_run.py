@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import doedesign.optimization as optimization
+import doedesign.runs.fabricated
 from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
 from doedesign.runs.fabricated import fabricated
@@ -16,7 +17,7 @@ from doedesign.spots.orders import OrderTable, order_table
 from fab.errors import InputError
 from fab.order.verify import verify
 from fab.process import Variation
-from tests.pictures import leave_out_pictures
+from tests.pictures import leave_out_pictures, leave_out_pictures_of_orders
 
 SPEC = """
 name = "fan"
@@ -84,7 +85,7 @@ def test_a_design_of_orders_repeats_its_cell(tmp_path: Path):
 
 
 def test_a_run_holds_its_table_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    leave_out_pictures(monkeypatch)
+    leave_out_pictures(monkeypatch, optimization)
     spec = spec_of(tmp_path)
     whole = tmp_path / "whole"
     optimize(spec, whole)
@@ -113,7 +114,7 @@ def test_a_run_holds_its_table_and_goes_on_where_it_was_stopped(tmp_path: Path, 
 
 def test_a_plate_as_fabricated_has_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Etches 5 % too deep make beams unequal, by as much as a transform of the deeper cell says."""
-    leave_out_pictures(monkeypatch)
+    leave_out_pictures(monkeypatch, doedesign.runs.fabricated)
     design = optimize(spec_of(tmp_path, "spots.count=[3, 1]"))
     found = fabricated(design, variation=Variation(common_depth_scale=0.05), out=tmp_path / "made")
     rate, step = design.camera.waves_per_metre(532e-9), design.levels.step_m
@@ -131,7 +132,8 @@ def test_a_plate_as_fabricated_has_its_table(tmp_path: Path, monkeypatch: pytest
 
 
 def test_masks_of_a_run_are_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    leave_out_pictures(monkeypatch)
+    leave_out_pictures(monkeypatch, optimization)
+    leave_out_pictures_of_orders(monkeypatch)
     optimize(spec_of(tmp_path), tmp_path / "run")
     done = write_masks(tmp_path / "run", tmp_path / "order")
     assert done.report.passed

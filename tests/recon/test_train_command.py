@@ -45,7 +45,7 @@ from fab.pictures import read_display
 from sim.psf_bank import psf
 from sim.store import read_bank
 from tests.doedesign.small_runs import finished_run
-from tests.pictures import leave_out_pictures
+from tests.pictures import leave_out_pictures, leave_out_pictures_of_orders
 
 ROOT = Path(__file__).parents[2]
 # One colour, a network without transforms of its own and a loss of two terms compile in the least time.
@@ -245,8 +245,11 @@ def test_pictures_are_drawn(tmp_path: Path, rng: np.random.Generator):
         plot_training([], "small")
 
 
-def test_the_trained_plate_can_be_drawn(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_trained_plate_can_be_drawn(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """A training is a run with another plate: its masks are those of the map that it learnt."""
+    leave_out_pictures_of_orders(monkeypatch)
     assert main(["masks", str(whole), "--out", str(tmp_path / "order"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["checks"] > 0
     source = read_json(tmp_path / "order" / "manifest.json")["source"]
