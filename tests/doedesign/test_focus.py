@@ -84,6 +84,16 @@ def test_one_focus_is_a_lens(spec_file: Path):
     assert table.width_m[0] == pytest.approx(other.width_m[0], rel=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("levels", [3, 6])
+def test_a_lens_of_any_number_of_levels(spec_file: Path, levels: int):
+    """Of an ideal lens's light levels leave sinc²(1/L), and cells 96.3 % of that."""
+    step = f"process.level_step={1154.8 / levels:.2f} nm"  # one wave at 532 nm
+    design, table = designed(spec_file, f"process.levels={levels}", step)
+    assert np.unique(design.level_map.level).tolist() == list(range(levels))
+    assert table.strength[0] == pytest.approx(np.sinc(1 / levels) ** 2 * 0.963, abs=0.005)
+
+
 def _radius(design: doedesign.Design) -> np.ndarray:
     grid = design.camera.grid
     return np.hypot(grid.axis_m("y")[:, None], grid.axis_m("x"))
