@@ -63,8 +63,8 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
         if name not in known:
             cure = f"Choose one of {', '.join(known)}."
             yield InputError(f"focus.colours[{index}]", "must be a colour of the spec", f'"{name}"', cure)
-    for table in ("spots", "area"):
-        if getattr(spec, table) is not None:
+    for table, given in (("spots", spec.spots is not None), ("area", bool(spec.areas))):
+        if given:
             yield InputError("focus", f"takes the place of {table}", "both", f"Remove [focus] or [{table}].")
     if spec.sensor.distance_m is None:
         cure = "Give sensor.distance instead of optics.focal_length."
