@@ -53,7 +53,7 @@ def camera_from_spec(spec: Spec) -> Camera:
         light=spec.optics.light,
         polarisation=spec.optics.polarisation,
         beam=beam_from_spec(spec),
-        distance_m=spec.sensor.distance_m,
+        distance_m=np.inf if spec.sensor.in_angles else spec.sensor.distance_m,
     )
 
 

@@ -9,7 +9,9 @@ import math
 import re
 from functools import cache
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from fab.errors import InputError
 
@@ -85,6 +87,42 @@ def metres(value: float | str, name: str = "length", *, infinite: bool = False) 
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise InputError(name, rule, repr(value), cure)
     return float(value)
+
+
+def format_angle(angle_rad: float) -> str:
+    """Return an angle as ASCII in degrees ("0.05 deg"), a small one in microradians, to twelve digits."""
+    return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
+
+
+class PlaceUnit(NamedTuple):
+    """How places in the light of a DOE are told: as lengths on a sensor, or as angles where there is no sensor.
+
+    A place without a sensor is a direction sine, as a length at a distance of one metre.
+
+    Attributes:
+        name: the unit as pictures write it.
+        suffix: the unit at the end of a key or of a column's name.
+        scale: of an axis on which pixels are equally wide: metres per unit, or 1 for sines.
+        in_degrees: whether places are sines, told in degrees.
+    """
+
+    name: str
+    suffix: str
+    scale: float
+    in_degrees: bool = False
+
+    def of(self, place_m: Any) -> Any:
+        """Distance of places from the axis, in the unit."""
+        return np.degrees(np.arcsin(np.clip(place_m, -1, 1))) if self.in_degrees else place_m / self.scale
+
+    def size(self, size_m: Any) -> Any:
+        """Size of what lies about the axis, in the unit."""
+        return 2 * self.of(np.divide(size_m, 2)) if self.in_degrees else size_m / self.scale
+
+
+MICROMETRES = PlaceUnit("µm", "um", UM)
+MILLIMETRES = PlaceUnit("mm", "mm", MM)
+DEGREES = PlaceUnit("°", "deg", 1.0, in_degrees=True)
 
 
 def format_length(length_m: float) -> str:

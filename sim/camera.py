@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float
 
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.units import format_length
+from fab.units import DEGREES, PlaceUnit, format_length
 from sim.illumination import Beam, beam_amplitude, beam_irradiance
 from sim.material import fresnel_transmission, refractive_index
 
@@ -76,7 +76,8 @@ class Camera:
             all light that passes the aperture: nothing is vignetted.
         light: "scalar" for a thin element, "edges" for one whose walls add their light (`sim.rigorous.edge_optic`).
         polarisation: "unpolarised", or "x" or "y", the axis along which the electric field lies; for light with edges.
-        distance_m: distance of the sensor behind the DOE where there is no lens and `focal_length_m` is infinite.
+        distance_m: distance of the sensor behind the DOE where there is no lens and `focal_length_m` is infinite. At
+            infinity there is no sensor but directions: `pixel_m` and all places are direction sines.
         beam: the beam that lights the DOE, of whose power energies are shares; None for plane or spherical waves, whose
             power is that on the clear aperture.
     """
@@ -107,11 +108,23 @@ class Camera:
         if self.distance_m is not None and (self.mapping != "sine" or any(self.distortion) or self.doe_distance_m):
             rule = "without a lens there is no mapping, distortion or distance before it"
             raise InputError("mapping", rule, self.lens_text, "Leave them out.")
+        if self.in_angles and self.window * self.pixel_m > 2 * (1 + 1e-9):
+            rule, got = "directions end at a sine of 1", f"{self.window * self.pixel_m / 2:.4g} at the window's edge"
+            raise InputError("window", rule, got, f"Choose at most {int(2 / self.pixel_m)} pixels, or finer ones.")
         check_lens(self.mapping, self.distortion, self.window * self.pixel_m / 2**0.5 / self.sensor_distance_m)
         for key, words in (("light", get_args(Light)), ("polarisation", get_args(Polarised))):
             if getattr(self, key) not in words:
                 rule = f"must be one of {', '.join(words)}"
                 raise InputError(key, rule, repr(getattr(self, key)), "Choose one of them.")
+
+    @property
+    def in_angles(self) -> bool:
+        """Whether light is looked at by its direction, and not on a sensor; pixels are equally wide in the sine."""
+        return self.distance_m == math.inf
+
+    def told_in(self, unit: PlaceUnit) -> PlaceUnit:
+        """The unit in which to tell places: the one given, or degrees where there is no sensor."""
+        return DEGREES if self.in_angles else unit
 
     @property
     def is_sine(self) -> bool:
@@ -125,8 +138,10 @@ class Camera:
         For a DOE at a distance s before the lens it is the element B of the ray matrix from DOE to sensor,
         d + s (1 - d/f) with d from lens to sensor, which Collins' integral has in place of d (S. A. Collins, J. Opt.
         Soc. Am. 60, 1168, 1970). In the focal plane B = f whatever s is, and nothing is left of the lens's curvature:
-        there s changes phases on the sensor alone. Without a lens B = d.
+        there s changes phases on the sensor alone. Without a lens B = d, and 1 where places are direction sines.
         """
+        if self.in_angles:
+            return 1.0
         if self.distance_m is not None:
             return self.distance_m
         return self.focal_length_m + self.defocus_m - self.doe_distance_m * self.defocus_m / self.focal_length_m
@@ -134,8 +149,11 @@ class Camera:
     def curvature_per_m(self, source_per_m: float = 0.0) -> float:
         """Curvature of the wave behind the DOE as the sensor's distance has it, for a source's curvature at the DOE.
 
-        Lens and propagation leave A/B of the ray matrix, 1/d - 1/f for a DOE on the lens, and 0 in the focal plane.
+        Lens and propagation leave A/B of the ray matrix, 1/d - 1/f for a DOE on the lens, and 0 in the focal plane and
+        at infinity.
         """
+        if self.in_angles:
+            return source_per_m
         if self.doe_distance_m:
             return source_per_m - self.defocus_m / self.focal_length_m / self.sensor_distance_m
         return source_per_m + 1 / self.sensor_distance_m - 1 / self.focal_length_m
@@ -201,6 +219,8 @@ class Camera:
     @property
     def lens_text(self) -> str:
         """The lens's mapping in words, or that there is none."""
+        if self.in_angles:
+            return "no lens, directions of light; pixels are equally wide in the sine of the angle"
         if self.distance_m is not None:
             return f"no lens, sensor {format_length(self.distance_m)} behind the DOE"
         names = {"sine": "places follow the sine of the angle", "tangent": "places follow the tangent of the angle"}
@@ -236,9 +256,12 @@ class Camera:
     def defocus_radius_m(self, depth_m: float) -> float:
         """Radius on the sensor of the geometric blur disc: D/2 · |B/z + 1 - d/f|, or D f / (2 z) in the focal plane.
 
-        B is `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow.
+        B is `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow, and
+        without a sensor the sine that the aperture fills as seen from the source.
         """
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
+        if self.in_angles:
+            return self.aperture_m / 2 * inverse_depth
         if self.distance_m is not None:
             return self.aperture_m / 2 * (self.distance_m * inverse_depth + 1.0)
         distance = self.focal_length_m + self.defocus_m

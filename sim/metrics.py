@@ -404,7 +404,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) -> list[dict[str, Any]]:
     """One row per depth and colour: `colour`, `depth_m` (None for infinity) and the metrics of a table.
 
-    A ring:disc ratio without any light in the disc is infinite.
+    A ring:disc ratio without any light in the disc is infinite. Lengths on a sensor are angles where there is none, and
+    their names end in `_rad`.
     """
     rows = []
     for d, depth in enumerate(inputs.depths_m):
@@ -416,7 +417,10 @@ def metric_rows(inputs: MetricInputs, table: Literal["design", "fabricated"]) ->
                     continue
                 if table in metric.tables and metric.depths in shown:
                     value = metric.of(inputs, c, d)
-                    row[name] = None if value is None else float(value)
+                    key = name
+                    if metric.unit == "m" and inputs.camera.in_angles:
+                        key, value = f"{name.removesuffix('_m')}_rad", np.arcsin(min(float(value), 1.0))
+                    row[key] = None if value is None else float(value)
             rows.append(row)
     return rows
 

@@ -44,7 +44,8 @@ class PsfBank(eqx.Module):
             jax where it is traced.
         colours: name of each entry of the first axis.
         depths_m: source depth of each entry of the second axis, metres.
-        pixel_m: pixel pitch, metres. The chief ray is at the centre of the window.
+        pixel_m: pixel pitch, metres, or a direction sine where there is no sensor (`Camera.in_angles`). The chief ray
+            is at the centre of the window.
         field_rad: field angles (y, x).
         camera: the camera they were computed for, if it is known.
     """
@@ -120,7 +121,7 @@ class PsfBank(eqx.Module):
         rows = {
             "colours": ", ".join(self.colours),
             "depths": ", ".join(length_text(z) for z in self.depths_m),
-            "pixels": f"{x} x {y} of {length_text(self.pixel_m)}",
+            "pixels": f"{x} x {y} of {length_text(self.pixel_m) if self.camera is None else self._pixel_text}",
         }
         if self.camera is None:
             return html_of("PSFs", rows)
@@ -129,6 +130,12 @@ class PsfBank(eqx.Module):
             values = self.metric(name)
             rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
         return html_of("PSFs", rows, self.plot())
+
+    @property
+    def _pixel_text(self) -> str:
+        from sim.plots.places import size_text
+
+        return size_text(self.metric_inputs().camera, self.pixel_m)
 
     def as_optic(self) -> "BankOptic":
         """An optic that mixes these PSFs linearly in 1/z."""

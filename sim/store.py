@@ -109,10 +109,15 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
     description = {
         "colours": list(bank.colours),
         "depths_m": [repr(float(depth)) for depth in bank.depths_m],
-        "pixel_m": repr(float(bank.pixel_m)),
+        _pixel_key(bank): repr(float(bank.pixel_m)),
         "field_rad": [repr(float(angle)) for angle in bank.field_rad],
     }
     _write(Path(path), channels, {_BANK: canonical_json(description).decode()}, extra)
+
+
+def _pixel_key(bank: "sim.psf_bank.PsfBank") -> str:
+    """What the pitch of a bank's pixels is called: they have a length, or only a direction."""
+    return "pixel_sine" if bank.camera is not None and bank.camera.in_angles else "pixel_m"
 
 
 def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = np.inf) -> "sim.psf_bank.PsfBank":
@@ -190,14 +195,15 @@ def _bank_description(
         colours = tuple(str(colour) for colour in described["colours"])
         depths = tuple(float(depth) for depth in described["depths_m"])
         y, x = (float(angle) for angle in described["field_rad"])
-        pixel = described["pixel_m"]
+        key = "pixel_sine" if "pixel_sine" in described else "pixel_m"
+        pixel = described[key]
     except (ValueError, KeyError, TypeError) as error:
         rule = "must list colours, depths_m, pixel_m and field_rad"
         raise InputError(f"{path}: {_BANK}", rule, f'"{error!r}"', "Write the file again.") from error
     if not colours or not all(depth > 0 for depth in depths) or not depths:
         rule = "needs at least one colour and depths above 0"
         raise InputError(f"{path}: {_BANK}", rule, f"{colours} and {depths}", "Write the file again.")
-    return colours, depths, _length(path, f"{_BANK}.pixel_m", pixel), (y, x)
+    return colours, depths, _length(path, f"{_BANK}.{key}", pixel), (y, x)
 
 
 def _measured_colours(path: str | Path, channels: Mapping[str, Any]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
 from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, in_plane
 from doedesign.design.design import Design
 from doedesign.spec import input_files
-from fab.units import format_length
+from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length
 from sim.camera import Camera
 from sim.metrics import zeroth_order
 from sim.optic import CellOptic
@@ -31,17 +31,25 @@ _STRAIGHT, _ROUND = 0.1, 0.03
 class Profile:
     """Light along a line through the middle of an area, over the mean of its flat part.
 
+    Places, sizes and edges are metres on the sensor, and radians where there is none.
+
     Attributes:
         place_m: places from the middle.
         light: light there.
         wanted: light wanted.
         size_m: distance between the outermost places with half the light; None without them.
         edge_m: mean of the distances from 90 to 13.5 % on both sides; None where there is no such fall.
+        in_angles: whether places are angles.
     """
 
     place_m: Float[np.ndarray, " n"]
     light: Float[np.ndarray, " n"]
     wanted: Float[np.ndarray, " n"]
+    in_angles: bool = False
+
+    def in_unit(self, value_m: Any, unit: PlaceUnit) -> Any:
+        """Places, a size or an edge in a unit of length, or in degrees."""
+        return np.degrees(value_m) if self.in_angles else value_m / unit.scale
 
     @property
     def size_m(self) -> float | None:
@@ -121,14 +129,16 @@ class AreaTable:
 
     @property
     def place(self) -> str:
-        """The colour that lights it, and how far away it lies."""
+        """The colour that lights it, and how far away it lies on a sensor."""
+        if self.camera.in_angles:
+            return self.camera.colours[0].name
         return f"{self.camera.colours[0].name}, {format_length(float(f'{self.camera.sensor_distance_m:.4g}'))}"
 
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
-        profiles = (("x", self.along_x), ("y", self.along_y))
-        sizes = {f"size_{name}_m": p and p.size_m for name, p in profiles}
-        edges = {f"edge_{name}_m": p and p.edge_m for name, p in profiles}
+        profiles, unit = (("x", self.along_x), ("y", self.along_y)), "rad" if self.camera.in_angles else "m"
+        sizes = {f"size_{name}_{unit}": p and p.size_m for name, p in profiles}
+        edges = {f"edge_{name}_{unit}": p and p.edge_m for name, p in profiles}
         return {
             "efficiency": self.efficiency,
             "contrast": self.contrast,
@@ -151,8 +161,9 @@ class AreaTable:
         """One line."""
         size = ""
         if self.along_x is not None and self.along_y is not None:
-            wide = [p.size_m for p in (self.along_x, self.along_y)]
-            size = ", {} x {} um at half the light".format(*("?" if w is None else f"{w * 1e6:.5g}" for w in wide))
+            found = [(p, p.size_m) for p in (self.along_x, self.along_y)]
+            wide = ["?" if w is None else f"{p.in_unit(w, MICROMETRES):.5g}" for p, w in found]
+            size = f", {wide[0]} x {wide[1]} {self.camera.told_in(MICROMETRES).suffix} at half the light"
         pixels = "" if self.pixel_contrast is None else f" ({100 * self.pixel_contrast:.2f} % on pixels)"
         return (
             f"{self.target.shape}: {100 * self.efficiency:.2f} % of the light (ceiling: none known), contrast "
@@ -161,13 +172,13 @@ class AreaTable:
         )
 
     def to_csv(self) -> str:
-        """Both profiles: axis, place in millimetres, light and light wanted."""
+        """Both profiles: axis, place in millimetres or degrees, light and light wanted."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["axis", "place_mm", "light", "wanted"])
+        writer.writerow(["axis", f"place_{self.camera.told_in(MILLIMETRES).suffix}", "light", "wanted"])
         for axis, profile in (("x", self.along_x), ("y", self.along_y)):
             if profile is not None:
-                rows = zip(profile.place_m * 1e3, profile.light, profile.wanted, strict=True)
+                rows = zip(profile.in_unit(profile.place_m, MILLIMETRES), profile.light, profile.wanted, strict=True)
                 writer.writerows([axis, *(f"{value:.9g}" for value in row)] for row in rows)
         return out.getvalue()
 
@@ -294,7 +305,10 @@ def _profile(over: Float[np.ndarray, "v u"], target: AreaTarget, camera: Camera,
     share = _STRAIGHT if target.shape == "rectangle" else _ROUND
     near = np.abs(across) <= max(share * target.size_m[1 - axis], np.abs(across).min() * 1.001)
     light, wanted = (np.compress(near, values, 1 - axis).mean(1 - axis) for values in (over, target.value))
-    return Profile(_places(target, camera, axis), light, wanted)
+    place, centre = _places(target, camera, axis), target.centre_m[axis]
+    if camera.in_angles:
+        place = np.arcsin(place + centre) - np.arcsin(centre)
+    return Profile(place, light, wanted, camera.in_angles)
 
 
 def _on_pixels(over: Float[np.ndarray, "v u"], target: AreaTarget, camera: Camera) -> float | None:

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from doedesign.design.patterns import picture_light
 from doedesign.spec.targets.areas import AreaSpec
 from fab.errors import InputError
-from fab.units import format_length
+from fab.units import DEGREES, format_length
 from sim.camera import Camera
 from sim.illumination import GaussianBeam
 
@@ -104,7 +104,7 @@ class AreaTarget:
             # A multiple of the step from the axis, so that the 0th order is one of the samples.
             first, last = np.floor(ends[0] / step), np.ceil(ends[1] / step)
             if last - first > _MOST:
-                rule = f"at most {_MOST} times lambda f / aperture / {samples:g} across"
+                rule = f"at most {_MOST} times the smallest detail, over {samples:g}, across"
                 got, cure = f"{last - first:.0f}", "Choose a smaller area or aperture."
                 raise InputError("area", rule, got, cure)
             axes.append(np.arange(first, last + 1) * step)
@@ -121,10 +121,16 @@ class AreaTarget:
         sines_y, sines_x = axes
         target = cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns))
         if not target.flat.any():
-            least, got = (format_length(float(f"{size:.3g}")) for size in (_LEAST * edge, min(filter(None, size_m))))
-            rule = f"light falls over {format_length(float(f'{edge:.3g}'))} there, so that an area needs {least}"
+            sizes = edge, _LEAST * edge, min(filter(None, size_m))
+            falls, least, got = (_size_text(camera, size) for size in sizes)
+            rule = f"light falls over {falls} there, so that an area needs {least}"
             raise InputError("area", rule, got, "Choose a larger area, a larger aperture, or a nearer sensor.")
         return target
+
+
+def _size_text(camera: Camera, size_m: float) -> str:
+    """A size with three digits, of length or in degrees."""
+    return f"{DEGREES.size(size_m):.3g} deg" if camera.in_angles else format_length(float(f"{size_m:.3g}"))
 
 
 def finest_detail_m(camera: Camera) -> float:

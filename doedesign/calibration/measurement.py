@@ -226,6 +226,9 @@ def read_measurement(path: Path, camera: Camera) -> Measurement:
     Raises:
         InputError: a mistake in the file, or an image that cannot be used.
     """
+    if camera.in_angles:
+        cure = "Give the spec a sensor.distance, or optics.focal_length, and sensor.pitch."
+        raise InputError("sensor.pixel_angle", "images are measured with a sensor", camera.lens_text, cure)
     spec = load_measurement(path)
     digests = {path.name: sha256_file(path)}
 

@@ -65,6 +65,21 @@ def sensor_from_spec(spec: Spec | None) -> Sensor:
         raise InputError("sensor", rule.replace("`", ""), got, "Change the sensor of the spec.") from error
 
 
+def sensor_side(spec: Spec) -> int:
+    """Binned pixels of the shorter side of a spec's sensor, of which pictures are taken.
+
+    Raises:
+        InputError: a spec without a sensor, or one that does not say how many photosites it has.
+    """
+    if spec.sensor.in_angles:
+        cure = "Give optics.focal_length, sensor.pitch and sensor.resolution."
+        raise InputError("sensor.pixel_angle", "pictures are taken by a sensor behind a lens", "directions", cure)
+    if spec.sensor.resolution is None:
+        cure = "For example `resolution = [4000, 3000]`."
+        raise InputError("sensor.resolution", "pictures need the photosites of the sensor", "nothing", cure)
+    return min(spec.sensor.resolution) // spec.sensor.binning
+
+
 def obstruction_from_spec(
     spec: Spec | None, source: str, given: str | None = None, near_m: Sequence[float] = ()
 ) -> ObstructionKind:

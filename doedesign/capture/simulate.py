@@ -14,7 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel, depth_range_m
-from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, rgb_from_channels, sensor_from_spec
+from doedesign.capture.from_spec import (
+    obstruction_from_spec,
+    occlusion_from_spec,
+    rgb_from_channels,
+    sensor_from_spec,
+    sensor_side,
+)
 from doedesign.capture.images import display_values
 from doedesign.capture.scenes import NamedScene, draw_scene
 from doedesign.design.design import Design
@@ -179,7 +185,7 @@ class Stage(NamedTuple):
 
 
 def _side(spec: Spec | None, size: int | None) -> int:
-    most = _MOST_SIDE if spec is None else min(spec.sensor.resolution) // spec.sensor.binning
+    most = _MOST_SIDE if spec is None else sensor_side(spec)
     side = min(_USUAL_SIDE, most) if size is None else size
     if not 16 <= side <= most:
         rule = f"must lie from 16 to the {most} binned pixels of the sensor's shorter side"

@@ -97,7 +97,7 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     waves = [((np.arange(_SIDE) + rng.random(_SIDE)) / _SIDE - 0.5) * extent for _ in "yx"]
     axis = camera.grid.axis_m("x")
     bend = 0.0 if np.isinf(depth_m) else 1 / depth_m
-    bend += 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+    bend += 0.0 if camera.in_angles else 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
 
     def kernel(seen: np.ndarray) -> np.ndarray:
         """Far field of the cells of a row in some directions; cells farther from the axis are lit more obliquely."""

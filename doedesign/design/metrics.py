@@ -10,9 +10,8 @@ from jaxtyping import Float
 from scipy.ndimage import binary_erosion
 
 from doedesign.design.objectives import Term
-from doedesign.design.patterns import offset_m, spot_centres_m
+from doedesign.design.patterns import offset_m, positive_place, spot_centres_m
 from doedesign.spec import Spec
-from fab.units import parse_length
 from sim.camera import Camera
 from sim.metrics import (
     airy_radius_m,
@@ -110,8 +109,8 @@ def _pattern_numbers(
 def _spot_energies(camera: Camera, psf: Float[np.ndarray, "y x"], options: Any) -> Float[np.ndarray, " spot"]:
     radius = spot_radius_m(camera, mean_wavelength_m(camera.colours[0]))
     axis = camera.axis_m()
-    centres = spot_centres_m(tuple(options["count"]), parse_length(str(options["spacing"])))
-    centres += offset_m(options, "objective")
+    centres = spot_centres_m(tuple(options["count"]), positive_place(options["spacing"], camera, "spacing"))
+    centres += offset_m(options, camera, "objective")
     return np.array(
         [psf[np.hypot(axis[:, None] - y, axis[None, :] - x) <= radius].sum(dtype=np.float64) for y, x in centres]
     )

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.pictures import TIFF_FILES, read_display, read_pixels
-from fab.units import parse_length
+from fab.units import MILLIMETRES, parse_angle, parse_length
 from sim.aperture import circle_coverage
 from sim.camera import Camera
 from sim.light import linear_from_srgb
@@ -31,23 +31,47 @@ def positive_length(text: object, where: str) -> float:
     return length
 
 
+def positive_place(text: object, camera: Camera, where: str, *, size: bool = False) -> float:
+    """Place of an option on the sensor, metres, or an angle where there is none, as its sine; see `positive_length`.
+
+    A `size` lies about the axis: it becomes twice the sine of half its angle.
+    """
+    if not camera.in_angles:
+        return positive_length(text, where)
+    cure = f'For example {where.rpartition(" ")[2]} = "2 deg".'
+    try:
+        angle = parse_angle(str(text))
+    except ValueError as error:
+        raise InputError(where, "must be an angle with a unit", repr(text), cure) from error
+    if not 0 < angle <= np.pi / (1 if size else 2):
+        raise InputError(where, "must be positive and not beyond the horizon", repr(text), cure)
+    return float(2 * np.sin(angle / 2) if size else np.sin(angle))
+
+
 def spot_centres_m(count: tuple[int, int], spacing_m: float) -> Float[np.ndarray, "spot 2"]:
     """Centres (y, x) of a centred grid of `count` = (columns, rows) spots, metres."""
     x, y = ((np.arange(n) - (n - 1) / 2) * spacing_m for n in count)
     return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def offset_m(options: Mapping[str, Any], where: str) -> tuple[float, float]:
-    """Middle (y, x) of a pattern on the sensor, metres, of the option `offset = ["x", "y"]`; `where` as above."""
-    texts = options.get("offset", ("0 m", "0 m"))
+def offset_m(options: Mapping[str, Any], camera: Camera, where: str) -> tuple[float, float]:
+    """Middle (y, x) of a pattern on the sensor, metres, of the option `offset = ["x", "y"]`; `where` as above.
+
+    Without a sensor it is two angles, as their sines.
+    """
+    if "offset" not in options:
+        return 0.0, 0.0
+    texts, parse = options["offset"], parse_angle if camera.in_angles else parse_length
     rule, cure = "must be two lengths, [x, y]", 'For example offset = ["100 um", "0 um"].'
+    if camera.in_angles:
+        rule, cure = "must be two angles, [x, y]", 'For example offset = ["2 deg", "0 deg"].'
     if not (isinstance(texts, tuple) and len(texts) == 2):
         raise InputError(f"{where}: offset", rule, repr(texts), cure)
     try:
-        x, y = (parse_length(str(text)) for text in texts)
+        x, y = (parse(str(text)) for text in texts)
     except ValueError as error:
         raise InputError(f"{where}: offset", rule, repr(texts), cure) from error
-    return y, x
+    return (float(np.sin(y)), float(np.sin(x))) if camera.in_angles else (y, x)
 
 
 def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
@@ -58,15 +82,12 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
     if not (isinstance(count, tuple) and len(count) == 2 and all(isinstance(n, int) and n > 0 for n in count)):
         rule = "must be two positive whole numbers"
         raise InputError(f"{where}: count", rule, repr(count), "For example count = [5, 5].")
-    centres = spot_centres_m(count, positive_length(options.get("spacing"), f"{where}: spacing"))
-    centres += offset_m(options, where)
-    axis = camera.axis_m()
+    centres = spot_centres_m(count, positive_place(options.get("spacing"), camera, f"{where}: spacing"))
+    centres += offset_m(options, camera, where)
+    axis, unit = camera.axis_m(), camera.told_in(MILLIMETRES)
     if np.abs(centres).max() > axis[-1]:
-        rule = f"spots must lie within the window, {2 * axis[-1] * 1e3:.4g} mm"
-        got, cure = (
-            f"{2 * np.abs(centres).max() * 1e3:.4g} mm",
-            "Use fewer or closer spots, or a larger window.",
-        )
+        wide, got = (f"{unit.size(2 * end):.4g} {unit.suffix}" for end in (axis[-1], np.abs(centres).max()))
+        rule, cure = f"spots must lie within the window, {wide}", "Use fewer or closer spots, or a larger window."
         raise InputError(f"{where}: spacing", rule, got, cure)
     zero = airy_radius_m(camera, camera.colours[0].wavelengths_m[0])
     image = np.zeros((camera.window, camera.window))
@@ -77,17 +98,17 @@ def _spots(camera: Camera, options: dict[str, Any], where: str) -> Image:
 
 
 def _square(camera: Camera, options: dict[str, Any], where: str) -> Image:
-    half = positive_length(options.get("width"), f"{where}: width") / 2
+    half = positive_place(options.get("width"), camera, f"{where}: width", size=True) / 2
     y, x = (
         np.clip((half - np.abs(camera.axis_m() - middle)) / camera.pixel_m + 0.5, 0.0, 1.0)
-        for middle in offset_m(options, where)
+        for middle in offset_m(options, camera, where)
     )
     return y[:, None] * x[None, :]
 
 
 def _disc(camera: Camera, options: dict[str, Any], where: str) -> Image:
-    radius = positive_length(options.get("diameter"), f"{where}: diameter") / 2
-    shape, centre = (camera.window, camera.window), offset_m(options, where)
+    radius = positive_place(options.get("diameter"), camera, f"{where}: diameter", size=True) / 2
+    shape, centre = (camera.window, camera.window), offset_m(options, camera, where)
     return circle_coverage(Grid(shape, camera.pixel_m), 2 * radius, centre).astype(np.float64)
 
 

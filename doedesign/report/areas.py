@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fab.figure import DPI, LIGHT, LINE, MARK, panels, shrunk
-from fab.units import UM
+from fab.units import MICROMETRES
+from sim.plots.places import label_places, size_text, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,29 +46,30 @@ def _title(table: "AreaTable") -> str:
     """Efficiency and contrast of an area."""
     title = f"{100 * table.efficiency:.1f} % of the light, contrast {100 * table.contrast:.2g} %"
     if table.pixel_contrast is not None:
-        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {table.camera.pixel_m / UM:.3g} µm)"
+        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {size_text(table.camera, table.camera.pixel_m)})"
     return title
 
 
 def _draw(table: "AreaTable", figure: "FigureBase") -> None:
     """Draw an area and its profiles side by side."""
-    target, camera = table.target, table.camera
+    target, camera, unit = table.target, table.camera, unit_of(table.camera)
     profiles = [(name, p) for name, p in (("x", table.along_x), ("y", table.along_y)) if p is not None]
     y, _ = camera.image_m(target.sines_y, 0.0)
     _, x = camera.image_m(0.0, target.sines_x)
-    box = [x[0] / UM, x[-1] / UM, y[0] / UM, y[-1] / UM]
+    box = [end / unit.scale for end in (x[0], x[-1], y[0], y[-1])]
     panes = np.atleast_1d(figure.subplots(1, 2 if profiles else 1, width_ratios=(1.0, 1.15)[: 1 + bool(profiles)]))
     image = shrunk(table.light.astype(np.float32), round(_SIDE * DPI))
     shown = panes[0].imshow(image, origin="lower", extent=box, vmin=0, vmax=_TOP, cmap=LIGHT)
-    panes[0].set(xlabel="x (µm)", ylabel="y (µm)")
+    label_places(panes[0], unit)
     panes[0].locator_params(nbins=5)
     figure.colorbar(shown, ax=panes[0], label="light over that inside", shrink=0.8, extend="max")
     for (name, profile), colour in zip(profiles, (LINE, MARK), strict=False):
-        size, place = profile.size_m, profile.place_m / UM
-        label = f"along {name}" + ("" if size is None else f": {size / UM:.5g} µm")
+        size, place = profile.size_m, profile.in_unit(profile.place_m, MICROMETRES)
+        words = "" if size is None else f": {profile.in_unit(size, MICROMETRES):.5g} {unit.name}"
+        label = f"along {name}{words}"
         panes[1].plot(place, profile.light, color=colour, lw=1, label=label)
         panes[1].plot(place, profile.wanted, color=colour, lw=0.8, ls=":")
     if profiles:
         top = max(1.3, 1.05 * max(p.light.max() for _, p in profiles))
-        panes[1].set(xlabel="from the middle (µm)", ylim=(0, top))
+        panes[1].set(xlabel=f"from the middle ({unit.name})", ylim=(0, top))
         panes[1].legend(loc="upper right", title="size at half the light; dots: wanted")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fab.figure import FAINT, INK, LINE, MARK, panels
-from fab.units import MM
+from sim.plots.places import label_places
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,13 +50,13 @@ def plot_orders(table: "OrderTable", ax: "Axes | None" = None) -> "FigureBase":
         else:
             left.xaxis.set_major_locator(MaxNLocator(integer=True))
             left.set_xlabel("spot")
-        y, x = table.places_m.T / MM
+        y, x = table.places_m.T / table.unit.scale
         over = 100 * (table.efficiency / wanted - 1)
         reach = max(float(np.abs(over).max()), 1e-3)
         dots = right.scatter(x, y, c=over, cmap="coolwarm", vmin=-reach, vmax=reach, s=42, edgecolors=INK, lw=0.4)
         right.plot(0, 0, "+", color=FAINT)
-        right.set(xlabel="x (mm)", ylabel="y (mm)")
         right.set_aspect("equal", adjustable="datalim")
+        label_places(right, table.unit)
         right.margins(0.15)
         figure.colorbar(dots, ax=right, label="over its wanted share (%)", shrink=0.8)
     return figure

@@ -16,11 +16,12 @@ from doedesign.spec.training import training_problems
 from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
 from doedesign.spec.values.table import toml_key
 from fab.errors import InputError
-from fab.units import NM, UM, format_length
+from fab.units import DEGREES, MICROMETRES, NM, format_length
 from sim.camera import check_lens, image_place
 from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
 
 _WAVE_TOLERANCE = 0.02
+_FINEST = 16  # pixels per wavelength / aperture
 
 
 # Keys of a beam of each kind: those that it needs, and those that it may have besides.
@@ -69,15 +70,21 @@ def _doe(spec: Spec) -> Iterator[InputError]:
 
 
 def _distance(spec: Spec) -> Iterator[InputError]:
-    """A camera has a lens or none; what belongs to a lens only."""
+    """A camera has a lens or none; what belongs to a lens or a sensor only."""
     optics, sensor = spec.optics, spec.sensor
-    if optics.focal_length_m is None and sensor.distance_m is None:
-        cure = 'Add it, for example focal_length = "8 mm", or sensor.distance for light without a lens.'
+    if optics.focal_length_m is None and sensor.distance_m is None and not sensor.in_angles:
+        cure = (
+            'Add it, for example focal_length = "8 mm", or sensor.distance or sensor.pixel_angle for light without one.'
+        )
         yield InputError("optics.focal_length", "a camera has a lens, or a sensor at a distance", "neither", cure)
     if optics.focal_length_m is not None and sensor.distance_m is not None:
         cure = "Remove it, or optics.focal_length."
         yield InputError("sensor.distance", "it is for light without a lens", "both", cure)
-    if optics.focal_length_m is not None or sensor.distance_m is None:
+    if sensor.in_angles:
+        yield from _directions(spec)
+    elif sensor.pitch_m is None:
+        yield InputError("sensor.pitch", "must be given", "nothing", 'For example `pitch = "1.85 um"`.')
+    if optics.focal_length_m is not None:
         return
     alone = {
         "optics.mapping": optics.mapping != "sine",
@@ -92,6 +99,28 @@ def _distance(spec: Spec) -> Iterator[InputError]:
     if spec.scene.near_m:
         rule = "obstructions are looked past through a lens"
         yield InputError("scene.near", rule, "depths", "Leave them out, or give optics.focal_length.")
+
+
+def _directions(spec: Spec) -> Iterator[InputError]:
+    """What cannot stand beside pixels that are angles, and how far they may reach."""
+    sensor, rule = spec.sensor, "directions are looked at without lens and sensor"
+    beside = {
+        "optics.focal_length": spec.optics.focal_length_m,
+        "sensor.distance": sensor.distance_m,
+        "sensor.pitch": sensor.pitch_m,
+        "sensor.resolution": sensor.resolution,
+    }
+    for key, value in beside.items():
+        if value is not None:
+            yield InputError(key, rule, "also sensor.pixel_angle", "Leave one of them out.")
+    if sensor.window_m > 2:
+        most = int(2 / sensor.pixel_m)
+        got = f"{sensor.window} pixels of {_pixel_text(spec)}, a sine of {sensor.window_m / 2:.4g} at their edge"
+        yield InputError("sensor.window", "directions end at 90 deg, a sine of 1", got, f"Set window = {most} or less.")
+
+
+def _pixel_text(spec: Spec) -> str:
+    return f"{float(spec.told_in(MICROMETRES).of(spec.sensor.pixel_m)):.4g} {spec.told_in(MICROMETRES).suffix}"
 
 
 def _sensor(spec: Spec) -> Iterator[InputError]:
@@ -278,7 +307,7 @@ def _training(spec: Spec) -> Iterator[InputError]:
 
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
-    rules = (_level_warning, _printing_warning, _window_warnings, _occlusion_warning, _limit_warnings)
+    rules = (_level_warning, _printing_warning, _window_warnings, _pixel_warning, _occlusion_warning, _limit_warnings)
     return [warning for rule in rules for warning in rule(spec)]
 
 
@@ -312,18 +341,21 @@ def _image_share(spec: Spec, sine: float) -> float:
 
 def _window_warnings(spec: Spec) -> Iterator[str]:
     sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m or spec.image_distance_m, spec.doe.pitch_m
-    binned = min(sensor.resolution) // sensor.binning
+    binned = min(sensor.resolution or (math.inf,)) // sensor.binning
     if sensor.window > binned:
         yield (
             f"sensor.window: {sensor.window} pixels are more than the {binned} binned pixels of the sensor's shorter "
             "side; PSFs will reach beyond the sensor."
         )
     wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2
-    reach_m = focal_m * _image_share(spec, wavelength_m / (2 * pitch_m))
+    reach_m, unit = focal_m * _image_share(spec, wavelength_m / (2 * pitch_m)), spec.told_in(MICROMETRES)
     if half_m > reach_m:
+        ends, reaches = (
+            f"{unit.of(at):{'.4g' if unit.in_degrees else '.0f'}} {unit.suffix}" for at in (half_m, reach_m)
+        )
         yield (
-            f"sensor.window: it ends {half_m / UM:.0f} um from the axis, but cells of {format_length(pitch_m)} steer "
-            f"{format_length(wavelength_m)} only {reach_m / UM:.0f} um far; "
+            f"sensor.window: it ends {ends} from the axis, but cells of {format_length(pitch_m)} steer "
+            f"{format_length(wavelength_m)} only {reaches} far; "
             f"beyond that the PSF repeats. At most {int(2 * reach_m / sensor.pixel_m)} pixels avoid it."
         )
     depth_m = min(spec.scene.near_m, default=math.inf)
@@ -332,6 +364,17 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
         yield (
             f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
             f"more than the window's {_rounded(sensor.window_m)}; its rim is cut off."
+        )
+
+
+def _pixel_warning(spec: Spec) -> Iterator[str]:
+    """Warn of directions told apart far more finely than diffraction by the aperture lets them differ."""
+    detail = _shortest_m(spec) / spec.doe.aperture_m
+    if spec.sensor.in_angles and spec.sensor.pixel_m < detail / _FINEST:
+        yield (
+            f"sensor.pixel_angle: pixels of {_pixel_text(spec)} are more than {_FINEST} times finer than what an "
+            f"aperture of {format_length(spec.doe.aperture_m)} can show, {DEGREES.of(detail):.4g} deg at "
+            f'{format_length(_shortest_m(spec))}; "{DEGREES.of(detail / 4):.2g} deg" is enough.'
         )
 
 

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from doedesign.spec.response import RESPONSE_KEYS
-from doedesign.spec.values import FROM_TOML, nearest
+from doedesign.spec.values import FROM_TOML, IN_ANGLES, nearest
 from doedesign.spec.values.table import SpecTable, toml_key
 from fab.errors import InputError
 
@@ -66,8 +66,10 @@ def validated(
         overridden: dotted keys whose value was given beside the file.
         si: whether keys are attributes and lengths numbers in SI units, as in JSON, instead of those of TOML.
     """
+    sensor = raw.get("sensor")
+    context = IN_ANGLES if isinstance(sensor, Mapping) and "pixel_angle" in sensor else FROM_TOML
     try:
-        return model.model_validate(raw, by_alias=not si, by_name=si, context=None if si else FROM_TOML)
+        return model.model_validate(raw, by_alias=not si, by_name=si, context=None if si else context)
     except ValidationError as error:
         found = error.errors(include_url=False)
     # Pydantic also calls a list with wrong entries too short, which would only repeat them.

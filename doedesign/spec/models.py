@@ -28,7 +28,6 @@ from doedesign.spec.targets.focus import FocusSpec
 from doedesign.spec.targets.spots import SpotsSpec
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import (
-    FROM_TOML,
     HEIGHT_FILES,
     OBJECTIVES,
     STARTS,
@@ -43,13 +42,14 @@ from doedesign.spec.values import (
     Steps,
     accepted,
     broken,
+    from_toml,
     known,
     length,
     share,
 )
 from doedesign.spec.values.table import SpecTable, optional
 from doedesign.spec.wafer import WaferSpec
-from fab.units import NM, UM, parse_length
+from fab.units import DEGREES, NM, UM, PlaceUnit, parse_length
 from sim.camera import Light, Polarised
 from sim.material import MATERIALS
 
@@ -109,8 +109,8 @@ class OpticsSpec(SpecTable, frozen=True):
     """Lens and light.
 
     Attributes:
-        focal_length_m: focal length of the camera lens the DOE sits on; left out where there is none and the sensor has
-            a `distance`.
+        focal_length_m: focal length of the camera lens the DOE sits on; left out where there is none, and the sensor
+            has a `distance` or a `pixel_angle`.
         design_wavelength_m: wavelength at which the full height of the levels should be one wave.
         colours: colour channels, in the order of a PSF bank's first axis. In TOML, `wavelengths = ["656 nm",
             "589 nm"]` is short for one channel of one wavelength each, named after it ("656nm"), and
@@ -142,7 +142,8 @@ class OpticsSpec(SpecTable, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _spread_wavelengths(cls, table: Any, info: ValidationInfo) -> Any:
-        if info.context != FROM_TOML or not isinstance(table, dict) or "wavelengths" not in table or "colours" in table:
+        short = from_toml(info.context) and isinstance(table, dict) and "wavelengths" in table
+        if not short or "colours" in table:
             return table  # beside colours, the short form is reported as a key too many
         colours = table["wavelengths"]
         if isinstance(colours, list):
@@ -268,7 +269,7 @@ class Spec(SpecTable, frozen=True):
             return table
         areas = [table["area"]] if isinstance(table["area"], Mapping) else table["area"]
         rest = {key: value for key, value in table.items() if key != "area"}
-        return rest | {"area" if info.context == FROM_TOML else "areas": areas}
+        return rest | {"area" if from_toml(info.context) else "areas": areas}
 
     @model_serializer(mode="wrap")
     def _one_area_again(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -289,13 +290,19 @@ class Spec(SpecTable, frozen=True):
 
     @property
     def image_distance_m(self) -> float:
-        """Distance of the sensor from the lens, or from the DOE where there is no lens."""
+        """Distance of the sensor from the lens, or from the DOE where there is no lens; 1 where places are sines."""
+        if self.sensor.in_angles:
+            return 1.0
         return self.sensor.distance_m or (self.optics.focal_length_m or math.nan) + self.sensor.defocus_m
 
     @property
     def propagation(self) -> Literal["far_field", "fresnel"] | None:
         """How light is to get to the sensor behind a lens; None without one, where its distance says it."""
-        return self.optics.propagation if self.sensor.distance_m is None else None
+        return None if self.optics.focal_length_m is None else self.optics.propagation
+
+    def told_in(self, unit: PlaceUnit) -> PlaceUnit:
+        """The unit in which to tell places: the one given, or degrees where there is no sensor."""
+        return DEGREES if self.sensor.in_angles else unit
 
     @property
     def file(self) -> Path | None:

@@ -5,6 +5,7 @@ default, so that nobody uses one unawares: those two commands ask for it.
 """
 
 from collections.abc import Mapping
+from math import sin
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field
@@ -112,7 +113,10 @@ class SensorSpec(SpecTable, frozen=True):
 
     Attributes:
         pitch_m: distance of neighbouring photosites.
-        resolution: photosites along x and along y (as in "4000 x 3000").
+        pixel_angle_rad: in place of `pitch`, where there is neither lens nor `distance`: light is looked at by its
+            direction, and a pixel in the middle is so wide. All pixels are equally wide in the sine of the angle, which
+            is wavelength x order / period for a grating.
+        resolution: photosites along x and along y (as in "4000 x 3000"); for captures alone.
         binning: photosites per pixel and axis.
         window: pixels per side of the square, centred on the chief ray, over which PSFs are computed; binned.
         fill_factor: side of a pixel's light-sensitive square over its pitch; a length ratio, so 0.9 collects
@@ -130,8 +134,9 @@ class SensorSpec(SpecTable, frozen=True):
         noise: noise model.
     """
 
-    pitch_m: Pitch = Field(examples=['"1.85 um"'])
-    resolution: tuple[Count, Count] = Field(examples=["[4000, 3000]"])
+    pitch_m: Pitch | None = optional()
+    pixel_angle_rad: Annotated[float, bounded("rad", 1e-8, 1.2)] | None = optional()
+    resolution: tuple[Count, Count] | None = optional()
     binning: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     window: Annotated[int, Field(strict=True, ge=2, le=8192, examples=["512"])]
     fill_factor: Annotated[float, Field(strict=True, gt=0, le=1)] = 1.0
@@ -148,9 +153,14 @@ class SensorSpec(SpecTable, frozen=True):
     noise: Noise | None = optional()
 
     @property
+    def in_angles(self) -> bool:
+        """Whether there is no sensor, but directions."""
+        return self.pixel_angle_rad is not None
+
+    @property
     def pixel_m(self) -> float:
-        """Distance of neighbouring pixels after binning."""
-        return self.pitch_m * self.binning
+        """Distance of neighbouring pixels after binning, or their width as a direction sine."""
+        return self.binning * (sin(self.pixel_angle_rad) if self.pixel_angle_rad is not None else self.pitch_m or 0.0)
 
     @property
     def window_m(self) -> float:

@@ -7,11 +7,12 @@ from typing import Any
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process import ProcessSpec, SpreadSpec
-from doedesign.spec.values import UNITS
+from doedesign.spec.values import UNITS, HeldAngle
 from doedesign.spec.values.table import SpecTable, toml_key
 from doedesign.spec.variation import ProcessFile, variation_file
 from fab.files import canonical_json, sha256_bytes
 from fab.process import Variation
+from fab.units import parse_angle
 
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
@@ -27,7 +28,8 @@ def spec_digest(spec: Spec) -> str:
 def spec_to_toml(spec: SpecTable, comments: Sequence[str] = ()) -> str:
     """Write a spec with every default filled in, as TOML that reads back to the same spec; `comments` come first."""
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
-    return "\n".join(lines + _table_lines(spec, "")).strip() + "\n"
+    in_angles = isinstance(spec, Spec) and spec.sensor.in_angles
+    return "\n".join(lines + _table_lines(spec, "", in_angles)).strip() + "\n"
 
 
 def spec_to_resolved_toml(spec: Spec, overrides: Sequence[str]) -> str:
@@ -45,20 +47,29 @@ def variation_to_toml(variation: Variation, comments: Sequence[str] = ()) -> str
     return spec_to_toml(variation_file(variation), comments)
 
 
-def _table_lines(table: SpecTable, path: str) -> list[str]:
+def _table_lines(table: SpecTable, path: str, in_angles: bool = False) -> list[str]:
     values, tables = [], []
     for name, given in table.given().items():
         value = given[0] if name == "areas" and len(given) == 1 else given  # the only one is no array
         key = toml_key(name)
         inner = f"{path}.{key}".removeprefix(".")
         if isinstance(value, SpecTable) and not value.inline:
-            tables += ["", f"[{inner}]", *_table_lines(value, inner)]
+            tables += ["", f"[{inner}]", *_table_lines(value, inner, in_angles)]
         elif isinstance(value, tuple) and value and isinstance(value[0], SpecTable) and not value[0].inline:
             for item in value:
-                tables += ["", f"[[{inner}]]", *_table_lines(item, inner)]
+                tables += ["", f"[[{inner}]]", *_table_lines(item, inner, in_angles)]
         elif name != "objectives":  # an empty array of tables is written as none
-            values.append(f"{key} = {_text(name, value)}")
+            kind = table.angles.get(name) if in_angles else None
+            values.append(f"{key} = {_text(name, value) if kind is None else _angle_text(value, kind)}")
     return values + tables
+
+
+def _angle_text(value: Any, kind: HeldAngle) -> str:
+    """Write places that are held as sines as angles, with as few digits as are read back to them."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(_angle_text(item, kind) for item in value)}]"
+    texts = [f"{math.degrees(kind.angle(value)):.{digits}g} deg" for digits in range(4, 16)]
+    return f'"{next((text for text in texts if kind.held(parse_angle(text)) == value), texts[-1])}"'
 
 
 def _text(name: str, value: Any) -> str:

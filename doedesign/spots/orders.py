@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
 from fab.grid import Grid
+from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
 from sim.optic import CellOptic
 from sim.propagation.directions import efficiencies
@@ -75,9 +76,10 @@ class OrderTable:
         strongest_stray: the same of the strongest order around the spots that should have none; None where spots lie on
             no lattice.
         fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
-        places_m: `[spot, (y, x)]` on the sensor.
+        places_m: `[spot, (y, x)]` on the sensor, direction sines without one.
         ceiling: what light allows.
         light: "scalar" or "edges", as the DOE was looked at.
+        unit: in which places are told.
     """
 
     spots: Spots
@@ -88,6 +90,7 @@ class OrderTable:
     places_m: Float[np.ndarray, "m 2"]
     ceiling: Ceiling
     light: str = "scalar"
+    unit: PlaceUnit = MILLIMETRES
 
     @property
     def total(self) -> float:
@@ -144,13 +147,14 @@ class OrderTable:
         )
 
     def to_csv(self) -> str:
-        """The table: order or number, place in millimetres, efficiency, and its share over the wanted one."""
+        """The table: order, place in millimetres or degrees, efficiency, and its share over the wanted one."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["order_x", "order_y", "x_mm", "y_mm", "efficiency", "over_wanted"])
+        unit = self.unit.suffix
+        writer.writerow(["order_x", "order_y", f"x_{unit}", f"y_{unit}", "efficiency", "over_wanted"])
         orders = self.spots.orders if self.spots.orders is not None else np.full((self.spots.count, 2), -1)
         over = self.efficiency / self.spots.shares / self.total
-        for order, place, one, share in zip(orders, self.places_m * 1e3, self.efficiency, over, strict=True):
+        for order, place, one, share in zip(orders, self.unit.of(self.places_m), self.efficiency, over, strict=True):
             names = ["", ""] if self.spots.orders is None else [int(order[1]), int(order[0])]
             writer.writerow([*names, f"{place[1]:.9g}", f"{place[0]:.9g}", f"{one:.9g}", f"{share:.9g}"])
         return out.getvalue()
@@ -184,8 +188,9 @@ def order_table(
     """
     camera, line = optic.camera, optic.camera.lines[0]
     # Directions are what a lens would show in its focus, whatever the light on the DOE and the way behind it.
-    focal = {} if camera.distance_m is None else {"distance_m": None, "focal_length_m": camera.distance_m}
-    bare = camera.beam is not None or camera.distance_m is not None
+    away = camera.distance_m is not None and not camera.in_angles
+    focal = {"distance_m": None, "focal_length_m": camera.distance_m} if away else {}
+    bare = camera.beam is not None or away
     plain = replace(optic, camera=replace(camera, beam=None, **focal)) if bare else optic
     field, coverage, grid = np.asarray(plain.field(line, depth_m)), np.asarray(optic.coverage), camera.grid
     if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
@@ -206,6 +211,7 @@ def order_table(
         _places_m(spots, camera, line.wavelength_m),
         ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
         camera.light,
+        camera.told_in(MILLIMETRES),
     )
 
 

@@ -281,7 +281,10 @@ def resting_depths_m(spec: Spec, kind: ObstructionKind) -> tuple[float, ...]:
 def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
     """Field angles (y, x) of a scene, anywhere on the sensor."""
     share = np.random.default_rng((seed, _SALT_FIELD, number)).uniform(-0.5, 0.5, 2)
-    width, height = (n * spec.sensor.pitch_m for n in spec.sensor.resolution)
+    sensor = spec.sensor
+    assert sensor.resolution is not None
+    assert sensor.pitch_m is not None
+    width, height = (n * sensor.pitch_m for n in sensor.resolution)
     y, x = np.arctan(share * np.array([height, width]) / spec.image_distance_m)
     return float(y), float(x)
 

@@ -27,7 +27,13 @@ from jaxtyping import Float
 from doedesign import __version__
 from doedesign.build import camera_from_spec
 from doedesign.capture.camera import depth_range_m
-from doedesign.capture.from_spec import obstruction_from_spec, occlusion_from_spec, plain_parameters, rgb_from_channels
+from doedesign.capture.from_spec import (
+    obstruction_from_spec,
+    occlusion_from_spec,
+    plain_parameters,
+    rgb_from_channels,
+    sensor_side,
+)
 from doedesign.capture.images import Pictures
 from doedesign.capture.scenes import Batch, SceneData
 from doedesign.design.design import Design
@@ -168,16 +174,11 @@ def _with_options(design: Design, options: Mapping[str, Any]) -> tuple[Design, S
         tables = spec_to_json(spec)
         spec = spec_from_json({**tables, "train": {**tables.get("train", {}), **options}}, "train")
     coarsest = 2**spec.network.depth
-    fitting = _sensor_side(spec) // coarsest * coarsest
+    fitting = sensor_side(spec) // coarsest * coarsest
     if spec.train.size == USUAL_SIZE > fitting >= 2 * coarsest:
         _log.info("training pictures of %d pixels per side, what the sensor has", fitting)
         spec = spec.model_copy(update={"train": spec.train.model_copy(update={"size": fitting})})
     return replace(design, spec=spec), spec
-
-
-def _sensor_side(spec: Spec) -> int:
-    """Binned pixels of the sensor's shorter side."""
-    return min(spec.sensor.resolution) // spec.sensor.binning
 
 
 def _scenes(spec: Spec, kind: ObstructionKind, split: Split) -> tuple[SceneData, SceneData]:
@@ -316,7 +317,7 @@ def _name(path: Path, folder: Path | None) -> str:
 
 def _require_possible(spec: Spec, source: str) -> None:
     """Refuse a frame larger than the sensor, and a network that the camera's colours do not fit."""
-    side = _sensor_side(spec)
+    side = sensor_side(spec)
     if spec.train.size > side:
         rule = f"must be at most the {side} binned pixels of the sensor's shorter side"
         raise InputError(f"{source}: train.size", rule, spec.train.size, "Choose a smaller size.")

@@ -4,5 +4,6 @@ colours  names and line colours of colour channels, positions of depths in a ban
 psfs     point spread functions of every colour and depth
 curves   MTF and encircled energy over colours and depths
 leakage  a PSF as designed and as fabricated, and its leaked and diffracted light
+places   places as lengths or as angles, on axes and in words
 pattern  a target pattern beside the achieved one
 """

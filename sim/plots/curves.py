@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.figure import FAINT, INK, evenly_spaced, length_text, panels
-from fab.units import MM, UM
+from fab.units import MM
 from sim.camera import Camera
 from sim.metrics import encircled_energy, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, line_colours
+from sim.plots.places import unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +44,8 @@ def plot_mtf(
     more than three near or far depths, and of more than six colours, an even choice is shown. A ValueError for no
     depth, or one that is not in a bank.
     """
-    frequencies = transfer.frequencies_per_m * MM
+    per, unit = (np.radians(1.0), "degree") if camera.in_angles else (MM, "mm")
+    frequencies = transfer.frequencies_per_m * per
 
     def finish(axes: "Axes", _: int, group: str) -> None:
         if group == "near":
@@ -52,8 +54,9 @@ def plot_mtf(
         axes.set_xlim(frequencies[1] if group == "near" else 0, frequencies[-1])
 
     both = [(transfer.transfer, transfer.depths_m)] + ([(lens.transfer, lens.depths_m)] if lens is not None else [])
-    words = ("frequency along x (cycles/mm)", "MTF")
-    note = "lens, plate and pixel before sampling; all light counts, also beyond the window"
+    words = (f"frequency along x (cycles/{unit})", "MTF")
+    note = "{}plate and pixel before sampling; all light counts, also beyond the window"
+    note = note.format("degrees about the axis; " if camera.in_angles else "lens, ")
     return _plot_curves(camera, frequencies, both, (near_m, far_m), finish, words, note, ax)
 
 
@@ -70,7 +73,7 @@ def plot_encircled(
     Dotted lines stand at the radius of the geometric defocus disc of near depths, and of the far spot of far ones. A
     ValueError for no depth, or one that is not in a bank.
     """
-    hues = line_colours(camera.colours)
+    hues, unit = line_colours(camera.colours), unit_of(camera)
     radii = bank.pixel_m * np.geomspace(1.0, bank.energy.shape[-1] / np.sqrt(2), _RADII)
     both = [
         (encircled_energy(np.asarray(one.energy), one.pixel_m, radii), one.depths_m)
@@ -83,15 +86,15 @@ def plot_encircled(
         if group == "far":
             lines = [(spot_radius_m(camera, mean_wavelength_m(camera.colours[c])), hues[c]) for c in _shown(camera)]
         for radius, hue in lines:
-            axes.axvline(radius / UM, color=hue, ls=":", lw=1.0)
+            axes.axvline(unit.of(radius), color=hue, ls=":", lw=1.0)
         axes.set_xscale("log")
-        axes.set_xlim(radii[0] / UM, radii[-1] / UM)
+        axes.set_xlim(unit.of(radii[0]), unit.of(radii[-1]))
         axes.xaxis.set_major_formatter("{x:g}")
 
     marks = [*(["far spot (far)"] if far_m else []), *(["geometric defocus disc (near)"] if near_m else [])]
     note = "dotted: " + ", ".join(marks)
-    words = ("radius (µm)", "encircled energy")
-    return _plot_curves(camera, radii / UM, both, (near_m, far_m), finish, words, note, ax)
+    words = (f"radius ({unit.name})", "encircled energy")
+    return _plot_curves(camera, unit.of(radii), both, (near_m, far_m), finish, words, note, ax)
 
 
 def _shown(camera: Camera) -> list[int]:
@@ -139,6 +142,8 @@ def _plot_curves(
         grid[0, 0].set_ylim(0, 1.02)
         keys = [Line2D([], [], color=hues[i], label=colour_label(camera.colours[i])) for i in _shown(camera)]
         if len(both) > 1:
-            keys.append(Line2D([], [], color=INK, **_LENS, label="lens alone"))
+            keys.append(
+                Line2D([], [], color=INK, **_LENS, label="aperture alone" if camera.in_angles else "lens alone")
+            )
         figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), borderpad=0.0)
     return figure

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, scale_bar, shrunk
+from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, shrunk
 from sim.camera import Camera
 from sim.plots.colours import colour_label
+from sim.plots.places import place_bar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +60,7 @@ def plot_split(
             row[0].set_ylabel(colour_label(camera.colours[c]))
         for axes, words in zip(panes[0], ("as designed", "as fabricated", "leaked", "diffracted"), strict=True):
             axes.set_title(words)
-        scale_bar(panes[-1, -1], camera.window * camera.pixel_m)
+        place_bar(panes[-1, -1], camera, camera.window * camera.pixel_m)
         scale = ScalarMappable(norm, LIGHT)
         bar = figure.colorbar(scale, ax=panes.ravel().tolist(), location="bottom", anchor=(0, 0), shrink=0.4)
         bar.set_label("share of light per pixel")

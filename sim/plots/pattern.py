@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.figure import DPI, LIGHT, extent_of, panels, shrunk
-from fab.units import UM
 from sim.camera import Camera
+from sim.plots.places import label_places, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,12 +45,12 @@ def plot_pattern(
     )
     with panels(ax, (8.3, 3.95), layout="compressed") as figure:
         panes = figure.subplots(1, 2, sharex=True, sharey=True)
-        norm, box = PowerNorm(0.5, 0.0, top, clip=True), extent_of(target.shape, camera.pixel_m, UM)
+        norm, box = PowerNorm(0.5, 0.0, top, clip=True), extent_of(target.shape, camera.pixel_m, unit_of(camera).scale)
         for axes, image, title in zip(panes, images, titles, strict=True):
             axes.imshow(image, origin="lower", extent=box, norm=norm, cmap=LIGHT, interpolation="auto")
             axes.set_title(title)
-            axes.set_xlabel("x (µm)")
-        panes[0].set_ylabel("y (µm)")
+            label_places(axes, unit_of(camera), "x")
+        label_places(panes[0], unit_of(camera), "y")
         panes[0].locator_params(nbins=5, steps=[1, 2, 5, 10])
         above = "max" if float(images[1].max()) > top else "neither"
         bar = figure.colorbar(panes[0].images[0], ax=list(panes), extend=above, format="{x:.2g}", ticks=MaxNLocator(4))

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fab.figure import DPI, LIGHT, SMALL, bare, evenly_spaced, extent_of, length_text, panels, shrunk
-from fab.units import UM
 from sim.camera import Camera
 from sim.metrics import energy_within, mean_wavelength_m, spot_radius_m
 from sim.plots.colours import colour_label, depth_positions, wavelength_order
+from sim.plots.places import label_places, size_text, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,7 +86,8 @@ def plot_psfs(
             spare.set_axis_off()
         for axes, picked in zip(grid[:, 0], rows, strict=True):
             name = colour_label(camera.colours[picked[0]]) if len(picked) == 1 else "together"
-            axes.set_ylabel(f"{name}\ny (µm)")
+            label_places(axes, unit_of(camera), "y")
+            axes.set_ylabel(f"{name}\n{axes.get_ylabel()}")
         grid[0, 0].locator_params(nbins=3, steps=[1, 2, 5, 10])
     return figure
 
@@ -130,7 +131,7 @@ def _draw_group(
         for row, picked in enumerate(rows):
             _draw_panel(panes[row, column], camera, bank, group, column, picked)
         panes[0, column].set_title(f"{group.name}, {length_text(bank.depths_m[depth])}")
-        panes[-1, column].set_xlabel("x (µm)")
+        label_places(panes[-1, column], unit_of(camera), "x")
     scale = ScalarMappable(group.norm, LIGHT)
     bar = figure.colorbar(scale, ax=panes.ravel().tolist(), location="bottom", aspect=20 * len(group.depths))
     bar.set_label(f"{group.name}: share of light per pixel")
@@ -141,11 +142,12 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
     """Draw one depth in one colour, or in three."""
     from matplotlib.patheffects import withStroke
 
-    _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m)
+    scale = unit_of(camera).scale
+    _show(axes, _shade(group.images[picked, column], group), bank.energy.shape[-2:], bank.pixel_m / scale)
     depth = group.depths[column]
     disc_m = _disc_m(camera, bank.depths_m[depth])
     if disc_m > _least_disc_m(bank):
-        _circle(axes, disc_m, "--")
+        _circle(axes, disc_m / scale, "--")
     shares = {"window": float(np.asarray(bank.energy)[picked[0], depth].sum(dtype=np.float64))}
     if group.name == "far":
         inset = axes.inset_axes((0.62, 0.62, 0.36, 0.36))
@@ -153,9 +155,9 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
         size, pixels = bank.energy.shape[-1], _inset_pixels(camera, bank)
         cut = slice(size // 2 - pixels, size - size // 2 + pixels)
         middle = np.asarray(bank.energy)[picked, depth, cut, cut]
-        _show(inset, _shade(middle, group), middle.shape[-2:], bank.pixel_m)
+        _show(inset, _shade(middle, group), middle.shape[-2:], bank.pixel_m / scale)
         radius_m = _spot_radius_m(camera, picked[0])
-        _circle(inset, radius_m, ":")
+        _circle(inset, radius_m / scale, ":")
         bare(inset)
         inset.spines[:].set_color("white")
         shares["spot"] = float(energy_within(middle[0], bank.pixel_m, radius_m))
@@ -166,14 +168,14 @@ def _draw_panel(axes: "Axes", camera: Camera, bank: "Bank", group: _Group, colum
         axes.text(0.03, 0.03, words, transform=axes.transAxes, **style)
 
 
-def _show(axes: "Axes", shades: np.ndarray, shape: tuple[int, ...], pixel_m: float) -> None:
-    axes.imshow(shades, origin="lower", extent=extent_of(shape, pixel_m, UM), interpolation="auto")
+def _show(axes: "Axes", shades: np.ndarray, shape: tuple[int, ...], pixel: float) -> None:
+    axes.imshow(shades, origin="lower", extent=extent_of(shape, pixel, 1.0), interpolation="auto")
 
 
-def _circle(axes: "Axes", radius_m: float, line: str) -> None:
+def _circle(axes: "Axes", radius: float, line: str) -> None:
     from matplotlib.patches import Circle
 
-    axes.add_patch(Circle((0, 0), radius_m / UM, ls=line, ec="white", lw=0.9, fill=False))
+    axes.add_patch(Circle((0, 0), radius, ls=line, ec="white", lw=0.9, fill=False))
 
 
 def _spot_radius_m(camera: Camera, colour: int) -> float:
@@ -204,7 +206,7 @@ def _notes(camera: Camera, bank: "Bank", shown: dict[str, list[int]]) -> str:
         words.append("dashed: geometric defocus disc")
     if "far" in shown:
         width = 2 * _inset_pixels(camera, bank) + bank.energy.shape[-1] % 2
-        words.append(f"inset: central {length_text(width * bank.pixel_m)}")
+        words.append(f"inset: central {size_text(camera, width * bank.pixel_m)}")
         words.append("dotted: far spot (first dark ring + 1 pixel)")
     if len(camera.colours) == 3:
         words.append("together: all three as red, green, blue")

@@ -60,6 +60,9 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     order of angle⁴. An InputError for a camera that asks for another, where eq. 6 does not hold, or where the window
     does not fit on the padded grid.
     """
+    if camera.in_angles:
+        rule, cure = "the direct path leads to a sensor", 'Use the "far_field" path.'
+        raise InputError("propagation", rule, camera.lens_text, cure)
     if camera.doe_distance_m:
         rule, got = "on the direct path the DOE lies on the lens", f"{camera.doe_distance_m * 1e3:.4g} mm before it"
         raise InputError("camera.doe_distance", rule, got, 'Use the "far_field" path.')

@@ -1,27 +1,30 @@
 """The table [area]: a part of the sensor that a DOE should light, and the rules for it."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from doedesign.spec.targets.beside import beside_problems
-from doedesign.spec.values import ColourName, NotNegative, length, nearest
+from doedesign.spec.values import PLACE, SIZE, ColourName, NotNegative, length, nearest, place
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
-from fab.units import UM, format_length
+from fab.units import DEGREES, MICROMETRES, UM, format_length
 from sim.camera import sines_at
 
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
-Place = Annotated[float, length(-1.0, 1.0)]
-Size = Annotated[float, length(0.1 * UM, 1.0)]
+Place = Annotated[float, place(-1.0, 1.0)]
+Size = Annotated[float, place(0.1 * UM, 1.0, SIZE)]
 Shape = Literal["rectangle", "ellipse", "ring", "line", "picture"]
 
 
 class AreaSpec(SpecTable, frozen=True):
     """An area to be lit, instead of objectives. Its phase is free. There may be several, as [[area]].
+
+    Places and sizes are lengths on the sensor; without one, with `sensor.pixel_angle`, they are angles, and held as
+    direction sines: `width_m`, `height_m` and `inner_m` as twice the sine of half the angle, the others as its sine.
 
     Attributes:
         shape: "rectangle" and "ellipse" (`width` and `height`), "ring" (`width`, `inner`), "line" (`width` along x, or
@@ -43,14 +46,19 @@ class AreaSpec(SpecTable, frozen=True):
         distance_m: where it lies, from the lens, or from the DOE without one; on the sensor if left out.
     """
 
+    angles: ClassVar = {
+        **dict.fromkeys(("width_m", "height_m", "inner_m"), SIZE),
+        **dict.fromkeys(("edge_m", "offset_m", "dark_m"), PLACE),
+    }
+
     shape: Shape = Field(examples=['"rectangle"'])
     width_m: Size | None = optional()
     height_m: Size | None = optional()
     inner_m: Size | None = optional()
-    edge_m: Size | None = optional()
+    edge_m: Annotated[float, place(0.1 * UM, 1.0)] | None = optional()
     picture: str | None = optional()
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
-    dark_m: Annotated[float, length(0.0, 1.0)] = optional(0.0)
+    dark_m: Annotated[float, place(0.0, 1.0)] = optional(0.0)
     uniformity: NotNegative = optional(1.0)
     start: Literal["transport", "random"] = optional("transport")
     colour: ColourName | None = optional()
@@ -108,8 +116,9 @@ def _problems(spec: "Spec", area: Any, key: str) -> Iterator[InputError]:
         complete = False
         yield InputError(key, "a line has a width or a height", "both or none", "Give one of them.")
     if area.shape == "ring" and complete and area.inner_m >= area.width_m:
-        rule = f"must be smaller than the width, {format_length(area.width_m)}"
-        yield InputError(f"{key}.inner", rule, format_length(area.inner_m), "Choose a smaller one.")
+        width, inner = (_size_text(spec, size) for size in (area.width_m, area.inner_m))
+        rule = f"must be smaller than the width, {width}"
+        yield InputError(f"{key}.inner", rule, inner, "Choose a smaller one.")
     colours = {colour.name: colour.wavelengths_m[0] for colour in spec.optics.colours}
     if area.colour is not None and area.colour not in colours:
         rule, cure = "must be a colour channel of the spec", nearest(area.colour, colours)
@@ -118,6 +127,9 @@ def _problems(spec: "Spec", area: Any, key: str) -> Iterator[InputError]:
         first = spec.optics.colours[0].name
         yield from _reach(spec, area, key, colours[area.colour or first])
     focal = spec.optics.focal_length_m
+    if area.distance_m is not None and spec.sensor.in_angles:
+        rule, cure = "light by its direction lies in no plane", "Leave it out, or give a lens or sensor.distance."
+        yield InputError(f"{key}.distance", rule, format_length(area.distance_m), cure)
     if area.distance_m is not None and focal is not None and area.distance_m <= focal / 2:
         rule = f"must be beyond half the focal length, {format_length(focal)}"
         yield InputError(f"{key}.distance", rule, format_length(area.distance_m), "Choose a larger one.")
@@ -131,7 +143,13 @@ def _reach(spec: "Spec", area: Any, key: str, wavelength: float) -> Iterator[Inp
     y, x = (abs(at) + reach for at, reach in zip(area.offset_m[::-1], half, strict=True))
     sine = max(map(abs, sines_at(optics.mapping, optics.distortion, y / distance, x / distance)))
     if sine * _ROOM > most:
-        rule = f"cells of {format_length(pitch)} light places up to {most * distance / _ROOM / UM:.4g} um from the axis"
+        unit = spec.told_in(MICROMETRES)
+        end, got = (f"{unit.of(at):.4g} {unit.suffix}" for at in (most * distance / _ROOM, max(y, x)))
+        rule = f"cells of {format_length(pitch)} light places up to {end} from the axis"
         finer = format_length(float(f"{wavelength / (2 * sine * _ROOM):.4g}"))
         cure = f"Choose a smaller area, or a pitch of at most {finer}."
-        yield InputError(key, rule, f"{max(y, x) / UM:.4g} um", cure)
+        yield InputError(key, rule, got, cure)
+
+
+def _size_text(spec: "Spec", size_m: float) -> str:
+    return f"{DEGREES.size(size_m):.12g} deg" if spec.sensor.in_angles else format_length(size_m)

@@ -40,6 +40,6 @@ def in_focus(spec: "Spec") -> Iterator[InputError]:
     if spec.sensor.distance_m is not None and spec.spots is not None and spec.spots.period_m is None:
         cure = "Give optics.focal_length, or spots.period for orders of a unit cell."
         yield InputError("sensor.distance", "spots lie in the focus of a lens", "a distance", cure)
-    if spec.sensor.defocus_m:
+    if spec.sensor.defocus_m and not spec.sensor.in_angles:
         got = format_length(spec.sensor.defocus_m)
         yield InputError("sensor.defocus", "spots lie in the focal plane", got, "Leave it out.")

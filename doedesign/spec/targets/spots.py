@@ -1,26 +1,30 @@
 """The table [spots]: where a DOE should send its light, spot by spot; its rules, and what may stand beside it."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
 from doedesign.spec.targets.beside import beside_problems, in_focus
-from doedesign.spec.values import Count, NotNegative, Positive, broken, length
+from doedesign.spec.values import PLACE, Count, NotNegative, Positive, broken, length, place
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
-from fab.units import MM, UM, format_length
+from fab.units import MICROMETRES, MM, UM, format_length
 from sim.camera import sines_at
 
 if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
-Place = Annotated[float, length(-1.0, 1.0)]
+Place = Annotated[float, place(-1.0, 1.0)]
+Separation = Annotated[float, place(0.1 * UM, 1.0)]
 Arrangement = Literal["grid", "hexagonal", "ring", "list"]
 
 
 class SpotsSpec(SpecTable, frozen=True):
     """Spots to be drawn with light, instead of objectives.
+
+    Places are lengths on the sensor; without one, with `sensor.pixel_angle`, they are angles, and held as direction
+    sines: a `spacing` of an angle is a step of its sine, and spots of a grid are such steps apart.
 
     Attributes:
         arrangement: "grid" (`count` and `spacing`, or `count` and `period`), "hexagonal" (`rings` around a middle spot,
@@ -40,12 +44,14 @@ class SpotsSpec(SpecTable, frozen=True):
         starts: random starts of the search for the spots' phases.
     """
 
+    angles: ClassVar = dict.fromkeys(("spacing_m", "radius_m", "places_m", "offset_m"), PLACE)
+
     arrangement: Arrangement = "grid"
     count: tuple[Count, Count] | None = optional()
     rings: Annotated[int, Field(strict=True, ge=1, le=50)] | None = optional()
     number: Annotated[int, Field(strict=True, ge=2, le=10_000)] | None = optional()
-    spacing_m: Annotated[float, length(0.1 * UM, 1.0)] | None = optional()
-    radius_m: Annotated[float, length(0.1 * UM, 1.0)] | None = optional()
+    spacing_m: Separation | None = optional()
+    radius_m: Separation | None = optional()
     places_m: tuple[tuple[Place, Place], ...] = optional(())
     period_m: Annotated[float, length(0.02 * UM, 100 * MM)] | None = optional()
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
@@ -146,10 +152,12 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         if max(map(abs, sines)) > sine:
             farthest, sine = max(abs(y), abs(x)), max(map(abs, sines))
     if sine > most:
-        rule = f"cells of {format_length(pitch)} steer light {most * spec.image_distance_m / UM:.4g} um far at most"
+        unit = spec.told_in(MICROMETRES)
+        end, got = (f"{unit.of(at):.4g} {unit.suffix}" for at in (most * spec.image_distance_m, farthest))
+        rule = f"cells of {format_length(pitch)} steer light {end} far at most"
         finer = format_length(wavelength / (2 * sine))
         cure = f"Bring the spots nearer to the axis, or choose a pitch of at most {finer}."
-        yield InputError("spots", rule, f"a spot {farthest / UM:.4g} um from the axis", cure)
+        yield InputError("spots", rule, f"a spot {got} from the axis", cure)
 
 
 def _corners(spots: Any) -> Iterator[tuple[float, float]]:

@@ -10,14 +10,15 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from fab.units import MM, NM, UM, format_length, parse_angle, parse_length
+from fab.units import MM, NM, UM, format_angle, format_length, parse_angle, parse_length
 
-FROM_TOML = "toml"
+# Contexts of validation: of TOML files, and of those whose places are angles.
+FROM_TOML, IN_ANGLES = "toml", "toml in angles"
 HEIGHT_FILES = (".exr", ".npy", ".tif", ".tiff", ".png")
 BEAM_FILES = (".png", ".tif", ".tiff")
 
@@ -60,13 +61,8 @@ def nearest(name: object, choices: Collection[str]) -> str:
     return f"Did you mean `{close[0]}`?" if close else f"Choose one of {', '.join(choices)}."
 
 
-def angle_text(angle_rad: float) -> str:
-    """Write an angle in degrees, a small one in microradians, to twelve digits, which `parse_angle` reads back."""
-    return f"{angle_rad * 1e6:.12g} urad" if 0 < abs(angle_rad) < 1e-3 else f"{math.degrees(angle_rad):.12g} deg"
-
-
 # Name, reader and writer of the quantities of a spec by their SI unit.
-UNITS = {"m": ("metres", parse_length, format_length), "rad": ("radians", parse_angle, angle_text)}
+UNITS = {"m": ("metres", parse_length, format_length), "rad": ("radians", parse_angle, format_angle)}
 _CURES = {"m": "Use a unit of length: nm, um, mm or m.", "rad": "Use a unit of angle: deg, mrad or rad."}
 
 
@@ -85,7 +81,7 @@ def unit_cure(unit: str, value: Any) -> str:
 def _read(unit: str, value: Any, context: Any) -> float:
     """A quantity as text with a unit in TOML, as a number in SI units otherwise."""
     plural, parse, _ = UNITS[unit]
-    if context != FROM_TOML:
+    if not from_toml(context):
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
         raise broken(f"must be a number of {plural}", "Give a number.")
@@ -98,18 +94,27 @@ def _read(unit: str, value: Any, context: Any) -> float:
     return float(number) if name.strip() == unit else parsed
 
 
+def from_toml(context: Any) -> bool:
+    """Whether a validation reads TOML, and not numbers in SI units."""
+    return context in (FROM_TOML, IN_ANGLES)
+
+
+def _within(unit: str, low: float, high: float, value: Any, context: Any, also: str = "") -> float:
+    """A quantity, or the error of one outside its bounds, whose rule says what is allowed, `also`."""
+    number = _read(unit, value, context)
+    slack = 1e-12  # a bound itself, rounded on its way from text, is inside
+    if not low - slack * abs(low) <= number <= high + slack * abs(high):
+        raise broken(_range_rule(low, high, UNITS[unit][2]) + also, "Check the unit.")
+    return number
+
+
 def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> BeforeValidator:
     """Return the validator of a quantity between two bounds in its SI unit, "m" or "rad"; "inf" may be allowed."""
 
     def validate(value: Any, info: ValidationInfo) -> float:
-        if infinite and (value == "inf" or (value == math.inf and info.context != FROM_TOML)):
+        if infinite and (value == "inf" or (value == math.inf and not from_toml(info.context))):
             return math.inf
-        number = _read(unit, value, info.context)
-        slack = 1e-12  # a bound itself, rounded on its way from text, is inside
-        if not low - slack * abs(low) <= number <= high + slack * abs(high):
-            rule = _range_rule(low, high, UNITS[unit][2]) + (', or be "inf"' if infinite else "")
-            raise broken(rule, "Check the unit.")
-        return number
+        return _within(unit, low, high, value, info.context, ', or be "inf"' if infinite else "")
 
     return BeforeValidator(validate)
 
@@ -117,6 +122,53 @@ def bounded(unit: str, low: float, high: float, *, infinite: bool = False) -> Be
 def length(low_m: float, high_m: float, *, infinite: bool = False) -> BeforeValidator:
     """Return the validator of a length between two bounds, metres; "inf" may be allowed."""
     return bounded("m", low_m, high_m, infinite=infinite)
+
+
+class HeldAngle(NamedTuple):
+    """How an angle is held as a direction sine, in a spec without a sensor.
+
+    Attributes:
+        held: the number for an angle, radians; to twelve digits, so that the angle written for it is read as the same.
+        angle: the angle of such a number.
+        widest_rad: the largest angle.
+    """
+
+    held: Callable[[float], float]
+    angle: Callable[[float], float]
+    widest_rad: float
+
+
+# A place, or the distance of two near the axis, is held as its sine; a size about the axis as that of both its halves.
+PLACE = HeldAngle(
+    lambda angle_rad: float(f"{math.sin(angle_rad):.12g}"),
+    lambda sine: math.asin(min(1.0, max(-1.0, sine))),
+    math.pi / 2,
+)
+SIZE = HeldAngle(
+    lambda angle_rad: float(f"{2 * math.sin(angle_rad / 2):.12g}"),
+    lambda size: 2 * math.asin(min(1.0, size / 2)),
+    math.pi,
+)
+
+
+def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> BeforeValidator:
+    """Return the validator of a place on the sensor or of a size there: a length between two bounds, metres.
+
+    In a spec without a sensor it is an angle, held as a direction sine, a length at a distance of one metre.
+    """
+
+    def validate(value: Any, info: ValidationInfo) -> float:
+        if info.context == FROM_TOML:
+            return _within("m", low_m, high_m, value, info.context)
+        if info.context != IN_ANGLES:  # a number of metres or a sine, which has been looked at before
+            return _within("m", min(low_m, 0.0), max(high_m, 2.0), value, info.context)
+        least = -kind.widest_rad if low_m < 0 else 0.0
+        sine = kind.held(_within("rad", least, kind.widest_rad, value, info.context))
+        if low_m > 0 and not sine > 0:
+            raise broken("must be greater than 0", "Choose a larger angle.")
+        return sine
+
+    return BeforeValidator(validate)
 
 
 def share(low: float, high: float) -> BeforeValidator:

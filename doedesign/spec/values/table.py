@@ -6,6 +6,7 @@ suffix and is text with a unit. A number of electrons ends in `_e`, which its TO
 as they are.
 """
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -31,6 +32,8 @@ class SpecTable(BaseModel, frozen=True):
     """Table of a spec. Unknown keys are refused, values never change."""
 
     inline: ClassVar[bool] = False  # whether it is written on one line, as `{ key = value }`
+    # Attributes that are angles in a spec without a sensor, and how they are held (`doedesign.spec.values.HeldAngle`).
+    angles: ClassVar[Mapping[str, Any]] = {}
 
     model_config = ConfigDict(
         extra="forbid",
