@@ -10,6 +10,7 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     values/     the types of value in a spec: lengths, names, options; common ground of all tables
     models      the tables, one per section of the TOML
     scene       the tables of scene, illumination, obstruction and sensor
+    left_out    what a spec may leave out because its task says it
     response    colours of a camera from its spectral response
     process     the tables of the process: errors, defects, limits of a good DOE
     targets/    the tables of spots, areas and foci
@@ -30,6 +31,7 @@ from typing import Any
 
 from doedesign.spec.checks import find_problems, spec_warnings
 from doedesign.spec.errors import SpecError, Table, key_as_written, spec_error, validated
+from doedesign.spec.left_out import with_left_out
 from doedesign.spec.models import Spec
 from doedesign.spec.order import OrderFile, OrderSpec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
@@ -84,8 +86,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
             table with the table before it (``process__levels=8, sensor__pitch="1.85 um"``), or a whole table.
 
     Returns:
-        The spec with every default filled in. Files it names are not opened (see `input_files`), but for a spectral
-        response, whose colours become part of the spec.
+        The spec with every default filled in, and what its task says (`doedesign.spec.left_out`). Files it names are
+        not opened (see `input_files`), but for a spectral response, whose colours become part of the spec.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
@@ -97,7 +99,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     for name, value in values.items():
         keys.append(key := name.replace("__", ".") if "__" in name or name in tables else f"optimize.{name}")
         _put(raw, key, value)
-    spec = _checked(Spec, with_response(raw, path), str(path), keys)
+    filled = with_left_out(with_response(raw, path), str(path), keys)
+    spec = _checked(Spec, filled, str(path), keys)
     spec._file = path  # pyright: ignore[reportAttributeAccessIssue]
     return spec
 

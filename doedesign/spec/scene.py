@@ -6,11 +6,12 @@ default, so that nobody uses one unawares: those two commands ask for it.
 
 from collections.abc import Mapping
 from math import sin
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
 from doedesign.spec.values import (
+    ANGLE,
     Count,
     FarDepth,
     NearDepth,
@@ -84,7 +85,7 @@ class IlluminationSpec(SpecTable, frozen=True):
             Images lie about the axis of the beam.
     """
 
-    kind: Literal["gaussian", "picture"] = Field(examples=['"gaussian"'])
+    kind: Literal["gaussian", "picture"] = "gaussian"
     diameters_m: Annotated[tuple[Diameter, ...], BeforeValidator(_as_list)] = optional(())
     waist_distance_m: Annotated[float, length(-100.0, 100.0)] = optional(0.0)
     m_squared: Annotated[tuple[Quality, ...], BeforeValidator(_as_list)] = optional((1.0,))
@@ -133,6 +134,8 @@ class SensorSpec(SpecTable, frozen=True):
         bayer: the four upper left photosites of a mosaic, row by row; every pixel sees every colour if left out.
         noise: noise model.
     """
+
+    angles: ClassVar = {"pixel_angle_rad": ANGLE}
 
     pitch_m: Pitch | None = optional()
     pixel_angle_rad: Annotated[float, bounded("rad", 1e-8, 1.2)] | None = optional()

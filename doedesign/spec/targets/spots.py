@@ -146,7 +146,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         return
     optics = spec.optics
     farthest, sine = 0.0, 0.0
-    for y, x in _corners(spots):
+    for y, x in corners(spots):
         share = (y / spec.image_distance_m, x / spec.image_distance_m)
         sines = sines_at(optics.mapping, optics.distortion, *share)
         if max(map(abs, sines)) > sine:
@@ -160,7 +160,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         yield InputError("spots", rule, f"a spot {got} from the axis", cure)
 
 
-def _corners(spots: Any) -> Iterator[tuple[float, float]]:
+def corners(spots: Any) -> Iterator[tuple[float, float]]:
     """Places (y, x), metres, that are as far out as any spot is."""
     across, up = spots.offset_m
     if spots.arrangement == "list":

@@ -124,6 +124,18 @@ def length(low_m: float, high_m: float, *, infinite: bool = False) -> BeforeVali
     return bounded("m", low_m, high_m, infinite=infinite)
 
 
+_NO_SENSOR = "Write a length; angles take sensor.pixel_angle in place of a lens, or of sensor.distance and pitch."
+
+
+def _is(parse: Callable[[str], float], value: Any) -> bool:
+    """Whether text is a quantity of a kind."""
+    try:
+        parse(value)
+    except ValueError:
+        return False
+    return True
+
+
 class HeldAngle(NamedTuple):
     """How an angle is held as a direction sine, in a spec without a sensor.
 
@@ -150,6 +162,8 @@ SIZE = HeldAngle(
     math.pi,
 )
 
+ANGLE = HeldAngle(float, float, math.pi)  # held as it is
+
 
 def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> BeforeValidator:
     """Return the validator of a place on the sensor or of a size there: a length between two bounds, metres.
@@ -159,9 +173,14 @@ def place(low_m: float, high_m: float, kind: HeldAngle = PLACE) -> BeforeValidat
 
     def validate(value: Any, info: ValidationInfo) -> float:
         if info.context == FROM_TOML:
+            if _is(parse_angle, value):
+                raise broken('must be a length on the sensor such as "1 mm"', _NO_SENSOR)
             return _within("m", low_m, high_m, value, info.context)
         if info.context != IN_ANGLES:  # a number of metres or a sine, which has been looked at before
             return _within("m", min(low_m, 0.0), max(high_m, 2.0), value, info.context)
+        if _is(parse_length, value):
+            cure = "Write an angle; for a length give optics.focal_length, or sensor.distance and sensor.pitch."
+            raise broken('must be an angle such as "2 deg", for there is no sensor', cure)
         least = -kind.widest_rad if low_m < 0 else 0.0
         sine = kind.held(_within("rad", least, kind.widest_rad, value, info.context))
         if low_m > 0 and not sine > 0:

@@ -1,0 +1,151 @@
+"""What a spec may leave out because its task says it: the scene, the sensor, the steps of a design that is a formula.
+
+A task is said by `[spots]`, `[area]`, `[focus]` or a classic start (`optimize.start = "axicon"`). What is left out then
+becomes part of the spec, as if it had been written, by these rules:
+
+    scene.far           "inf", a collimated beam; also where there is an [illumination]
+    optimize.steps      0 for a classic start without objectives
+    sensor.distance     the first of focus.distances, or the focal length of a start that is a lens, if no lens is there
+    sensor.pixel_angle  if there is neither lens nor distance nor pitch: light is looked at by its direction
+    sensor.pitch        half of what diffraction by the aperture can show, wavelength x distance / (2 x aperture), and
+    or pixel_angle      as much in direction sines; wider where a window of 1024 pixels would not hold what is asked for
+    sensor.window       what is asked for and a quarter more, at least 64 pixels; as far as cells steer light at most
+"""
+
+import math
+from collections.abc import Collection, Mapping, Set
+from typing import Any
+
+from doedesign.spec.errors import validated
+from doedesign.spec.models import Spec
+from doedesign.spec.targets.spots import corners
+from doedesign.spec.values import STARTS
+from fab.units import format_length, parse_angle, parse_length
+
+# Starts that are designs of their own, and which of them are lenses by one of their options.
+_CLASSIC = tuple(start for start in STARTS if start not in ("flat", "random", "ring"))
+_LENSES = {"fresnel": "focal_length", "lens_array": "focal_length", "axilens": "near", "logarithmic_asphere": "near"}
+_AIMS = ("spots", "area", "focus")
+
+_MARGIN = 1.25
+_PER_DETAIL = 2  # pixels
+_LEAST, _MOST, _LARGEST = 64, 1024, 8192  # pixels of a window: at least, with pixels of our choice, and at all
+
+
+def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[str] = ()) -> dict[str, Any]:
+    """Put what a spec leaves out into its tables, where its task says it.
+
+    Args:
+        raw: the tables as they were read.
+        source: where they came from, for messages.
+        overridden: keys that were given beside the file.
+
+    Raises:
+        InputError: a mistake in what the spec says, which has to be right before the rest can follow from it.
+    """
+    filled: dict[str, Any] = dict(raw)
+    aimed = any(isinstance(raw.get(name), Mapping) for name in _AIMS)
+    optimize, optics, sensor = (raw.get(name, {}) for name in ("optimize", "optics", "sensor"))
+    classic = isinstance(optimize, Mapping) and optimize.get("start") in _CLASSIC
+    if aimed or classic or isinstance(raw.get("illumination"), Mapping):
+        scene = raw.get("scene", {})
+        if isinstance(scene, Mapping) and not {"near", "far"} & scene.keys():
+            filled["scene"] = {**scene, "far": ["inf"]}
+    if classic and not aimed and not raw.get("objective") and "steps" not in optimize:
+        filled["optimize"] = {**optimize, "steps": 0}
+    if not ((aimed or classic) and isinstance(optics, Mapping) and isinstance(sensor, Mapping)):
+        return filled
+    if not ("focal_length" in optics or {"distance", "pixel_angle"} & sensor.keys()):
+        distance = _distance(raw)
+        sensor = sensor if distance is None else {**sensor, "distance": distance}
+    pixel = "pitch" if {"distance", "pitch"} & sensor.keys() or "focal_length" in optics else "pixel_angle"
+    usual = {"window": 2, pixel: "1 um" if pixel == "pitch" else "1 mrad"}
+    stand_in = {key: value for key, value in usual.items() if key not in sensor}
+    filled["sensor"] = {**sensor, **stand_in}
+    if stand_in:
+        spec = validated(Spec, filled, source, overridden)
+        # Without any distance the rules between tables have something to say.
+        found = _sensor(spec, stand_in.keys()) if math.isfinite(spec.image_distance_m) else stand_in
+        filled["sensor"] = {**sensor, **found}
+    return filled
+
+
+def _distance(raw: Mapping[str, Any]) -> Any:
+    """Distance at which foci or a start that is a lens bring light to a focus, as the spec has it, or None."""
+    focus, optimize = raw.get("focus"), raw.get("optimize", {})
+    if isinstance(focus, Mapping):
+        distances = focus.get("distances")
+        return distances[0] if isinstance(distances, list) and distances else None
+    options = optimize.get("start_options") if isinstance(optimize, Mapping) else None
+    key = _LENSES.get(str(optimize.get("start"))) if isinstance(options, Mapping) else None
+    return options.get(key) if key and isinstance(options, Mapping) else None
+
+
+def _sensor(spec: Spec, missing: Set[str]) -> dict[str, Any]:
+    """Keys of the sensor that are missing, for a spec that has stand-ins in their place."""
+    sensor, distance = spec.sensor, spec.image_distance_m
+    shortest = min(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
+    detail = shortest * distance / spec.doe.aperture_m
+    full = max(2 * _MARGIN * _reach_m(spec, detail), _LEAST / _PER_DETAIL * detail)
+    # Cells steer light so far, directions end at 90 degrees, and nothing is computed beyond three apertures near by.
+    most = shortest * distance / spec.doe.pitch_m
+    most = min(most, 2.0 if sensor.in_angles else math.inf)
+    most = most if sensor.distance_m is None else min(most, 3 * spec.doe.samples * spec.doe.pitch_m)
+    found: dict[str, Any] = {}
+    pixel = sensor.pixel_m
+    if missing - {"window"}:
+        pixel = max(detail / _PER_DETAIL, min(full, most) / (_MOST if "window" in missing else sensor.window))
+        one = float(f"{pixel / sensor.binning:.3g}")
+        if sensor.in_angles:
+            degrees = float(f"{math.degrees(math.asin(min(1.0, one))):.3g}")
+            found["pixel_angle"], one = f"{degrees:g} deg", math.sin(math.radians(degrees))
+        else:
+            found["pitch"] = format_length(one)
+        pixel = one * sensor.binning
+    if "window" in missing:
+        window = min(2 * math.ceil(full / pixel / 2), 2 * int(most / pixel / 2), _LARGEST)
+        found["window"] = max(2, window)
+    return found
+
+
+def _reach_m(spec: Spec, detail_m: float) -> float:
+    """How far from the axis light is asked for, metres on the sensor; `detail_m` is what diffraction shows there."""
+    distance, near = spec.image_distance_m, spec.sensor.distance_m is not None
+    shadow = spec.doe.aperture_m / 2 if near else 0.0
+    longest = max(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
+    if (spots := spec.spots) is not None:
+        if spots.period_m is not None:
+            highest = max((n - 1) // 2 if n % 2 else n - 1 for n in spots.count or (1, 1))
+            return shadow + highest * longest / spots.period_m * distance
+        if not all(getattr(spots, name) for name in spots.needed):
+            return 0.0
+        return max(abs(part) for corner in corners(spots) for part in corner) + 2 * detail_m
+    if (area := spec.area) is not None:
+        # The height of a picture is not known before it is opened.
+        sizes = (max(area.size_m),) * 2 if area.shape == "picture" else area.size_m
+        beside = area.dark_m + (area.edge_m or 2 * detail_m)
+        return max(abs(at) + size / 2 for at, size in zip(area.offset_m[::-1], sizes, strict=True)) + beside
+    if spec.focus is not None:
+        return 4 * (spec.focus.widths_m or (0.0,))[0]
+    start, sine = spec.optimize.start, _steepest(spec, longest)
+    focuses = near and start in _LENSES
+    return (spec.doe.aperture_m / 2 if start == "lens_array" else 0.0) if focuses else shadow + sine * distance
+
+
+def _steepest(spec: Spec, wavelength_m: float) -> float:
+    """Largest direction sine to which a classic start sends light; 0 where its options are still to be mended."""
+    start, options, radius = spec.optimize.start, spec.optimize.start_options, spec.doe.aperture_m / 2
+    try:
+        if start == "axicon":
+            return math.sin(abs(parse_angle(options.get("angle", ""))))
+        if start == "blazed":
+            return wavelength_m / parse_length(options.get("period", ""))
+        if start == "lens_array":
+            return parse_length(options.get("pitch", "")) / 2 / parse_length(options.get("focal_length", ""))
+        if start in _LENSES:
+            return radius / parse_length(options.get(_LENSES[start], ""))
+        if start == "vortex":
+            return 2 * abs(float(options.get("charge", 1))) * wavelength_m / (2 * radius)
+        return 3 * abs(float(options.get("waves", 5))) * wavelength_m / radius
+    except (ValueError, TypeError, ZeroDivisionError):
+        return 0.0
