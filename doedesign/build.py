@@ -27,7 +27,7 @@ from fab.pictures import read_pixels
 from fab.process import DEVIATIONS, Defects, Normal, Process, error_names
 from fab.stock import IDEAL, STOCK, process_from
 from sim.camera import Camera, Colour
-from sim.illumination import Beam, GaussianBeam, MeasuredBeam
+from sim.illumination import Beam, EvenBeam, GaussianBeam, MeasuredBeam
 
 # Attributes that `Process` and a filled `ProcessSpec` have in common, and the rates among the defects.
 _SHARED = ("tone", "minimum_line_m", "minimum_space_m", "die_m", "wafer_radius_m")
@@ -66,10 +66,13 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     light = spec.illumination
     if light is None:
         return None
-    centre_m, angle_rad = _yx(light.centre_m), _yx(light.angles_rad)
+    centre_m, aslant = _yx(light.centre_m), (_yx(light.angles_rad), _yx(light.tilt_rad))
+    if light.kind in ("plane", "point"):
+        distance_m = np.inf if light.distance_m is None else light.distance_m
+        return EvenBeam(spec.doe.aperture_m - 2 * spec.process.chrome_overlap_m, distance_m, *aslant)
     if light.picture is None:
         y, x = _yx(light.diameters_m)
-        return GaussianBeam((y / 2, x / 2), light.waist_distance_m, _yx(light.m_squared), centre_m, angle_rad)
+        return GaussianBeam((y / 2, x / 2), light.waist_distance_m, _yx(light.m_squared), centre_m, *aslant)
     path = input_files(spec, "illumination.picture")["illumination.picture"]
     picture = read_pixels(path, others="RGBA")
     if picture.ndim == 3:
@@ -77,7 +80,7 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     if not picture.any():
         raise InputError(str(path), "a beam must have some light", "a black picture", "Give another picture.")
     assert light.pixel_m is not None
-    return MeasuredBeam(picture.astype(np.float64), light.pixel_m, centre_m, angle_rad)
+    return MeasuredBeam(picture.astype(np.float64), light.pixel_m, centre_m, *aslant)
 
 
 def _yx(values: Sequence[float]) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 from .camera import Camera as Camera
 from .camera import Colour as Colour
 from .camera import SpectralLine as SpectralLine
+from .illumination import EvenBeam as EvenBeam
 from .illumination import GaussianBeam as GaussianBeam
 from .illumination import MeasuredBeam as MeasuredBeam
 from .imaging.field import FieldOptics as FieldOptics

@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
-from sim.illumination import Beam, beam_amplitude, beam_irradiance
+from sim.illumination import Beam, beam_amplitude, beam_irradiance, path_from_point_m
 from sim.material import fresnel_transmission, refractive_index
 
 Mapping = Literal["sine", "tangent"]
@@ -174,11 +174,30 @@ class Camera:
         return (1.0,) if self.beam is None else self.beam.shares
 
     def chief_rad(self, field_rad: tuple[float, float]) -> tuple[float, float]:
-        """Angles (y, x) of the chief ray at field angles about the axis of the beam, or about that of the lens."""
-        if self.beam is None:
-            return field_rad
-        (y, x), (beam_y, beam_x) = field_rad, self.beam.angle_rad
-        return y + beam_y, x + beam_x
+        """Angles (y, x) that the window follows, at field angles about the axis of the beam or that of the lens."""
+        return field_rad if self.beam is None else _sum(field_rad, self.beam.angle_rad)
+
+    def light_rad(self, field_rad: tuple[float, float]) -> tuple[float, float]:
+        """Angles (y, x) at which light arrives: `chief_rad`, and what the beam is tilted by beside the window."""
+        chief_rad = self.chief_rad(field_rad)
+        return chief_rad if self.beam is None else _sum(chief_rad, self.beam.tilt_rad)
+
+    @property
+    def is_tilted(self) -> bool:
+        """Whether light arrives at an angle that the sensor's window does not follow."""
+        return self.beam is not None and any(self.beam.tilt_rad)
+
+    @property
+    def images_alike(self) -> bool:
+        """Whether pixels lie evenly among the sines about the chief ray, whatever its angle."""
+        return self.is_sine and not self.is_tilted
+
+    def moved_sines(self, chief_rad: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """Direction sines (y, x) by which a tilted beam moves images, for the angles of the window's chief ray."""
+        if self.beam is None or not self.is_tilted:
+            return 0.0, 0.0
+        y, x = direction_sines(_sum(chief_rad, self.beam.tilt_rad)) - direction_sines(chief_rad)
+        return float(y), float(x)
 
     def incident(self, line: SpectralLine) -> Complex[np.ndarray, "y x"] | None:
         """Amplitude of a mode of the beam on the cells, whose square is 1 for plane light; None without a beam."""
@@ -249,7 +268,7 @@ class Camera:
         (n - 1) / lambda on axis (eq. 2); for an oblique chief ray of direction sine s,
         (sqrt(n^2 - s^2) - sqrt(1 - s^2)) / lambda, the thin-element path difference.
         """
-        square = float(np.sum(np.square(direction_sines(self.chief_rad(field_rad)))))
+        square = float(np.sum(np.square(direction_sines(self.light_rad(field_rad)))))
         index = refractive_index(self.material, wavelength_m)
         return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
 
@@ -266,6 +285,10 @@ class Camera:
             return self.aperture_m / 2 * (self.distance_m * inverse_depth + 1.0)
         distance = self.focal_length_m + self.defocus_m
         return self.aperture_m / 2 * abs(self.sensor_distance_m * inverse_depth + 1.0 - distance / self.focal_length_m)
+
+
+def _sum(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    return one[0] + other[0], one[1] + other[1]
 
 
 def image_place(mapping: Mapping, distortion: Distortion, sine_y: Any, sine_x: Any) -> tuple[Any, Any]:
@@ -375,12 +398,7 @@ def path_at_m(
     defocus = (square / 2) * camera.curvature_per_m()
     if np.isinf(depth_m):
         return defocus
-    y0, x0 = (-depth_m * np.tan(angle) for angle in field_rad)
-    chief = np.sqrt(y0**2 + x0**2 + depth_m**2)
-    path = np.sqrt((y_m - y0) ** 2 + (x_m - x0) ** 2 + depth_m**2)
-    # (path - chief) without cancellation, then without its linear part -(y0 y + x0 x) / chief.
-    linear = y0 * y_m + x0 * x_m
-    return (square - 2 * linear) / (path + chief) + linear / chief + defocus
+    return path_from_point_m(y_m, x_m, depth_m, field_rad) + defocus
 
 
 def wrapped_waves(path_m: Float[np.ndarray, "*s"], wavelength_m: float) -> Float[np.ndarray, "*s"]:

@@ -3,7 +3,10 @@
 A Gaussian beam of quality M² is an incoherent sum of Hermite-Gaussian modes, those of a Gaussian Schell-model source
 (A. Starikov and E. Wolf, J. Opt. Soc. Am. 72, 923, 1982): the shares of the modes fall like q^n with
 q = (M² - 1) / (M² + 1), and all modes share a waist that is M times smaller than the beam's. A measured beam is a
-picture of its intensity and has a plane wavefront.
+picture of its intensity and has a plane wavefront. Even light is a plane wave or comes from a point.
+
+The axis of a beam may stand aslant in two ways: by its `angle_rad`, with the sensor turned about the DOE so that its
+middle stays on that axis, or by its `tilt_rad`, with the sensor where it was, so that images move on it.
 
 Powers count from the whole beam: what misses the opening of the chrome is lost.
 """
@@ -31,7 +34,9 @@ class GaussianBeam:
         waist_distance_m: distance of the waist before the DOE, negative behind it.
         m_squared: beam quality M² (y, x), at least 1.
         centre_m: place (y, x) of its axis on the DOE.
-        angle_rad: angles (y, x) between its axis and that of the DOE, positive where light travels toward +y or +x.
+        angle_rad: angles (y, x) between its axis and that of the DOE, positive where light travels toward +y or +x; the
+            sensor's window follows.
+        tilt_rad: the same, added to it; the sensor's window stays.
     """
 
     radius_m: Pair
@@ -39,6 +44,7 @@ class GaussianBeam:
     m_squared: Pair = (1.0, 1.0)
     centre_m: Pair = (0.0, 0.0)
     angle_rad: Pair = (0.0, 0.0)
+    tilt_rad: Pair = (0.0, 0.0)
 
     @cached_property
     def _modes(self) -> list[tuple[float, int, int]]:
@@ -88,18 +94,21 @@ class MeasuredBeam:
         intensity: `[y, x]` intensity, not negative, in any unit.
         pixel_m: distance of its pixels.
         centre_m: place (y, x) of the picture's middle on the DOE.
-        angle_rad: angles (y, x) of its axis.
+        angle_rad: angles (y, x) of its axis, which the sensor's window follows.
+        tilt_rad: the same, added to it; the window stays.
     """
 
     intensity: Float[np.ndarray, "y x"] = field(repr=False)
     pixel_m: float
     centre_m: Pair = (0.0, 0.0)
     angle_rad: Pair = (0.0, 0.0)
+    tilt_rad: Pair = (0.0, 0.0)
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
         picture = np.ascontiguousarray(self.intensity, np.float64)
-        return picture.shape, hashlib.sha256(picture.tobytes()).hexdigest(), self.pixel_m, self.centre_m, self.angle_rad
+        digest, aslant = hashlib.sha256(picture.tobytes()).hexdigest(), (self.angle_rad, self.tilt_rad)
+        return picture.shape, digest, self.pixel_m, self.centre_m, *aslant
 
     def __eq__(self, other: object) -> bool:
         """Whether all is the same, pixel by pixel."""
@@ -129,6 +138,60 @@ class MeasuredBeam:
         return np.sqrt(seen / (self.intensity.sum(dtype=np.float64) * self.pixel_m**2)).astype(complex)
 
 
+@dataclass(frozen=True)
+class EvenBeam:
+    """Light that is as bright all over the aperture, of whose power energies are shares.
+
+    Attributes:
+        aperture_m: diameter of the clear aperture.
+        distance_m: distance of the point before the DOE that it comes from; infinite for a plane wave.
+        angle_rad: angles (y, x) of its chief ray, which the sensor's window follows.
+        tilt_rad: the same, added to it; the window stays.
+    """
+
+    aperture_m: float
+    distance_m: float = np.inf
+    angle_rad: Pair = (0.0, 0.0)
+    tilt_rad: Pair = (0.0, 0.0)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """One mode."""
+        return (1.0,)
+
+    @property
+    def _chief_rad(self) -> Pair:
+        return self.angle_rad[0] + self.tilt_rad[0], self.angle_rad[1] + self.tilt_rad[1]
+
+    def curvature_per_m(self, wavelength_m: float) -> float:
+        """Curvature of its wavefront about the chief ray."""
+        return float(1 / self.distance_m / np.sqrt(1 + np.sum(np.tan(self._chief_rad) ** 2)))
+
+    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+        """Amplitude in the middle of every cell, its phase less that along the chief ray, as for every beam."""
+        waves = np.zeros(grid.shape)
+        if np.isfinite(self.distance_m):
+            y, x = grid.axis_m("y")[:, None], grid.axis_m("x")
+            waves = path_from_point_m(y, x, self.distance_m, self._chief_rad) / wavelength_m
+        return 2 / (np.sqrt(np.pi) * self.aperture_m) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+
+
+def path_from_point_m(
+    y_m: Float[np.ndarray, "*s"], x_m: Float[np.ndarray, "*t"], distance_m: float, chief_rad: Pair
+) -> Float[np.ndarray, "*u"]:
+    """Path from a point at a distance and angles (y, x) to places of the DOE, less that of the chief ray and its tilt.
+
+    Paper eq. 1, free of cancellation; metres. Places are broadcast against each other.
+    """
+    square = y_m**2 + x_m**2
+    y0, x0 = (-distance_m * np.tan(angle) for angle in chief_rad)
+    chief = np.sqrt(y0**2 + x0**2 + distance_m**2)
+    path = np.sqrt((y_m - y0) ** 2 + (x_m - x0) ** 2 + distance_m**2)
+    # (path - chief) without cancellation, then without its linear part -(y0 y + x0 x) / chief.
+    linear = y0 * y_m + x0 * x_m
+    return (square - 2 * linear) / (path + chief) + linear / chief
+
+
 def _hermite_gaussian(number: int, at_m: Float[np.ndarray, " n"], radius_m: float) -> Float[np.ndarray, " n"]:
     """Hermite-Gaussian function of unit norm, 1/sqrt(m), by its recurrence; the lowest has the radius 1/e²."""
     place = np.sqrt(2) * at_m / radius_m
@@ -139,7 +202,7 @@ def _hermite_gaussian(number: int, at_m: Float[np.ndarray, " n"], radius_m: floa
 
 
 # `shares` are the powers of the modes of which a beam is an incoherent sum; together 1.
-Beam = GaussianBeam | MeasuredBeam
+Beam = GaussianBeam | MeasuredBeam | EvenBeam
 
 
 @lru_cache(maxsize=8)

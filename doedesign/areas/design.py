@@ -119,7 +119,8 @@ class AreaTask:
         amplitudes = np.asarray(self.problem.problems[index].amplitudes)
         light: Any = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
         wavelength = camera_for(area, self.camera).lines[0].wavelength_m
-        directions = target.sines_y / wavelength, target.sines_x / wavelength
+        moved_y, moved_x = self.camera.moved_sines()
+        directions = (target.sines_y - moved_y) / wavelength, (target.sines_x - moved_x) / wavelength
         phase = transport_phase(light, (grid.axis_m("y"), grid.axis_m("x")), target.value, directions)
         # The wave has a phase already, that of the lowest mode and of a sensor out of focus.
         return phase - np.angle(amplitudes[0])

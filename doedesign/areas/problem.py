@@ -171,7 +171,8 @@ def lattice_factors(
 ) -> tuple[Complex[np.ndarray, "v y"], Complex[np.ndarray, "u x"]]:
     """Factors of rows and columns from cells to the lattice; the square of a sum of unit power is a share of light."""
     found, wavelength, pitch = [], camera.lines[0].wavelength_m, camera.grid.pitch_m
-    for axis, sines in (("y", target.sines_y), ("x", target.sines_x)):
+    moved_y, moved_x = camera.moved_sines()  # light counts from the direction in which a tilted beam arrives
+    for axis, sines in (("y", target.sines_y - moved_y), ("x", target.sines_x - moved_x)):
         turns = np.outer(sines / wavelength, camera.grid.axis_m(axis))  # pyright: ignore[reportArgumentType]
         # A cell sends |sinc|² pitch² into the square of sines (wavelength)²; a sample stands for a step of sines.
         share = np.sqrt(pitch * (sines[1] - sines[0]) / wavelength) * np.sinc(sines * pitch / wavelength)

@@ -108,7 +108,8 @@ class AreaTarget:
                 got, cure = f"{last - first:.0f}", "Choose a smaller area or aperture."
                 raise InputError("area", rule, got, cure)
             axes.append(np.arange(first, last + 1) * step)
-        _require_reach(camera, max(float(np.abs(axis).max()) for axis in axes))
+        moved = camera.moved_sines()
+        _require_reach(camera, max(float(np.abs(axis - by).max()) for axis, by in zip(axes, moved, strict=True)))
         y, x = camera.image_m(axes[0][:, None], axes[1][None, :])
         at = y - middle[0], x - middle[1]
         value = _draw(table, at, edge) if light is None else _draw_picture(light, at, size_m)

@@ -95,6 +95,7 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     rng = np.random.default_rng(_SEED)
     extent = camera.window * camera.pixel_m / camera.sensor_distance_m / wavelength  # waves per metre
     waves = [((np.arange(_SIDE) + rng.random(_SIDE)) / _SIDE - 0.5) * extent for _ in "yx"]
+    waves = [one - moved / wavelength for one, moved in zip(waves, camera.moved_sines(), strict=True)]
     axis = camera.grid.axis_m("x")
     bend = 0.0 if np.isinf(depth_m) else 1 / depth_m
     bend += 0.0 if camera.in_angles else 1 / camera.sensor_distance_m - 1 / camera.focal_length_m

@@ -26,8 +26,10 @@ _FINEST = 16  # pixels per wavelength / aperture
 
 # Keys of a beam of each kind: those that it needs, and those that it may have besides.
 _BEAM_KEYS = {
-    "gaussian": (("diameters_m",), ("waist_distance_m", "m_squared")),
-    "picture": (("picture", "pixel_m"), ()),
+    "gaussian": (("diameters_m",), ("waist_distance_m", "m_squared", "centre_m")),
+    "picture": (("picture", "pixel_m"), ("centre_m",)),
+    "plane": ((), ()),
+    "point": (("distance_m",), ()),
 }
 _DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all others exist at every depth
 
@@ -208,7 +210,8 @@ def _illumination(spec: Spec) -> Iterator[InputError]:
             )
     for name in sorted({key for keys in _BEAM_KEYS.values() for one in keys for key in one} - {*needed, *allowed}):
         if name in given:
-            rule = f'a beam of kind "{beam.kind}" takes: {", ".join(map(toml_key, (*needed, *allowed)))}'
+            takes = map(toml_key, (*needed, *allowed, "angles_rad", "tilt_rad"))
+            rule = f'a beam of kind "{beam.kind}" takes: {", ".join(takes)}'
             yield InputError(f"illumination.{toml_key(name)}", rule, toml_key(name), "Remove it.")
     for name in ("diameters_m", "m_squared"):
         if len(getattr(beam, name)) > 2:
@@ -217,8 +220,17 @@ def _illumination(spec: Spec) -> Iterator[InputError]:
     if beam.picture is not None and not beam.picture.lower().endswith(BEAM_FILES):
         rule, got = f"must be a file of {', '.join(BEAM_FILES)}", f'"{beam.picture}"'
         yield InputError("illumination.picture", rule, got, "Save the picture as one of these.")
+    least_m = _nyquist_length_m(spec)
+    if beam.distance_m is not None and beam.distance_m < least_m:
+        rule = f"must be at least samples x pitch^2 / wavelength = {_rounded(least_m)}, "
+        rule += "or the cells cannot follow the wave of the point"
+        cure = "Move the point away or choose a finer pitch for the same aperture."
+        yield InputError("illumination.distance", rule, format_length(beam.distance_m), cure)
+    if any(beam.tilt_rad) and spec.optics.propagation == "fresnel":
+        rule, cure = "a beam is tilted in the far field", "Give its angle, which the sensor follows, or leave it out."
+        yield InputError("illumination.tilt", rule, '"fresnel"', cure)
     if spec.scene.near_m or spec.scene.far_m != (math.inf,):
-        cure = 'Write far = ["inf"]; the curvature of the beam is that of its waist_distance.'
+        cure = 'Write far = ["inf"]; the curvature of the beam is that of its waist_distance, or its point\'s distance.'
         yield InputError("scene.far", "a beam takes the place of sources at depths", "depths", cure)
     if spec.optimize.parametrization == "radial":
         rule = "rings are computed for even light"
@@ -347,16 +359,20 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
             f"sensor.window: {sensor.window} pixels are more than the {binned} binned pixels of the sensor's shorter "
             "side; PSFs will reach beyond the sensor."
         )
-    wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2
+    # Cells steer light about the direction in which it arrives.
+    moved_m = focal_m * max(map(abs, spec.moved_sines))
+    wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2 + moved_m
     reach_m, unit = focal_m * _image_share(spec, wavelength_m / (2 * pitch_m)), spec.told_in(MICROMETRES)
     if half_m > reach_m:
+        axis = "where light arrives" if moved_m else "the axis"
+        most = int(2 * max(reach_m - moved_m, 0.0) / sensor.pixel_m)
         ends, reaches = (
             f"{unit.of(at):{'.4g' if unit.in_degrees else '.0f'}} {unit.suffix}" for at in (half_m, reach_m)
         )
         yield (
-            f"sensor.window: it ends {ends} from the axis, but cells of {format_length(pitch_m)} steer "
+            f"sensor.window: it ends {ends} from {axis}, but cells of {format_length(pitch_m)} steer "
             f"{format_length(wavelength_m)} only {reaches} far; "
-            f"beyond that the PSF repeats. At most {int(2 * reach_m / sensor.pixel_m)} pixels avoid it."
+            f"beyond that the PSF repeats. At most {most} pixels avoid it."
         )
     depth_m = min(spec.scene.near_m, default=math.inf)
     disc_m = spec.doe.aperture_m * focal_m / depth_m

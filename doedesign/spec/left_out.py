@@ -112,11 +112,12 @@ def _reach_m(spec: Spec, detail_m: float) -> float:
     """How far from the axis light is asked for, metres on the sensor; `detail_m` is what diffraction shows there."""
     distance, near = spec.image_distance_m, spec.sensor.distance_m is not None
     shadow = spec.doe.aperture_m / 2 if near else 0.0
+    moved = max(map(abs, spec.moved_sines)) * distance
     longest = max(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
     if (spots := spec.spots) is not None:
         if spots.period_m is not None:
             highest = max((n - 1) // 2 if n % 2 else n - 1 for n in spots.count or (1, 1))
-            return shadow + highest * longest / spots.period_m * distance
+            return shadow + moved + highest * longest / spots.period_m * distance
         if not all(getattr(spots, name) for name in spots.needed):
             return 0.0
         return max(abs(part) for corner in corners(spots) for part in corner) + 2 * detail_m
@@ -129,7 +130,7 @@ def _reach_m(spec: Spec, detail_m: float) -> float:
         return 4 * (spec.focus.widths_m or (0.0,))[0]
     start, sine = spec.optimize.start, _steepest(spec, longest)
     focuses = near and start in _LENSES
-    return (spec.doe.aperture_m / 2 if start == "lens_array" else 0.0) if focuses else shadow + sine * distance
+    return (spec.doe.aperture_m / 2 if start == "lens_array" else 0.0) if focuses else shadow + moved + sine * distance
 
 
 def _steepest(spec: Spec, wavelength_m: float) -> float:

@@ -300,6 +300,15 @@ class Spec(SpecTable, frozen=True):
         """How light is to get to the sensor behind a lens; None without one, where its distance says it."""
         return None if self.optics.focal_length_m is None else self.optics.propagation
 
+    @property
+    def moved_sines(self) -> tuple[float, float]:
+        """Direction sines (y, x) by which a tilted beam moves images, with a window that follows none."""
+        if self.illumination is None or not any(self.illumination.tilt_rad):
+            return 0.0, 0.0
+        x, y = map(math.tan, self.illumination.tilt_rad)
+        longer = math.sqrt(1 + x**2 + y**2)
+        return y / longer, x / longer
+
     def told_in(self, unit: PlaceUnit) -> PlaceUnit:
         """The unit in which to tell places: the one given, or degrees where there is no sensor."""
         return DEGREES if self.sensor.in_angles else unit

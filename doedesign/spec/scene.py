@@ -72,7 +72,8 @@ class IlluminationSpec(SpecTable, frozen=True):
     """The beam that lights the DOE, instead of a source at a depth. Energies are shares of its power.
 
     Attributes:
-        kind: "gaussian", or "picture" for a measured beam with a plane wavefront.
+        kind: "gaussian"; "picture" for a measured beam with a plane wavefront; "plane" or "point" for light that is as
+            bright all over the aperture, a plane wave or one that comes from a point.
         diameters_m: one diameter or [x, y] at the waist, between the places where the intensity is 1/e² of that in the
             middle.
         waist_distance_m: distance of the waist before the DOE, negative behind it.
@@ -81,18 +82,24 @@ class IlluminationSpec(SpecTable, frozen=True):
         picture: a file with the beam's intensity, linear: PNG or TIFF, relative to the spec file.
         pixel_m: distance of its pixels on the DOE.
         centre_m: [x, y] of the beam's axis, or of the picture's middle, on the DOE.
+        distance_m: distance of a point before the DOE.
         angles_rad: [x, y] between the beam's axis and that of the DOE, positive where light travels toward +x or +y.
             Images lie about the axis of the beam.
+        tilt_rad: the same for a sensor that stays where it is: images move by distance x sin(tilt), the focal length
+            being the distance behind a lens, or by the angle itself where there is no sensor. Far field only. Spots and
+            areas stay where they are asked for; orders of a unit cell move.
     """
 
-    kind: Literal["gaussian", "picture"] = "gaussian"
+    kind: Literal["plane", "gaussian", "picture", "point"] = "gaussian"
     diameters_m: Annotated[tuple[Diameter, ...], BeforeValidator(_as_list)] = optional(())
     waist_distance_m: Annotated[float, length(-100.0, 100.0)] = optional(0.0)
     m_squared: Annotated[tuple[Quality, ...], BeforeValidator(_as_list)] = optional((1.0,))
     picture: str | None = optional()
     pixel_m: Annotated[float, length(10 * NM, 10 * MM)] | None = optional()
     centre_m: tuple[Axis, Axis] = optional((0.0, 0.0))
+    distance_m: FarDepth | None = optional()
     angles_rad: tuple[Tilt, Tilt] = optional((0.0, 0.0))
+    tilt_rad: tuple[Tilt, Tilt] = optional((0.0, 0.0))
 
 
 class ObstructionSpec(SpecTable, frozen=True):

@@ -206,7 +206,7 @@ def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:
 
 
 def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
-    """Spots of a table, for the first wavelength of a camera."""
+    """Spots of a table, for the first wavelength of a camera; from the direction in which light arrives."""
     wavelength = camera.lines[0].wavelength_m
     shares = shares_of(table.weights, table.spot_count)
     if table.period_m is not None:
@@ -215,8 +215,8 @@ def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
         return Spots(orders * step, shares, orders, (step, step))
     places = _places_m(table)
     middle = np.array(table.offset_m[::-1])
-    sines = np.stack(camera.sines_of(*(places + middle).T), axis=1)
-    if table.arrangement != "grid" or middle.any() or not camera.is_sine:
+    sines = np.stack(camera.sines_of(*(places + middle).T), axis=1) - np.array(camera.moved_sines())
+    if table.arrangement != "grid" or middle.any() or not camera.images_alike:
         return Spots(sines / wavelength, shares)
     assert table.spacing_m is not None
     # An even count has no middle: its spots are the odd ones of a lattice twice as fine.

@@ -242,5 +242,5 @@ def _stray(spots: Spots) -> Float[np.ndarray, "n 2"]:
 
 
 def _places_m(spots: Spots, camera: Camera, wavelength_m: float) -> Float[np.ndarray, "m 2"]:
-    """Places (y, x) of the spots on the sensor."""
-    return np.stack(camera.image_m(*(spots.waves_per_m * wavelength_m).T), axis=1)
+    """Places (y, x) of the spots on the sensor, as far as a tilted beam has moved them."""
+    return np.stack(camera.image_m(*(spots.waves_per_m * wavelength_m + np.array(camera.moved_sines())).T), axis=1)

@@ -115,7 +115,8 @@ def plan_far_field(
         sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
             `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
-        field_rad: field angles (y, x); without influence if the lens has the mapping "sine" and no distortion.
+        field_rad: field angles (y, x); without influence if the lens has the mapping "sine" and no distortion, and no
+            beam is tilted.
         room: by how much `bent` may turn, shear or stretch the image, a share; 0 is for a sensor that is perfect.
     """
     ny, nx = camera.grid.shape
@@ -135,7 +136,7 @@ def plan_far_field(
     spacing = scale / (length * pitch)
     fine = spacing if bare else scale / (sampling * aperture)
     width = camera.pixel_m * camera.fill / fine
-    places = None if camera.is_sine and not room else window_places(camera, fine, field_rad)
+    places = None if camera.images_alike and not room else window_places(camera, fine, field_rad)
     reach = camera.window * camera.pixel_m / 2 / fine
     if places is not None:
         reach = largest_reach(places, camera.window) * (1 + 2 * room)

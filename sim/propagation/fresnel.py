@@ -63,6 +63,10 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     if camera.in_angles:
         rule, cure = "the direct path leads to a sensor", 'Use the "far_field" path.'
         raise InputError("propagation", rule, camera.lens_text, cure)
+    if camera.is_tilted:
+        rule = "on the direct path the sensor's window follows a beam that stands aslant"
+        cure = 'Give its `angle` in place of its `tilt`, or use the "far_field" path.'
+        raise InputError("illumination.tilt", rule, "a tilt", cure)
     if camera.doe_distance_m:
         rule, got = "on the direct path the DOE lies on the lens", f"{camera.doe_distance_m * 1e3:.4g} mm before it"
         raise InputError("camera.doe_distance", rule, got, 'Use the "far_field" path.')

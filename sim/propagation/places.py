@@ -21,17 +21,19 @@ CUBIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2),
 def window_places(camera: Camera, sample_m: float, field_rad: tuple[float, float] = (0.0, 0.0)) -> PlaceMap:
     """Map from the window's pixels to samples of the far field, `sample_m` metres apart on an ideal sine lens.
 
-    The window's middle is at the chief ray of the field angles (y, x).
+    The window's middle is at the chief ray of the field angles (y, x). Samples count from the light of a beam, which
+    may be tilted beside it.
     """
     chief = direction_sines(field_rad)
-    middle_m = camera.image_m(*chief)
+    middle_m, moved = camera.image_m(*chief), camera.moved_sines(field_rad)
     distance, pixel = camera.sensor_distance_m, camera.pixel_m
 
     def places(row: Any, column: Any) -> tuple[Any, Any]:
-        if camera.is_sine:
+        if camera.images_alike:
             return row * (pixel / sample_m), column * (pixel / sample_m)
         y, x = camera.sines_of(middle_m[0] + row * pixel, middle_m[1] + column * pixel)
-        return (y - chief[0]) * (distance / sample_m), (x - chief[1]) * (distance / sample_m)
+        y, x = y - (chief[0] + moved[0]), x - (chief[1] + moved[1])
+        return y * (distance / sample_m), x * (distance / sample_m)
 
     return places
 

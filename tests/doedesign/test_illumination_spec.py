@@ -1,5 +1,6 @@
 """The table [illumination]: from the file to a camera's beam, what is refused, and what a run keeps of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,14 @@ import doedesign.optimization as optimization
 from doedesign.build import camera_from_spec
 from doedesign.optimization import optimize
 from doedesign.runs.folder import open_run
-from doedesign.spec import Spec, load_spec, spec_to_toml
+from doedesign.spec import Spec, load_spec, spec_digest, spec_to_toml, spec_warnings
+from doedesign.spots.design import spots_from_spec
+from doedesign.spots.orders import order_table
 from fab.errors import InputError
 from fab.pictures import write_pixels
-from sim.illumination import GaussianBeam, MeasuredBeam
+from fab.units import parse_angle
+from sim.illumination import EvenBeam, GaussianBeam, MeasuredBeam
+from sim.optic import HeightOptic
 from sim.transfer import mtf
 from tests.doedesign.test_spots_run import SPEC
 from tests.pictures import leave_out_pictures
@@ -22,6 +27,8 @@ GAUSSIAN = """
 kind = "gaussian"
 diameter = ["120 um", "100 um"]
 """
+PLANE = '[illumination]\nkind = "plane"\n'
+POINT = '[illumination]\nkind = "point"\ndistance = "50 mm"\n'
 PICTURE = """
 [illumination]
 kind = "picture"
@@ -60,8 +67,46 @@ def test_a_spec_has_x_before_y_and_a_beam_y_before_x(tmp_path: Path):
     assert camera_from_spec(spec_of(tmp_path, "")).beam is None
 
 
-def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
-    spec = spec_of(tmp_path, GAUSSIAN, "illumination.angle=['0 deg', '1 deg']", "illumination.m_squared=1.5")
+def test_light_without_a_shape_is_plane_or_comes_from_a_point(tmp_path: Path):
+    """On the opening that the chrome leaves, tilted or not."""
+    plane = spec_of(tmp_path, PLANE, 'illumination.tilt=["2 deg", "-1 deg"]')
+    opening = plane.doe.aperture_m - 2 * plane.process.chrome_overlap_m
+    assert camera_from_spec(plane).beam == EvenBeam(opening, tilt_rad=(parse_angle("-1 deg"), parse_angle("2 deg")))
+    point = camera_from_spec(spec_of(tmp_path, POINT, 'illumination.angle=["0 deg", "1 deg"]')).beam
+    assert point == EvenBeam(opening, 0.05, (parse_angle("1 deg"), 0.0))
+    assert camera_from_spec(spec_of(tmp_path, POINT, 'illumination.distance="inf"')).beam == EvenBeam(opening)
+
+
+def test_a_beam_without_a_kind_is_gaussian(tmp_path: Path):
+    spec = spec_of(tmp_path, GAUSSIAN.replace('kind = "gaussian"\n', ""))
+    assert spec_digest(spec) == spec_digest(spec_of(tmp_path, GAUSSIAN))
+
+
+def test_orders_of_a_tilted_beam_are_told_where_they_land(tmp_path: Path):
+    """asin(order wavelength / period + sin(tilt)) along the tilt; on a sensor, the focal length times that sine."""
+    spec = spec_of(tmp_path, PLANE, 'illumination.tilt=["2 deg", "0 deg"]')
+    assert spec.spots is not None
+    camera = camera_from_spec(spec)
+    spots = spots_from_spec(spec.spots, camera)
+    found = order_table(HeightOptic.of(camera), spots).places_m
+    moved = order_table(HeightOptic.of(replace(camera, beam=None)), spots).places_m
+    assert found[:, 1] - moved[:, 1] == pytest.approx(camera.focal_length_m * np.sin(np.deg2rad(2)), rel=1e-9)
+    assert found[:, 0] == pytest.approx(moved[:, 0], abs=1e-12)
+
+
+def test_a_window_that_tilted_light_leaves_is_warned_of(tmp_path: Path):
+    straight, tilted = (spec_of(tmp_path, PLANE, f'illumination.tilt=["{tilt} deg", "0 deg"]') for tilt in (0, 8))
+    assert [w for w in spec_warnings(straight) if w.startswith("sensor.window")] == []
+    (warning,) = [w for w in spec_warnings(tilted) if w.startswith("sensor.window")]
+    assert "from where light arrives" in warning
+
+
+@pytest.mark.parametrize(
+    "table", ["{}angle = ['0 deg', '1 deg']\nm_squared = 1.5", "{}", "{}tilt = ['1 deg', '0 deg']"]
+)
+def test_a_spec_is_written_as_it_was_read(tmp_path: Path, table: str):
+    beam = GAUSSIAN if "m_squared" in table else POINT
+    spec = spec_of(tmp_path, table.format(beam))
     path = tmp_path / "again.toml"
     path.write_text(spec_to_toml(spec))
     assert load_spec(path) == spec
@@ -78,6 +123,14 @@ def test_a_spec_is_written_as_it_was_read(tmp_path: Path):
         ('[illumination]\nkind = "gaussian"\n', [], "illumination.diameter", "needs it"),
         (PICTURE, ['illumination.picture="beam.gif"'], "illumination.picture", ".png"),
         (PICTURE, ["illumination.m_squared=1.5"], "illumination.m_squared", "takes: picture, pixel"),
+        ('[illumination]\nkind = "point"\n', [], "illumination.distance", "needs it"),
+        (POINT, ['illumination.distance="20 um"'], "illumination.distance", "cannot follow the wave of the point"),
+        (POINT, ['illumination.diameter="1 mm"'], "illumination.diameter", "takes: distance, angle, tilt"),
+        (PLANE, ['illumination.distance="5 mm"'], "illumination.distance", "takes: angle, tilt"),
+        (PLANE, ['illumination.centre=["1 um", "0 um"]'], "illumination.centre", "takes: angle, tilt"),
+        (PLANE, ['illumination.tilt="1 deg"'], "illumination.tilt", "must be a list"),
+        (PLANE, ['illumination.tilt=["90 deg", "0 deg"]'], "illumination.tilt[0]", "must lie between"),
+        (PLANE, ['illumination.tilt=["1 um", "0 deg"]'], "illumination.tilt[0]", "deg, mrad or rad"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path: Path, table: str, changes: list[str], where: str, words: str):

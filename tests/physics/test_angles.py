@@ -20,13 +20,17 @@ def camera_of(window: int, pixel: float = PIXEL) -> Camera:
     return Camera(grid, CELLS * PITCH, "fused_silica", (colour,), np.inf, pixel, window, distance_m=np.inf)
 
 
-def summed(field: np.ndarray, camera: Camera) -> np.ndarray:
+def summed(field: np.ndarray, camera: Camera, moved: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     """Energy of every pixel by a plain sum over square cells, in double precision, 16 directions to it and axis."""
     inside = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
-    sines = ((np.arange(camera.window) - (camera.window - 1) / 2)[:, None] + inside).ravel() * camera.pixel_m
+    middle = (np.arange(camera.window) - (camera.window - 1) / 2)[:, None] + inside
     place = (np.arange(CELLS) - (CELLS - 1) / 2) * PITCH
-    kernel = np.exp(-2j * np.pi * sines[:, None] * place / WAVELENGTH) * np.sinc(sines * PITCH / WAVELENGTH)[:, None]
-    light = np.abs(kernel @ field @ kernel.T) ** 2 * (PITCH**2 / WAVELENGTH * camera.pixel_m / _PARTS) ** 2
+    kernels = []
+    for sine in moved:  # light that arrives at an angle leaves at it
+        waves = (middle.ravel() * camera.pixel_m / camera.sensor_distance_m - sine) / WAVELENGTH
+        kernels.append(np.exp(-2j * np.pi * waves[:, None] * place) * np.sinc(waves * PITCH)[:, None])
+    scale = PITCH**2 / WAVELENGTH * camera.pixel_m / camera.sensor_distance_m / _PARTS
+    light = np.abs(kernels[0] @ field @ kernels[1].T) ** 2 * scale**2
     light /= np.pi * camera.aperture_m**2 / 4
     return light.reshape(camera.window, _PARTS, camera.window, _PARTS).sum((1, 3)) * camera.transmission(WAVELENGTH)
 

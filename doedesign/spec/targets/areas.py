@@ -141,7 +141,8 @@ def _reach(spec: "Spec", area: Any, key: str, wavelength: float) -> Iterator[Inp
     most = wavelength / (2 * pitch)
     half = [size / 2 + area.dark_m for size in area.size_m]
     y, x = (abs(at) + reach for at, reach in zip(area.offset_m[::-1], half, strict=True))
-    sine = max(map(abs, sines_at(optics.mapping, optics.distortion, y / distance, x / distance)))
+    sines = sines_at(optics.mapping, optics.distortion, y / distance, x / distance)
+    sine = max(abs(at) + abs(moved) for at, moved in zip(sines, spec.moved_sines, strict=True))
     if sine * _ROOM > most:
         unit = spec.told_in(MICROMETRES)
         end, got = (f"{unit.of(at):.4g} {unit.suffix}" for at in (most * distance / _ROOM, max(y, x)))

@@ -77,11 +77,13 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
 def _beam(spec: "Spec") -> Iterator[InputError]:
     """The rule that the beam is a single wave along the axis: light of any other has no focus there."""
     beam = spec.illumination
-    if beam is not None and any(value != 1.0 for value in beam.m_squared):
+    if beam is None:
+        return
+    if any(value != 1.0 for value in beam.m_squared):
         cure = "Leave it out, and look at the finished design in the real beam."
         yield InputError("illumination.m_squared", "foci are designed for a single mode", f"{beam.m_squared}", cure)
-    for name in ("centre", "angle"):
-        if beam is not None and any(beam.centre_m if name == "centre" else beam.angles_rad):
+    for name, places in (("centre", beam.centre_m), ("angle", beam.angles_rad), ("tilt", beam.tilt_rad)):
+        if any(places):
             yield InputError(f"illumination.{name}", "foci lie on the axis of the beam", "beside it", "Leave it out.")
 
 

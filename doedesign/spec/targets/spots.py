@@ -149,6 +149,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     for y, x in corners(spots):
         share = (y / spec.image_distance_m, x / spec.image_distance_m)
         sines = sines_at(optics.mapping, optics.distortion, *share)
+        sines = [at - moved for at, moved in zip(sines, spec.moved_sines, strict=True)]
         if max(map(abs, sines)) > sine:
             farthest, sine = max(abs(y), abs(x)), max(map(abs, sines))
     if sine > most:
