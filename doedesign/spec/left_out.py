@@ -18,6 +18,7 @@ from typing import Any
 
 from doedesign.spec.errors import validated
 from doedesign.spec.models import Spec
+from doedesign.spec.targets.areas import AreaSpec
 from doedesign.spec.targets.spots import corners
 from doedesign.spec.values import STARTS
 from fab.units import format_length, parse_angle, parse_length
@@ -44,7 +45,7 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
         InputError: a mistake in what the spec says, which has to be right before the rest can follow from it.
     """
     filled: dict[str, Any] = dict(raw)
-    aimed = any(isinstance(raw.get(name), Mapping) for name in _AIMS)
+    aimed = any(isinstance(raw.get(name), Mapping | list) for name in _AIMS)
     optimize, optics, sensor = (raw.get(name, {}) for name in ("optimize", "optics", "sensor"))
     classic = isinstance(optimize, Mapping) and optimize.get("start") in _CLASSIC
     if aimed or classic or isinstance(raw.get("illumination"), Mapping):
@@ -121,16 +122,20 @@ def _reach_m(spec: Spec, detail_m: float) -> float:
         if not all(getattr(spots, name) for name in spots.needed):
             return 0.0
         return max(abs(part) for corner in corners(spots) for part in corner) + 2 * detail_m
-    if (area := spec.area) is not None:
-        # The height of a picture is not known before it is opened.
-        sizes = (max(area.size_m),) * 2 if area.shape == "picture" else area.size_m
-        beside = area.dark_m + (area.edge_m or 2 * detail_m)
-        return max(abs(at) + size / 2 for at, size in zip(area.offset_m[::-1], sizes, strict=True)) + beside
+    if spec.areas:
+        return max(_far_end_m(area, detail_m) for area in spec.areas)
     if spec.focus is not None:
         return 4 * (spec.focus.widths_m or (0.0,))[0]
     start, sine = spec.optimize.start, _steepest(spec, longest)
     focuses = near and start in _LENSES
     return (spec.doe.aperture_m / 2 if start == "lens_array" else 0.0) if focuses else shadow + moved + sine * distance
+
+
+def _far_end_m(area: AreaSpec, detail_m: float) -> float:
+    """How far from the axis an area reaches; the height of a picture is not known before it is opened."""
+    sizes = (max(area.size_m),) * 2 if area.shape == "picture" else area.size_m
+    beside = area.dark_m + (area.edge_m or 2 * detail_m)
+    return max(abs(at) + size / 2 for at, size in zip(area.offset_m[::-1], sizes, strict=True)) + beside
 
 
 def _steepest(spec: Spec, wavelength_m: float) -> float:

@@ -80,7 +80,7 @@ def test_angles_of_spots_and_areas_are_those_of_their_light(tmp_path: Path):
     assert sines == pytest.approx(np.sin([[0, np.radians(-3)], [np.radians(2), 0.04]]), abs=1e-11)
     area = spec_of(
         tmp_path, 'area={ shape = "ring", width = "6 deg", inner = "3 deg", offset = ["1 deg", "0 deg"] }'
-    ).area
+    ).areas[0]
     assert area.size_m[1] == pytest.approx(2 * np.sin(np.radians(3)), rel=1e-11)
     assert area.offset_m == pytest.approx((np.sin(np.radians(1)), 0), rel=1e-11)
 

@@ -36,9 +36,9 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
 
 
 def in_focus(spec: "Spec") -> Iterator[InputError]:
-    """Return the broken rules that spots lie in the focal plane of a lens; orders of a unit cell need none."""
+    """Return the broken rules that spots lie in the focal plane of a lens or at angles; orders of a cell need none."""
     if spec.sensor.distance_m is not None and spec.spots is not None and spec.spots.period_m is None:
-        cure = "Give optics.focal_length, or spots.period for orders of a unit cell."
+        cure = "Give optics.focal_length, sensor.pixel_angle for spots in angles, or spots.period for orders of a cell."
         yield InputError("sensor.distance", "spots lie in the focus of a lens", "a distance", cure)
     if spec.sensor.defocus_m and not spec.sensor.in_angles:
         got = format_length(spec.sensor.defocus_m)

@@ -67,8 +67,9 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
         if given:
             yield InputError("focus", f"takes the place of {table}", "both", f"Remove [focus] or [{table}].")
     if spec.sensor.distance_m is None:
-        cure = "Give sensor.distance instead of optics.focal_length."
-        yield InputError("sensor.distance", "foci lie behind a DOE without a lens", "a lens", cure)
+        other, got = ("sensor.pixel_angle", "angles") if spec.sensor.in_angles else ("optics.focal_length", "a lens")
+        cure = f"Give sensor.distance and sensor.pitch instead of {other}."
+        yield InputError("sensor.distance", "foci lie behind a DOE without a lens", got, cure)
     yield from beside_problems(spec, "focus")
     yield from _beam(spec)
     yield from _reach(spec)
