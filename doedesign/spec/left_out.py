@@ -59,14 +59,15 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
     if not ("focal_length" in optics or {"distance", "pixel_angle"} & sensor.keys()):
         distance = _distance(raw)
         sensor = sensor if distance is None else {**sensor, "distance": distance}
-    pixel = "pitch" if {"distance", "pitch"} & sensor.keys() or "focal_length" in optics else "pixel_angle"
+    on_sensor = "focal_length" in optics or {"distance", "pitch"} & sensor.keys()
+    pixel = "pitch" if on_sensor and "pixel_angle" not in sensor else "pixel_angle"
     usual = {"window": 2, pixel: "1 um" if pixel == "pitch" else "1 mrad"}
     stand_in = {key: value for key, value in usual.items() if key not in sensor}
     filled["sensor"] = {**sensor, **stand_in}
     if stand_in:
         spec = validated(Spec, filled, source, overridden)
-        # Without any distance the rules between tables have something to say.
-        found = _sensor(spec, stand_in.keys()) if math.isfinite(spec.image_distance_m) else stand_in
+        # Without a possible distance the rules between tables have something to say.
+        found = _sensor(spec, stand_in.keys()) if 0 < spec.image_distance_m < math.inf else stand_in
         filled["sensor"] = {**sensor, **found}
     return filled
 

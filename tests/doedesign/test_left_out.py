@@ -132,6 +132,8 @@ def test_a_beam_takes_the_place_of_the_scene(tmp_path: Path):
         ([], ["scene: must be given", "sensor: must be given"]),
         (['spots={ count = [7, 7], period = "64 seconds" }'], ["spots.period", "75 nm"]),
         ([ORDERS, 'sensor.pitch="2 um"'], ["optics.focal_length", "a lens, or a sensor at a distance"]),
+        ([ORDERS, LENS, 'sensor.defocus="-10 mm"'], ["sensor.defocus", "beyond half the focal length"]),
+        ([ORDERS, 'optics.focal_length="1 mm"', 'sensor.defocus="-2 mm"'], ["sensor.defocus", "half the focal length"]),
         ([ORDERS, "sensor.pixels=3"], ["sensor.pixels", "must be a known key"]),
         ([ORDERS, "sensor=3"], ["sensor", "must be a table"]),
         ([ORDERS, "optics=3"], ["optics", "must be a table"]),
@@ -147,6 +149,12 @@ def test_mistakes_are_those_of_the_spec(tmp_path: Path, task: list[str], words: 
         spec_of(tmp_path, *task)
     for word in words:
         assert word in str(refused.value)
+
+
+def test_a_lens_beside_angles_is_one_mistake(tmp_path: Path):
+    with pytest.raises(InputError, match="directions are looked at without lens") as refused:
+        spec_of(tmp_path, ORDERS, LENS, 'sensor.pixel_angle="0.1 deg"')
+    assert "sensor.pitch" not in str(refused.value)
 
 
 def test_pictures_of_scenes_ask_for_photosites(tmp_path: Path):
