@@ -236,9 +236,9 @@ class ObjectiveSpec(SpecTable, frozen=True):
 class Spec(SpecTable, frozen=True):
     """All that a design depends on: its tables, and the name that runs and mask sets are called after.
 
-        `objectives` are the terms of the loss, unless `spots`, `areas` or a `focus` say where light should go, and
-        `limits` the conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML. One area is `[area]`, several are
-        `[[area]]`.
+    `objectives` are the terms of the loss, unless `spots`, `areas` or a `focus` say where light should go, and
+    `limits` the conditions of a good DOE; `[[objective]]` and `[[limit]]` in TOML. One area is `[area]`, several are
+    `[[area]]`.
 
     A file may leave out what its task says (`doedesign.spec.left_out`); here all is filled in.
     """
