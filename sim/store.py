@@ -116,7 +116,7 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
 
 
 def _pixel_key(bank: "sim.psf_bank.PsfBank") -> str:
-    """What the pitch of a bank's pixels is called: they have a length, or only a direction."""
+    """Name of the pitch of a bank's pixels: they have a length, or only a direction."""
     return "pixel_sine" if bank.camera is not None and bank.camera.in_angles else "pixel_m"
 
 

@@ -69,7 +69,7 @@ class DrawnPattern(NamedTuple):
 
 
 def drawn_patterns(spec: Spec, camera: Camera, bank: PsfBank, terms: tuple[Term, ...]) -> list[DrawnPattern]:
-    """What a design draws for every `target_pattern` objective, for the colours and depths that it names.
+    """The light that a design draws for every `target_pattern` objective, for the colours and depths that it names.
 
     Where it names none, it is judged for the first colour and far depth.
     """

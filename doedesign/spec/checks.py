@@ -104,7 +104,7 @@ def _distance(spec: Spec) -> Iterator[InputError]:
 
 
 def _directions(spec: Spec) -> Iterator[InputError]:
-    """What cannot stand beside pixels that are angles, and how far they may reach."""
+    """Keys that cannot stand beside pixels that are angles, and how far these may reach."""
     sensor, rule = spec.sensor, "directions are looked at without lens and sensor"
     beside = {
         "optics.focal_length": spec.optics.focal_length_m,

@@ -1,4 +1,4 @@
-"""What a spec may leave out because its task says it: the scene, the sensor, the steps of a design that is a formula.
+"""Parts that a spec may leave out because its task says them: scene, sensor, the steps of a design that is a formula.
 
 A task is said by `[spots]`, `[area]`, `[focus]` or a classic start (`optimize.start = "axicon"`). What is left out then
 becomes part of the spec, as if it had been written, by these rules:
