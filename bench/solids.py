@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from bench.masks import bench_map
+from fab.aperture import RoundAperture
 from fab.solids.columns import Columns, reduced_cells, whole, window_cells
 from fab.solids.mesh import closed_volume_m3, relief_mesh
 from fab.solids.meshfile import read_mesh, write_3mf, write_glb, write_stl
@@ -48,11 +49,12 @@ def bench_step(quick: bool, folder: Path) -> None:
     """Print the STEP file of a radial design with a step at every ring."""
     count = 2000 if quick else 8000
     rings = Rings(np.arange(1, count + 1) * 2.2 * MM / count, np.arange(count) % 16 * 75 * NM, 1125 * NM)
-    die, chrome, path = Substrate("die", 10 * MM, 0.5 * MM), ChromeRing(2.195 * MM, 3.7 * MM), folder / "r.step"
+    die, chrome = Substrate("die", 10 * MM, 0.5 * MM), ChromeRing(RoundAperture(4.39 * MM), 3.7 * MM)
+    path = folder / "r.step"
     # The kernel takes its time to load, and every process does that once.
-    substrate_step(folder / "first.step", die, 4.4 * MM, chrome)
+    substrate_step(folder / "first.step", die, RoundAperture(4.4 * MM), chrome)
     step_bodies(folder / "first.step")
-    _, written = timed(lambda: substrate_step(path, die, 4.4 * MM, chrome, rings))
+    _, written = timed(lambda: substrate_step(path, die, RoundAperture(4.4 * MM), chrome, rings))
     found, read = timed(lambda: step_bodies(path))
     want = substrate_bodies(die, chrome, rings)
     wrong = max(abs(found[name].volume_m3 / want[name].volume_m3 - 1) for name in want)

@@ -38,8 +38,8 @@ def camera_from_spec(spec: Spec) -> Camera:
     """Return lens, sensor, substrate and DOE grid of a spec."""
     return Camera(
         grid=Grid((spec.doe.samples, spec.doe.samples), spec.doe.pitch_m),
-        # Light passes the opening in the chrome, which is smaller than the etched circle.
-        aperture_m=spec.doe.aperture_m - 2 * spec.process.chrome_overlap_m,
+        # Light passes the opening in the chrome, which is smaller than what is etched.
+        aperture=spec.doe.relief.shrunk(spec.process.chrome_overlap_m),
         material=spec.doe.material,
         colours=tuple(Colour(c.name, c.wavelengths_m, c.weights) for c in spec.optics.colours),
         focal_length_m=np.inf if spec.optics.focal_length_m is None else spec.optics.focal_length_m,

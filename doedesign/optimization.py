@@ -48,7 +48,7 @@ from fab.height import HeightMap
 from fab.levels import Levels
 from fab.plots.height import plot_height
 from fab.units import NM, format_length
-from sim.aperture import circle_coverage
+from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.metrics import without_infinities
 from sim.optic import HeightOptic
@@ -265,7 +265,7 @@ def _iterate(
 def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
     """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
     binary = Levels(design.levels.count, design.levels.step_m)
-    area = circle_coverage(camera.grid, camera.aperture_m)
+    area = open_cells(camera.grid, camera.opening)
     heights = height_histogram(np.asarray(design.continuous_m), area, binary.period_m, camera)
     return {
         "depths_nm": [round(depth / NM, 1) for depth in design.levels.depths_m],
@@ -302,7 +302,7 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
         save(aimed.plot(), run.path(f"{aimed.name}.png"))
         names += [f"{aimed.name}.csv", f"{aimed.name}.png"]
     write_atomic(run.path("metrics.json"), canonical_json(metrics))
-    save(plot_height(HeightMap(height, camera.grid, spec.doe.aperture_m), levels, spec.name), run.path("height.png"))
+    save(plot_height(HeightMap(height, camera.grid, spec.doe.relief), levels, spec.name), run.path("height.png"))
     save(plot_psfs(bank, camera, near, far, remark=remark), run.path("psf.png"))
     transfers = [mtf(each, depths=(*near, *far)) for each in (drawn, flat)]
     save(plot_mtf(transfers[0], camera, near, far, transfers[1]), run.path("mtf.png"))

@@ -2,7 +2,8 @@
 
 The public names are those of `dir(fab)`; each is imported on its first use. The packages, in the order of the work:
 
-    grid, height, levels, level_map          the pixel raster, heights, the staircase and its masks, the DOE itself
+    grid, aperture, height, levels, level_map    the pixel raster, outlines on it, heights, the staircase and its masks,
+                                             the DOE itself
     process, deviations, stock, draws        what a lab does, its errors, ordinary processes with sources, random errors
     rules/         what a process can print, and a level map changed until it can
     layout/        the drawing: the DOE, its chrome, marks, test structures, dies, wafer

@@ -1,3 +1,5 @@
+from .aperture import RectangularAperture as RectangularAperture
+from .aperture import RoundAperture as RoundAperture
 from .errors import CheckFailed as CheckFailed
 from .errors import InputError as InputError
 from .grid import Grid as Grid

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture
 from fab.files import write_atomic
 from fab.units import MM, format_length
 
@@ -169,6 +170,11 @@ def length_text(length_m: float) -> str:
     if math.isinf(length_m):
         return "∞"
     return format_length(float(f"{length_m:.4g}")).replace("um", "µm")
+
+
+def aperture_text(aperture: Aperture) -> str:
+    """An aperture in words for a picture: its diameter, or "2 mm × 1 mm"."""
+    return " × ".join(map(length_text, aperture.sizes_m))
 
 
 def bare(axes: "Axes") -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.files import read_npy
 from fab.grid import Grid
@@ -32,7 +33,7 @@ class HeightMap:
     Attributes:
         height_m: heights above the deepest floor, metres, ``[y, x]``, float32 or float64, none negative.
         grid: the raster.
-        aperture_m: diameter of the relief, metres.
+        aperture: outline of the relief (`fab.aperture`); a number is the diameter of a round one, metres.
 
     Raises:
         InputError: the shape is not the grid's, or a height is NaN, infinite or negative.
@@ -40,15 +41,27 @@ class HeightMap:
 
     height_m: NDArray[np.floating]
     grid: Grid
-    aperture_m: float
+    aperture: Aperture | float
 
     def __post_init__(self) -> None:
         if self.height_m.shape != self.grid.shape:
             got = f"{self.height_m.shape} on {self.grid.shape}"
             raise InputError("height map", "must have the grid's shape", got, "Use its own grid.")
-        if not 0 < self.aperture_m < float("inf"):
-            raise InputError("aperture", "must be positive and finite", self.aperture_m, "Give the diameter.")
+        relief = aperture_from(self.aperture)
+        if not all(0 < side < float("inf") for side in relief.extent_m):
+            raise InputError("aperture", "must be positive and finite", str(relief), "Give the diameter.")
+        object.__setattr__(self, "aperture", relief)
         require_heights(self.height_m, "height map")
+
+    @property
+    def relief(self) -> Aperture:
+        """The outline of the relief."""
+        return aperture_from(self.aperture)
+
+    @property
+    def aperture_m(self) -> float:
+        """Diameter of a round relief, metres; an InputError for another."""
+        return diameter_of(self.relief)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the map as a whole and cell by cell, and the share of area at every height (`fab.plots.height`)."""
@@ -57,13 +70,13 @@ class HeightMap:
         return plot_height(self, ax=ax)
 
     def _repr_html_(self) -> str:
-        from fab.figure import html_of, length_text
+        from fab.figure import aperture_text, html_of, length_text
 
         ny, nx = self.grid.shape
         rows = {
             "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
             "heights": f"{length_text(float(self.height_m.min()))} to {length_text(float(self.height_m.max()))}",
-            "relief": length_text(self.aperture_m),
+            "relief": aperture_text(self.relief),
         }
         return html_of("height map", rows, self.plot())
 
@@ -107,7 +120,7 @@ def read_height(
     path: str | Path,
     pitch: float | str | None = None,
     scale: float | str | None = None,
-    aperture: float | str | None = None,
+    aperture: Aperture | float | str | None = None,
 ) -> HeightMap:
     """Read a height map that a user brings; lengths are metres, or text with a unit such as ``"1.85 um"``.
 
@@ -115,7 +128,7 @@ def read_height(
         path: ``.npy``, ``.tif``, ``.tiff`` or ``.png``.
         pitch: edge of a pixel. None of these files holds it, so it must be given.
         scale: length that one count of the file stands for. Floats are metres if it is left out; integers need it.
-        aperture: diameter of the relief; the shorter side of the map if left out.
+        aperture: diameter of the relief, or its outline (`fab.aperture`); the shorter side of the map if left out.
 
     Returns:
         The height map, float32 if the file holds float32 or float16, otherwise float64.
@@ -142,4 +155,6 @@ def read_height(
         height_m *= scale_m
     require_heights(height_m, str(path))
     grid = Grid((height_m.shape[0], height_m.shape[1]), metres(pitch, "pitch"))
-    return HeightMap(height_m, grid, min(grid.extent_m) if aperture is None else metres(aperture, "aperture"))
+    if not isinstance(aperture, Aperture):
+        aperture = min(grid.extent_m) if aperture is None else metres(aperture, "aperture")
+    return HeightMap(height_m, grid, aperture)

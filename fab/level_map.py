@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, RectangularAperture, RoundAperture, aperture_from, diameter_of
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import sha256_bytes
@@ -40,8 +41,8 @@ class LevelMap:
             whatever was given there. Read-only.
         levels: the staircase.
         grid: the raster.
-        aperture_m: diameter of the relief, metres; infinite where all of the raster is relief, as in a piece that was
-            cut out of a DOE.
+        aperture: outline of the relief (`fab.aperture`); a number is the diameter of a round one, metres, infinite
+            where all of the raster is relief, as in a piece that was cut out of a DOE.
         name: the owner's name for it.
 
     Raises:
@@ -52,7 +53,7 @@ class LevelMap:
     level: NDArray[np.uint8]
     levels: Levels
     grid: Grid
-    aperture_m: float
+    aperture: Aperture | float
     name: str = "doe"
 
     def __post_init__(self) -> None:
@@ -60,12 +61,16 @@ class LevelMap:
         if checked.shape != self.grid.shape:
             rule = f"must have the grid's shape {self.grid.shape}"
             raise InputError("level map", rule, checked.shape, "Use its own grid.")
-        side_m = min(self.grid.extent_m)
-        if not 0 < self.aperture_m <= side_m * (1 + 1e-9) and self.aperture_m != math.inf:
-            rule = f"must lie from 0 to the shorter side of the raster, {format_length(side_m)}"
-            raise InputError("aperture", rule, format_length(self.aperture_m), "Give the diameter of the relief.")
-        blank = np.where(self.grid.inside_circle(self.aperture_m), checked, np.uint8(self.levels.count - 1))
+        relief = aperture_from(self.aperture)
+        sides = zip(relief.extent_m, self.grid.extent_m, strict=True)
+        if not all(0 < side <= most * (1 + 1e-9) for side, most in sides) and relief.narrowest_m != math.inf:
+            rule = f"must lie from 0 to the shorter side of the raster, {format_length(min(self.grid.extent_m))}"
+            if not isinstance(relief, RoundAperture):
+                rule = f"must lie on the raster, {RectangularAperture(self.grid.extent_m)}"
+            raise InputError("aperture", rule, str(relief), "Give the diameter of the relief, or its width and height.")
+        blank = np.where(relief.inside(self.grid), checked, np.uint8(self.levels.count - 1))
         blank.setflags(write=False)
+        object.__setattr__(self, "aperture", relief)
         object.__setattr__(self, "level", blank)
 
     @classmethod
@@ -76,7 +81,17 @@ class LevelMap:
             InputError: a height above the staircase that is not to be wrapped, or the aperture does not fit.
         """
         level = (quantise_wrapped if wrapped else quantise)(height.height_m, levels)
-        return cls(level, levels, height.grid, height.aperture_m, name)
+        return cls(level, levels, height.grid, height.relief, name)
+
+    @property
+    def relief(self) -> Aperture:
+        """The outline of the relief."""
+        return aperture_from(self.aperture)
+
+    @property
+    def aperture_m(self) -> float:
+        """Diameter of a round relief, metres; an InputError for another."""
+        return diameter_of(self.relief)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -103,21 +118,26 @@ class LevelMap:
         """The same DOE with other level numbers ``[y, x]``."""
         return replace(self, level=level)
 
+    @property
+    def shown_relief(self) -> Aperture:
+        """The outline of the relief as pictures draw it: beyond the raster where all of it is relief."""
+        whole = RoundAperture(math.hypot(*self.grid.extent_m))
+        return whole if self.relief.widest_m == math.inf else self.relief
+
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw heights as a whole and cell by cell, and the share of area at every level (`fab.plots.height`)."""
         from fab.plots.height import plot_height
 
-        aperture_m = min(self.aperture_m, math.hypot(*self.grid.extent_m))
-        return plot_height(HeightMap(self.height_m, self.grid, aperture_m), self.levels, self.name, ax)
+        return plot_height(HeightMap(self.height_m, self.grid, self.shown_relief), self.levels, self.name, ax)
 
     def _repr_html_(self) -> str:
-        from fab.figure import html_of, length_text
+        from fab.figure import aperture_text, html_of, length_text
 
         ny, nx = self.shape
         rows = {
             "pixels": f"{ny} × {nx} of {length_text(self.grid.pitch_m)}",
             "levels": str(self.levels),
-            "relief": length_text(self.aperture_m),
+            "relief": aperture_text(self.relief),
             "SHA-256": self.digest[:12],
         }
         return html_of(self.name, rows, self.plot())
@@ -141,7 +161,7 @@ def write_level_map(path: str | Path, level_map: LevelMap) -> None:
         "name": level_map.name,
         "shape": list(grid.shape),
         "pitch_m": grid.pitch_m,
-        "aperture_m": None if level_map.aperture_m == math.inf else level_map.aperture_m,
+        "aperture_m": None if level_map.relief.widest_m == math.inf else level_map.relief.record(),
         "levels": levels.count,
         "level_step_m": levels.step_m,
         "etch_depths_m": list(levels.depths_m),
@@ -169,8 +189,8 @@ def read_level_map(path: str | Path) -> LevelMap:
         if bits.shape != (levels.bits, ny, nx):
             raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", bits.shape, cure)
         level = level_map_from_planes(bits, levels)
-        aperture_m = math.inf if header["aperture_m"] is None else float(header["aperture_m"])
-        return LevelMap(level, levels, grid, aperture_m, str(header["name"]))
+        aperture = math.inf if header["aperture_m"] is None else header["aperture_m"]
+        return LevelMap(level, levels, grid, aperture_from(aperture), str(header["name"]))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

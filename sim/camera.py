@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Complex, Float
 
+from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.units import DEGREES, PlaceUnit, format_length
@@ -59,7 +60,7 @@ class Camera:
 
     Attributes:
         grid: cells of the DOE.
-        aperture_m: diameter of the clear aperture.
+        aperture: the clear aperture (`fab.aperture`); a number is the diameter of a round one, metres.
         material: substrate, a key of `sim.material.MATERIALS`.
         colours: colour channels, in the order of the bank's first axis.
         focal_length_m: focal length of the lens.
@@ -83,7 +84,7 @@ class Camera:
     """
 
     grid: Grid
-    aperture_m: float
+    aperture: Aperture | float
     material: str
     colours: tuple[Colour, ...]
     focal_length_m: float
@@ -101,6 +102,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Refuse a lens that cannot image the window, and words that mean nothing here."""
+        object.__setattr__(self, "aperture", aperture_from(self.aperture))
         if math.isinf(self.focal_length_m) != (self.distance_m is not None):
             got = f"a focal length of {self.focal_length_m:g} m and a distance of {self.distance_m} m"
             rule, cure = "a camera has a lens, or a sensor at a distance", "Give a distance without a lens only."
@@ -125,6 +127,16 @@ class Camera:
     def told_in(self, unit: PlaceUnit) -> PlaceUnit:
         """The unit in which to tell places: the one given, or degrees where there is no sensor."""
         return DEGREES if self.in_angles else unit
+
+    @property
+    def opening(self) -> Aperture:
+        """The clear aperture."""
+        return aperture_from(self.aperture)
+
+    @property
+    def aperture_m(self) -> float:
+        """Diameter of a round clear aperture, metres; an InputError for another."""
+        return diameter_of(self.opening)
 
     @property
     def is_sine(self) -> bool:
@@ -203,13 +215,13 @@ class Camera:
         """Amplitude of a mode of the beam on the cells, whose square is 1 for plane light; None without a beam."""
         if self.beam is None:
             return None
-        return beam_amplitude(self.beam, self.grid, self.aperture_m, line.wavelength_m, line.mode)
+        return beam_amplitude(self.beam, self.grid, self.opening, line.wavelength_m, line.mode)
 
     def irradiance(self, wavelength_m: float) -> Float[np.ndarray, "y x"] | None:
         """Irradiance on the cells, 1 for plane light; None without a beam."""
         if self.beam is None:
             return None
-        return beam_irradiance(self.beam, self.grid, self.aperture_m, wavelength_m)
+        return beam_irradiance(self.beam, self.grid, self.opening, wavelength_m)
 
     @property
     def propagation(self) -> Literal["far_field", "angular_spectrum"]:
@@ -227,8 +239,8 @@ class Camera:
         and cells can follow it: cells pitch² / wavelength is at most the distance.
         """
         shortest = min(w for colour in self.colours for w in colour.wavelengths_m)
-        reach = self.aperture_m / 2 + self.window * self.pixel_m / math.sqrt(2)
-        follows = self.grid.shape[0] * self.grid.pitch_m**2 / shortest
+        reach = self.opening.reach_m + self.window * self.pixel_m / math.sqrt(2)
+        follows = max(self.grid.shape) * self.grid.pitch_m**2 / shortest
         return max(follows, (reach**4 / (8 * shortest * _PARAXIAL)) ** (1 / 3))
 
     def axis_m(self) -> Float[np.ndarray, " window"]:
@@ -282,9 +294,9 @@ class Camera:
         if self.in_angles:
             return self.aperture_m / 2 * inverse_depth
         if self.distance_m is not None:
-            return self.aperture_m / 2 * (self.distance_m * inverse_depth + 1.0)
+            return self.opening.reach_m * (self.distance_m * inverse_depth + 1.0)
         distance = self.focal_length_m + self.defocus_m
-        return self.aperture_m / 2 * abs(self.sensor_distance_m * inverse_depth + 1.0 - distance / self.focal_length_m)
+        return self.opening.reach_m * abs(self.sensor_distance_m * inverse_depth + 1.0 - distance / self.focal_length_m)
 
 
 def _sum(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.ndimage import map_coordinates
 
+from fab.aperture import Aperture
 from fab.grid import Grid
 
 _REST = 1e-3  # share of the weakest modes that is left out
@@ -207,24 +208,24 @@ Beam = GaussianBeam | MeasuredBeam | EvenBeam
 
 @lru_cache(maxsize=8)
 def beam_amplitude(
-    beam: Beam, grid: Grid, aperture_m: float, wavelength_m: float, mode: int
+    beam: Beam, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
 ) -> Complex[np.ndarray, "y x"]:
     """Amplitude `[y, x]` of a mode of a beam on the cells of a DOE, complex64 and read-only.
 
-    Its mean square over a clear aperture of that diameter would be 1 if the beam were to end at its rim: plane light
+    Its mean square over that clear aperture would be 1 if the beam were to end at its rim: plane light
     has the amplitude 1, and PSFs count energies over the power of the beam.
     """
-    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(np.pi) * aperture_m / 2
+    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(aperture.area_m2)
     found = found.astype(np.complex64)
     found.setflags(write=False)
     return found
 
 
 @lru_cache(maxsize=4)
-def beam_irradiance(beam: Beam, grid: Grid, aperture_m: float, wavelength_m: float) -> Float[np.ndarray, "y x"]:
+def beam_irradiance(beam: Beam, grid: Grid, aperture: Aperture, wavelength_m: float) -> Float[np.ndarray, "y x"]:
     """Irradiance `[y, x]` on the cells, the sum over all modes, of which 1 is that of plane light of the same power."""
     shown = np.zeros(grid.shape)
     for mode, share in enumerate(beam.shares):
-        shown += share * np.abs(beam_amplitude(beam, grid, aperture_m, wavelength_m, mode)) ** 2
+        shown += share * np.abs(beam_amplitude(beam, grid, aperture, wavelength_m, mode)) ** 2
     shown.setflags(write=False)
     return shown

@@ -40,8 +40,8 @@ def disc_weights(shape: tuple[int, int], pixel_m: float, radius_m: float) -> Flo
 
 
 def airy_radius_m(camera: Camera, wavelength_m: float) -> float:
-    """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D."""
-    return 1.2197 * wavelength_m * camera.sensor_distance_m / camera.aperture_m
+    """Radius of the first dark ring of the ideal lens, 1.22 lambda d / D; D is the shorter side of other apertures."""
+    return 1.2197 * wavelength_m * camera.sensor_distance_m / camera.opening.narrowest_m
 
 
 def mean_wavelength_m(colour: Colour) -> float:
@@ -148,7 +148,7 @@ def _lit_mean(doe: CellOptic, values: Any, wavelength_m: float) -> Any:
 def opening(doe: CellOptic, wavelength_m: float) -> Any:
     """Power on the open parts of the cells, over that of the beam, or over that on the nominal aperture without one."""
     camera = doe.camera
-    cells, light = np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4, camera.irradiance(wavelength_m)
+    cells, light = camera.opening.area_in(camera.grid.pitch_m), camera.irradiance(wavelength_m)
     return total(doe.coverage if light is None else doe.coverage * light) / cells
 
 
@@ -230,7 +230,8 @@ def energy_budget(
     `uncollected` near zero or below it would show a fault in either.
     """
     camera = optic.camera
-    scale = camera.grid.shape[0] ** 2 * np.pi * (camera.aperture_m / camera.grid.pitch_m) ** 2 / 4
+    cells = camera.grid.shape[0] * camera.grid.shape[1]
+    scale = camera.opening.area_in(camera.grid.pitch_m, cells)
     reach = camera.grid.pitch_m / (pitch_m or camera.grid.pitch_m) / 2
     entered = passed = band = 0.0
     lensed = camera.curvature_per_m(1 / depth_m)
@@ -244,7 +245,7 @@ def energy_budget(
         if camera.beam is not None and (light := camera.incident(line)) is not None:
             curvature += camera.beam.curvature_per_m(wavelength)
             open_ = float(np.sum(np.abs(light) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
-            open_ *= camera.grid.shape[0] ** 2 / scale
+            open_ *= cells / scale
         entered += line.factor / camera.transmission(wavelength) * open_
         passed += line.factor * open_
         band += line.factor * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength, reach) / scale

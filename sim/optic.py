@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from sim.aperture import circle_coverage
+from sim.aperture import open_cells
 from sim.camera import Camera, SpectralLine
 from sim.propagation.farfield import FarField, plan_far_field
 from sim.propagation.fresnel import DirectPath, plan_direct
@@ -169,8 +169,8 @@ class CellOptic(CameraOptic):
     def with_camera(self, camera: Camera) -> "CellOptic":
         """The same DOE before another lens or sensor; a ValueError for another aperture or substrate."""
         own = self.camera
-        if (camera.aperture_m, camera.material) != (own.aperture_m, own.material):
-            wanted, got = f"{own.aperture_m} m of {own.material}", f"{camera.aperture_m} m of {camera.material}"
+        if (camera.opening, camera.material) != (own.opening, own.material):
+            wanted, got = f"{own.opening} of {own.material}", f"{camera.opening} of {camera.material}"
             raise ValueError(f"`camera` must have the DOE's aperture and substrate, {wanted}, but got {got}")
         return replace(self, camera=replace(camera, grid=own.grid))
 
@@ -248,7 +248,7 @@ class HeightOptic(CellOptic):
         height = jnp.asarray(np.zeros(camera.grid.shape) if height_m is None else height_m, jnp.float32)
         if height.shape != camera.grid.shape:
             raise ValueError(f"`height_m` must have the grid's shape {camera.grid.shape}, but got {height.shape}")
-        return cls(camera, jnp.asarray(circle_coverage(camera.grid, camera.aperture_m)), height)
+        return cls(camera, jnp.asarray(open_cells(camera.grid, camera.opening)), height)
 
     def cells(self, line: SpectralLine, source: CellSource | None = None) -> tuple[Array | None, Array | None]:
         """Heights, and what a DOE as fabricated does besides."""

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.files import canonical_json, read_bytes, write_atomic
 from fab.pictures import MOST_PER_BYTE
@@ -47,15 +48,20 @@ class StoredHeight(NamedTuple):
 
     height_m: Float[np.ndarray, "y x"]  # `[y, x]` heights, metres, row 0 at the lowest y
     pitch_m: float | None  # cell pitch, metres, or None
-    aperture_m: float | None  # diameter of the clear aperture, metres, or None
+    aperture: Aperture | None  # the clear aperture, or None
     metadata: dict[str, str]  # the other text attributes
+
+    @property
+    def aperture_m(self) -> float | None:
+        """Diameter of a round clear aperture, metres, or None; an InputError for another."""
+        return None if self.aperture is None else diameter_of(self.aperture)
 
 
 def write_height(
     path: str | Path,
     height_m: Float[np.ndarray, "y x"],
     pitch_m: float,
-    aperture_m: float,
+    aperture: Aperture | float,
     extra: Mapping[str, str] | None = None,
 ) -> None:
     """Write a height map.
@@ -64,10 +70,11 @@ def write_height(
         path: the file; its folder is made if missing.
         height_m: `[y, x]` heights, metres, rounded to float32.
         pitch_m: cell pitch, metres.
-        aperture_m: diameter of the clear aperture, metres.
+        aperture: the clear aperture; a number is the diameter of a round one, metres.
         extra: further text attributes; a ValueError for a name that is taken.
     """
-    texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": repr(float(aperture_m))}
+    sizes = aperture_from(aperture).sizes_m
+    texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": " x ".join(map(repr, map(float, sizes)))}
     _write(Path(path), {"height": height_m}, texts, extra)
 
 
@@ -85,9 +92,10 @@ def read_height(path: str | Path) -> StoredHeight:
         rule = "heights must be finite and at least 0"
         cure = "Measure heights from the deepest floor upward, or write the file again."
         raise InputError(str(path), rule, f"{height[y, x]:.6g} m at row {y}, column {x} ({len(bad)} such pixels)", cure)
-    pitch, aperture = (
-        _length(path, key, texts.pop(key)) if key in texts else None for key in ("pitch_m", "aperture_m")
-    )
+    pitch = _length(path, "pitch_m", texts.pop("pitch_m")) if "pitch_m" in texts else None
+    aperture = None
+    if "aperture_m" in texts:
+        aperture = aperture_from([_length(path, "aperture_m", size) for size in texts.pop("aperture_m").split(" x ")])
     return StoredHeight(height, pitch, aperture, texts)
 
 

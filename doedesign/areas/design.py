@@ -207,7 +207,7 @@ class AreaTask:
         """The design of a state."""
         spec, grid = self.spec, self.camera.grid
         level_map = LevelMap(
-            self.level(np.asarray(state.phase, np.float64)), self.levels, grid, spec.doe.aperture_m, spec.name
+            self.level(np.asarray(state.phase, np.float64)), self.levels, grid, spec.doe.relief, spec.name
         )
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 

@@ -160,7 +160,7 @@ class AreaSet(eqx.Module):
 def mode_fields(doe: CellOptic, colour: int = 0) -> Complex[np.ndarray, "mode y x"]:
     """Field behind a DOE for a colour's first wavelength, by mode of the beam; its squares sum to what passes."""
     camera = doe.camera
-    power = camera.grid.pitch_m**2 / (np.pi * camera.aperture_m**2 / 4)
+    power = camera.grid.pitch_m**2 / camera.opening.area_m2
     lines = [line for line in camera.lines if line.colour == colour]
     modes = zip(camera.shares, lines, strict=False)  # those of the first wavelength come first
     return np.stack([np.float32(np.sqrt(share * power)) * np.asarray(doe.field(line)) for share, line in modes])

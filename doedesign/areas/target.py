@@ -96,7 +96,7 @@ class AreaTarget:
         size_m = table.size_m if light is None else (table.size_m[1] * light.shape[0] / light.shape[1], table.size_m[1])
         wavelength = camera.lines[0].wavelength_m
         edge = table.edge_m or finest_detail_m(camera)
-        step = wavelength / camera.aperture_m / samples
+        step = wavelength / camera.opening.widest_m / samples
         middle, axes = (table.offset_m[1], table.offset_m[0]), []
         for centre, size in zip(middle, size_m, strict=True):
             half = size / 2 + max(_MARGIN * edge, table.dark_m + edge)
@@ -135,9 +135,12 @@ def _size_text(camera: Camera, size_m: float) -> str:
 
 
 def finest_detail_m(camera: Camera) -> float:
-    """Size of detail that light can draw: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light."""
+    """Size of detail that light can draw: the radius of a Gaussian beam's focus, 2 lambda d / D of plane light.
+
+    D is the shorter side of an aperture that is not round.
+    """
     scale = camera.lines[0].wavelength_m * camera.sensor_distance_m
-    finest = scale / camera.aperture_m
+    finest = scale / camera.opening.narrowest_m
     if not isinstance(camera.beam, GaussianBeam):
         return 2 * finest
     quality = np.sqrt(np.prod(camera.beam.m_squared))

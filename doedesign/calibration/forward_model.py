@@ -163,5 +163,5 @@ class DoeImages:
     def zeroth_order(self) -> float:
         """Share of the light that passes as if the plate were flat."""
         light = np.asarray(jnp.sum(self.plate[0], axis=1), np.complex128).sum()
-        mean = complex(light) / (np.pi * (self.model.camera.aperture_m / self.grid.pitch_m) ** 2 / 4)
+        mean = complex(light) / self.model.camera.opening.area_in(self.grid.pitch_m)
         return float(abs(mean) ** 2)

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from doedesign.capture.from_spec import channels_from_rgb, outside_from_kind
+from fab.aperture import RoundAperture
+from fab.errors import InputError
 from sim.camera import Camera
 from sim.imaging.convolve import Border
 from sim.imaging.disc import disc_window
@@ -44,6 +46,9 @@ class CaptureModel:
     @classmethod
     def make(cls, camera: Camera, kind: ObstructionKind, occlusion: Model, sensor: Sensor) -> "CaptureModel":
         """A camera for one kind of obstruction, at whatever depth: all its scenes share one compiled capture."""
+        if not isinstance(camera.opening, RoundAperture):
+            rule, cure = "obstructions are captured through a round aperture", "Give its diameter."
+            raise InputError("doe.aperture", rule, str(camera.opening), cure)
         disc = camera.aperture_m * camera.sensor_distance_m / (camera.pixel_m * depth_range_m(kind)[0])
         return cls(camera, occlusion, outside_from_kind(kind), sensor, disc_window(disc))
 

@@ -112,7 +112,7 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     inside = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
     at_y = np.broadcast_to(axis[y][:, None, None] + inside[:, None] * pitch, (len(y), _PARTS, _PARTS))
     at_x = np.broadcast_to(axis[x][:, None, None] + inside[None, :] * pitch, at_y.shape)
-    open_ = np.hypot(at_y, at_x) <= camera.aperture_m / 2
+    open_ = camera.opening.contains(at_y, at_x)
     path = path_at_m(camera, at_y, at_x, depth_m) - path_at_m(camera, axis[y], axis[x], depth_m)[:, None, None]
     # Within a cell the field has its source's phase.
     passed = (field[y, x] / coverage[y, x])[:, None, None] * np.exp(2j * np.pi * path / wavelength)

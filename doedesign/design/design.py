@@ -180,7 +180,7 @@ class Design:
         near, far = (", ".join(format_length(z) for z in depths) or "none" for depths in (self.near_m, self.far_m))
         rows: dict[str, object] = {
             "level map": self.level_map,
-            "clear aperture": format_length(self.camera.aperture_m),
+            "clear aperture": str(self.camera.opening),
             "lens": self.camera.lens_text
             if self.camera.distance_m
             else f"f = {format_length(self.camera.focal_length_m)}, {self.camera.lens_text}",

@@ -31,7 +31,7 @@ from doedesign.spec import STARTS, Spec
 from fab.errors import InputError
 from fab.level_map import LevelMap
 from fab.levels import Levels
-from sim.aperture import circle_coverage
+from sim.aperture import open_cells
 
 
 class OptimizationState(NamedTuple):
@@ -150,7 +150,7 @@ def finished_design(
     continuous = problem.optic.raster(np.asarray(parametrization.continuous_m(state.parameters.radians)))
     levels = _chosen_levels(spec, problem, state, continuous) if spec.process.chooses_depths else parametrization.levels
     level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
-    level_map = LevelMap(level, levels, camera.grid, spec.doe.aperture_m, spec.name)
+    level_map = LevelMap(level, levels, camera.grid, spec.doe.relief, spec.name)
     near_m, far_m = spec.scene.near_m, spec.scene.far_m
     return Design(level_map, camera, near_m, far_m, continuous_m=continuous, spec=spec, history=tuple(history))
 
@@ -165,5 +165,5 @@ def _chosen_levels(
         depths_m = recipe_depths_m(np.asarray(parametrization.depths_m(ratio)), start)
         with contextlib.suppress(InputError):  # two levels met
             return Levels(start.count, start.step_m, depths_m)
-    area = circle_coverage(camera.grid, camera.aperture_m)
+    area = open_cells(camera.grid, camera.opening)
     return optimal_levels(height_histogram(continuous_m, area, start.period_m, camera), start)

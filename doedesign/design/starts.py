@@ -108,7 +108,7 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     if "focal_length" in options:
         return lens(setup, 1.0 / _length(options, "focal_length", 1.0))
     evaluations = int(_number(options, "evaluations", 30, 3, 10_000))
-    limit = 40 * 2 * setup.wavelength_m / (setup.camera.aperture_m / 2) ** 2
+    limit = 40 * 2 * setup.wavelength_m / setup.camera.opening.reach_m**2
 
     def loss(power: np.ndarray, _gradient: np.ndarray) -> float:
         return setup.loss(lens(setup, float(power[0]) * limit))
@@ -152,7 +152,7 @@ def lens_array(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
 
 def cubic(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     """Cubic phase of so many `waves` at the rim on each axis."""
-    rim_m = setup.camera.aperture_m / 2
+    rim_m = setup.camera.opening.widest_m / 2
     return _wrapped(setup, analytic.cubic(*_places(setup, "cubic"), _number(options, "waves", 5, -1e3, 1e3), rim_m))
 
 
@@ -196,7 +196,7 @@ def _foci(setup: StartSetup, options: Mapping[str, Any]) -> tuple[float, float, 
     if near_m == far_m:
         cure = 'For one focal length use start = "fresnel".'
         raise InputError(f"{_WHERE}.far", "must differ from `near`", repr(options["far"]), cure)
-    return near_m, far_m, setup.camera.aperture_m / 2
+    return near_m, far_m, setup.camera.opening.reach_m
 
 
 BUILT_IN = {name: globals()[name] for name in STARTS}

@@ -191,7 +191,7 @@ class FocusTask:
         drawn = state.step > round(_FREE * spec.optimize.steps)
         level = np.asarray(state.level) if drawn else self.nearest_level(state.radians)
         number = ring_numbers(self.camera)
-        level_map = LevelMap(level.astype(np.uint8)[number], self.levels, grid, spec.doe.aperture_m, spec.name)
+        level_map = LevelMap(level.astype(np.uint8)[number], self.levels, grid, spec.doe.relief, spec.name)
         return Design(level_map, self.camera, (), spec.scene.far_m, spec=spec, history=tuple(history))
 
 

@@ -73,7 +73,7 @@ def _patch(design: Design, process: Process) -> tuple[NDArray[np.uint8], Camera,
     off = ((y0 + (side - ny) / 2) * pitch_m, (x0 + (side - nx) / 2) * pitch_m)
     die_m = (process.die_m[0] + off[0], process.die_m[1] + off[1])
     # An opening beyond the corners, so that every cell counts alike.
-    small = replace(camera, grid=Grid((side, side), pitch_m), aperture_m=2 * side * pitch_m)
+    small = replace(camera, grid=Grid((side, side), pitch_m), aperture=2 * side * pitch_m)
     level = np.ascontiguousarray(design.level_map.level[y0 : y0 + side, x0 : x0 + side])
     on_wafer = max(process.wafer_radius_m, math.hypot(*die_m))
     return level, small, replace(process, die_m=die_m, wafer_radius_m=on_wafer)

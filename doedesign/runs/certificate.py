@@ -135,7 +135,7 @@ def certify(
     if pieces and side > min(height.shape):
         cure = "Ask for smaller squares, or for 0."
         raise InputError("side", f"squares must fit into the design of {min(height.shape)} cells", side, cure)
-    rows = cut_rows(height, camera.grid, camera.aperture_m, min(cells, height.shape[0]))
+    rows = cut_rows(height, camera.grid, camera.opening, min(cells, height.shape[0]))
     if not rows:
         cure = "Certify a design with relief."
         raise InputError(design.name, "must not be flat where rows are cut out", "a flat plate", cure)
@@ -145,7 +145,7 @@ def certify(
             done = count(1)
             certified = certify_rows(rows, camera, wavelengths, lambda: progress.advance(next(done)))
         certified_pieces: tuple[CertifiedPiece, ...] = ()
-        if squares := cut_pieces(height, camera.grid, camera.aperture_m, side, pieces, cells=cells):
+        if squares := cut_pieces(height, camera.grid, camera.opening, side, pieces, cells=cells):
             with meter("squares", len(squares) * len(wavelengths)) as progress:
                 squares_done = count(1)
                 certified_pieces = certify_pieces(

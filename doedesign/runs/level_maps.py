@@ -12,6 +12,7 @@ from doedesign.build import camera_from_spec, levels_from_spec
 from doedesign.design.design import Design
 from doedesign.runs.folder import CAPTURE_TABLES, CONTINUOUS, HEIGHT, LEVEL_MAP, Run, open_run, spec_with
 from doedesign.spec import HEIGHT_FILES
+from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, sha256_file
 from fab.grid import Grid
@@ -34,7 +35,7 @@ class Drawing(NamedTuple):
 
 
 def read_any_height(
-    path: Path, pitch_m: float | None = None, scale_m: float | None = None, aperture_m: float | None = None
+    path: Path, pitch_m: float | None = None, scale_m: float | None = None, aperture: Aperture | float | None = None
 ) -> HeightMap:
     """Read a height map from .exr, .npy, .tif or .png.
 
@@ -42,7 +43,7 @@ def read_any_height(
         path: the file.
         pitch_m: pixel pitch, metres; needed unless the file holds it (EXR of our own).
         scale_m: metres per count, for integers.
-        aperture_m: diameter of the relief, metres; by default what the file says, or its shorter side.
+        aperture: outline of the relief, or its diameter in metres; by default what the file says, or its shorter side.
     """
     if path.is_dir():
         raise InputError(str(path), f"a height map is a file ({', '.join(HEIGHT_FILES)})", "a folder", "Give the file.")
@@ -50,7 +51,7 @@ def read_any_height(
         rule = f"a height map must be one of {', '.join(HEIGHT_FILES)}"
         raise InputError(str(path), rule, path.suffix or "no suffix", "Convert it first.")
     if path.suffix.lower() != ".exr":
-        return read_height(path, pitch_m, scale_m, aperture_m)
+        return read_height(path, pitch_m, scale_m, aperture)
     from sim.store import read_height as read_exr
 
     stored = read_exr(path)
@@ -59,8 +60,9 @@ def read_any_height(
         raise InputError(str(path), "the pixel pitch must be given", "none in the file", "Give the pitch of a pixel.")
     ny, nx = stored.height_m.shape
     grid = Grid((ny, nx), pitch_m)
-    aperture_m = stored.aperture_m or min(grid.extent_m) if aperture_m is None else aperture_m
-    return HeightMap(stored.height_m, grid, aperture_m)
+    if aperture is None:
+        aperture = stored.aperture or min(grid.extent_m)
+    return HeightMap(stored.height_m, grid, aperture)
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
@@ -77,7 +79,7 @@ def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
     # A training that left the DOE as it was has only the heights after rounding.
     file = run.path(CONTINUOUS) if run.path(CONTINUOUS).is_file() else run.path(HEIGHT)
     # The design repeats with the full height, so the top half step rounds to the lowest level.
-    height = read_any_height(file, aperture_m=run.spec.doe.aperture_m)
+    height = read_any_height(file, aperture=run.spec.doe.relief)
     return LevelMap.from_height(height, levels, run.spec.name, wrapped=True)
 
 
@@ -128,12 +130,12 @@ def write_design(folder: Path, design: Design) -> list[str]:
     """Write the level map of a design and its heights, metres; return the names of the files."""
     from sim.store import write_height
 
-    grid, aperture_m = design.level_map.grid, design.level_map.aperture_m
+    grid, relief = design.level_map.grid, design.level_map.relief
     write_level_map(folder / LEVEL_MAP, design.level_map)
     heights = {HEIGHT: design.nominal_height_m, CONTINUOUS: design.continuous_m}
     names = [name for name, height in heights.items() if height is not None]
     for name in names:
-        write_height(folder / name, heights[name], grid.pitch_m, aperture_m)
+        write_height(folder / name, heights[name], grid.pitch_m, relief)
     return [LEVEL_MAP, *names]
 
 
@@ -145,7 +147,7 @@ def drawing_from(
     etch_depths_m: Sequence[float] = (),
     pitch_m: float | None = None,
     scale_m: float | None = None,
-    aperture_m: float | None = None,
+    aperture_m: float | Sequence[float] | None = None,
 ) -> Drawing:
     """Return the level map of a design, of a run (as optimised, not as an order draws it) or of a height map.
 
@@ -156,7 +158,7 @@ def drawing_from(
         etch_depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
         pitch_m: pixel pitch, metres.
         scale_m: metres per count, for integers.
-        aperture_m: diameter of the relief, metres.
+        aperture_m: diameter of the relief, or its width and height, metres.
 
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
@@ -188,7 +190,7 @@ def drawing_from(
         missing, name = ("number of levels", "levels") if count is None else ("height of a level", "step")
         raise InputError(str(source), f"a bare height map needs the {missing}", "none", f"Give `{name}`.")
     levels = Levels(count, step_m, tuple(etch_depths_m))
-    height = read_any_height(source, pitch_m, scale_m, aperture_m)
+    height = read_any_height(source, pitch_m, scale_m, None if aperture_m is None else aperture_from(aperture_m))
     # Mask shops take ASCII names; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
     try:
@@ -207,7 +209,7 @@ def _kept_light(design: Design, own: LevelMap) -> float:
     """
     assert design.spec is not None  # that of its run
     wavelength_m = design.spec.optics.design_wavelength_m
-    inside = own.grid.inside_circle(own.aperture_m)
+    inside = own.relief.inside(own.grid)
     moved_m = np.subtract(design.height_m, own.height_m, dtype=np.float64)[inside]
     kept = float(abs(np.exp(2j * np.pi * design.camera.waves_per_metre(wavelength_m) * moved_m).mean()) ** 2)
     words = "designed with %d levels and drawn with %d: %.2g %% of its light at %s goes astray; an optimisation with %d"

@@ -162,6 +162,6 @@ def _write(
         for path in sorted(folder.glob("quantised*")):
             shutil.copyfile(path, folder / path.name.replace("quantised", "from_masks"))
     if "continuous" in optics:
-        height_map = HeightMap(np.asarray(optics["continuous"].height_m), camera.grid, run.spec.doe.aperture_m)
+        height_map = HeightMap(np.asarray(optics["continuous"].height_m), camera.grid, run.spec.doe.relief)
         save(plot_height(height_map, None, f"{run.spec.name}, continuous"), folder / "continuous_height.png")
     (folder / "metrics.json").write_bytes(canonical_json(metrics))

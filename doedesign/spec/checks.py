@@ -59,14 +59,17 @@ def _light(spec: Spec) -> Iterator[InputError]:
 
 def _doe(spec: Spec) -> Iterator[InputError]:
     doe, overlap = spec.doe, spec.process.chrome_overlap_m
-    span_m, aperture = doe.samples * doe.pitch_m, format_length(doe.aperture_m)
+    span_m, aperture, widest_m = doe.samples * doe.pitch_m, str(doe.relief), doe.relief.widest_m
     # One part in a million of slack, for values that lie on the limit in decimal.
-    if abs(doe.aperture_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
+    if abs(widest_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
         span = format_length(span_m)
         rule = f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {span}"
-        cure = f'Set aperture = "{span}" or samples = {max(2, round(doe.aperture_m / doe.pitch_m))}.'
+        cure = f'Set aperture = "{span}" or samples = {max(2, round(widest_m / doe.pitch_m))}.'
         yield InputError("doe.aperture", f"{rule} to within half a pitch", aperture, cure)
-    if doe.aperture_m - 2 * overlap < 2 * doe.pitch_m:
+    if spec.optimize.parametrization == "radial" and not isinstance(doe.aperture_m, float):
+        rule, cure = "rings fill a round aperture", 'Use "freeform", or give the diameter of the aperture.'
+        yield InputError("optimize.parametrization", rule, f'"radial" in {aperture}', cure)
+    if doe.relief.narrowest_m - 2 * overlap < 2 * doe.pitch_m:
         rule = f"twice the overlap must leave an opening in an aperture of {aperture}"
         yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
 
@@ -294,7 +297,7 @@ def _process(spec: Spec) -> Iterator[InputError]:
     yield from process_problems(spec.process)
     process = spec.process.filled()
     die_m, radius_m = process.die_m or (0.0, 0.0), process.wafer_radius_m or math.inf
-    reach_m = math.hypot(*die_m) + spec.doe.aperture_m / 2
+    reach_m = math.hypot(*die_m) + spec.doe.relief.reach_m
     if reach_m > radius_m:
         rule = f"the DOE must lie on the wafer of radius {format_length(radius_m)}"
         cure = "Move the die inward or choose a larger process.wafer_radius."
@@ -375,7 +378,7 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
             f"beyond that the PSF repeats. At most {most} pixels avoid it."
         )
     depth_m = min(spec.scene.near_m, default=math.inf)
-    disc_m = spec.doe.aperture_m * focal_m / depth_m
+    disc_m = spec.doe.relief.widest_m * focal_m / depth_m
     if disc_m > sensor.window_m:
         yield (
             f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "

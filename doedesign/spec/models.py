@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    BeforeValidator,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
@@ -49,6 +50,7 @@ from doedesign.spec.values import (
 )
 from doedesign.spec.values.table import SpecTable, optional
 from doedesign.spec.wafer import WaferSpec
+from fab.aperture import Aperture, aperture_from
 from fab.units import DEGREES, NM, UM, PlaceUnit, parse_length
 from sim.camera import Light, Polarised
 from sim.material import MATERIALS
@@ -160,20 +162,41 @@ def _colour_name(wavelength: object, index: int) -> str:
     return f"{nanometres:.6g}nm".replace(".", "p").replace("+", "")
 
 
+_SIZE: Any = length(1 * UM, 1.0).func
+
+
+def _aperture_sizes(value: Any, info: ValidationInfo) -> Any:
+    """One length, or two of them."""
+    if not isinstance(value, list | tuple):
+        return _SIZE(value, info)
+    if len(value) != 2:
+        raise broken("must be a diameter, or [width, height]", 'For example "2 mm", or ["2 mm", "1 mm"].')
+    return tuple(_SIZE(size, info) for size in value)
+
+
+ApertureSizes = Annotated[float | tuple[float, float], BeforeValidator(_aperture_sizes)]
+
+
 class DoeSpec(SpecTable, frozen=True):
     """The DOE.
 
     Attributes:
         samples: cells per side, N.
         pitch_m: edge of a cell.
-        aperture_m: diameter of the relief; N cells must span it to within half a pitch.
+        aperture_m: diameter of the relief, or [width, height] of a rectangle; N cells must span it, or its longer side,
+            to within half a pitch.
         material: substrate, a key of `sim.material.MATERIALS`.
     """
 
     samples: Annotated[int, Field(strict=True, ge=2, le=20000, examples=["2400"])]
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
-    aperture_m: Annotated[float, length(1 * UM, 1.0)] = Field(examples=['"4.44 mm"'])
+    aperture_m: ApertureSizes = Field(examples=['"4.44 mm"'])
     material: Annotated[str, known("material", MATERIALS)] = Field(examples=['"fused_silica"'])
+
+    @property
+    def relief(self) -> Aperture:
+        """Outline of the relief."""
+        return aperture_from(self.aperture_m)
 
 
 class OptimizeSpec(SpecTable, frozen=True):

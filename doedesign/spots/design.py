@@ -20,7 +20,7 @@ from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, Wav
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
-from sim.aperture import circle_coverage
+from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.optic import CellOptic
 
@@ -74,7 +74,7 @@ class SpotTask:
         spots = spots_from_spec(spec.spots, camera)
         rate = camera.waves_per_metre(camera.lines[0].wavelength_m)
         staircase = Staircase.of(2 * np.pi * rate * levels.heights_m())
-        grid, coverage = camera.grid, circle_coverage(camera.grid, camera.aperture_m)
+        grid, coverage = camera.grid, open_cells(camera.grid, camera.opening)
         if camera.beam is not None:
             coverage = (coverage * camera.irradiance(camera.lines[0].wavelength_m)).astype(np.float32)
         if spec.spots.period_m is not None:
@@ -142,7 +142,7 @@ class SpotTask:
             ny, nx = self.camera.grid.shape
             level = np.tile(level, (-(-ny // level.shape[0]), -(-nx // level.shape[1])))[:ny, :nx]
         spec, far_m = self.spec, self.spec.scene.far_m
-        level_map = LevelMap(level, self.levels, self.camera.grid, spec.doe.aperture_m, spec.name)
+        level_map = LevelMap(level, self.levels, self.camera.grid, spec.doe.relief, spec.name)
         return Design(level_map, self.camera, (), far_m, spec=spec, history=tuple(history))
 
     def _exchanged(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:

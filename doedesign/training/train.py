@@ -282,7 +282,7 @@ class JointTraining(TrainingJob):
         assert isinstance(state.free, jax.Array)
         continuous = doe.learnt.raster(np.asarray(doe.learning.continuous_m(state.free)))
         level = np.asarray(doe.learning.level(jnp.asarray(continuous))).astype(np.uint8)
-        level_map = LevelMap(level, doe.learning.levels, camera.grid, spec.doe.aperture_m, spec.name)
+        level_map = LevelMap(level, doe.learning.levels, camera.grid, spec.doe.relief, spec.name)
         return Design(level_map, camera, spec.scene.near_m, spec.scene.far_m, continuous_m=continuous, spec=spec)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 from fab.layout.floorplan import GAP_M, Floorplan, floorplan, middle_of
-from fab.layout.geometry import Cell, Layer, Reference, Shapes, chrome_layer
+from fab.layout.geometry import Cell, Layer, Reference, Shapes, chrome_layer, outline_shapes
 from fab.layout.lettering import Job, label_block, mask_label, written
 from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import Part, Photomask, centred, joined, moved, prefixed, row, without
@@ -107,7 +107,7 @@ def draw_frame(
         )
     die_m = pitch - wafer.lane_m
     plan = floorplan(wafer, pitch, die_m, _size_m(site), _size_m(monitor), len(splits))
-    relief = unit.circle(level_map.aperture_m)
+    relief = outline_shapes(level_map.relief, dbu_m, _CORNERS)
     names = {part: f"{stem}_{part}" for part in ("SITE", "TEST", "WAFER")}
     die_cells = []
     for number, split in enumerate(splits):

@@ -10,6 +10,7 @@ none does, each edge is rounded once, so that neighbours still share it.
 """
 
 import graphlib
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,18 +18,21 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, RoundAperture, aperture_from
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.layout.polygons import annulus_sectors, doubled_area
+from fab.layout.polygons import annulus_sectors, doubled_area, frame_around_box, sectors_around_square
 from fab.level_map import LevelMap
 from fab.levels import Levels
-from fab.units import MM, NM, format_length
+from fab.units import MM, NM, UM, format_length
 
 _NAME = re.compile(r"[A-Z0-9_]{1,32}")
 _FEMTO = 10**15
 _NANO_FM = 10**6
 _UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
 _LIMIT = 2**31 - 1
+# Width of the square frame around a rectangular opening.
+_FRAME_M = 100 * UM
 
 # x0, y0, x1, y1
 Box = tuple[int, int, int, int]
@@ -191,21 +195,27 @@ class Chrome:
     outer_m: float | None = None
     chord_error_m: float = 5e-9
 
-    def radii_m(self, level_map: LevelMap) -> tuple[float, float]:
-        """Return the radius of the opening and the outer radius for one DOE, metres."""
-        grid, aperture_m = level_map.grid, level_map.aperture_m
-        inner = aperture_m / 2 - self.overlap_m
-        outer = self.outer_m
-        if outer is None:
-            # Whole tenths of a millimetre, because this number stands on the order form.
-            outer = (np.ceil((np.hypot(*grid.extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
-        if not 0 <= self.overlap_m < aperture_m / 2:
+    def opening(self, relief: Aperture) -> Aperture:
+        """Return the opening for a DOE with this relief."""
+        if not 0 <= self.overlap_m < relief.narrowest_m / 2:
             got = format_length(self.overlap_m)
             raise InputError("chrome overlap", "must lie from 0 to the aperture's radius", got, "Choose a smaller one.")
-        if not inner < outer < float("inf"):
+        return relief.shrunk(self.overlap_m)
+
+    def rim_m(self, level_map: LevelMap) -> float:
+        """Return the outer radius for one DOE, metres."""
+        opening, outer = self.opening(level_map.relief), self.outer_m
+        extent_m, reach_m = level_map.grid.extent_m, opening.reach_m
+        if not isinstance(opening, RoundAperture):  # there is a square frame around it
+            extent_m = (max(extent_m), max(extent_m))
+            reach_m = math.sqrt(2) * (opening.widest_m / 2 + _FRAME_M)
+        if outer is None:
+            # Whole tenths of a millimetre, because this number stands on the order form.
+            outer = (np.ceil((np.hypot(*extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
+        if not reach_m < outer < float("inf"):
             got = format_length(outer)
             raise InputError("chrome outer radius", "must exceed the opening's radius", got, "Choose a larger one.")
-        return float(inner), float(outer)
+        return float(outer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,12 +276,41 @@ def chrome_layer(levels: Levels) -> Layer:
 
 def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
     """Draw the chrome around the clear aperture as sectors of an annulus that share their radial edges."""
-    inner, outer = (round(radius_m / dbu_m) for radius_m in chrome.radii_m(level_map))
+    opening, outer = chrome.opening(level_map.relief), round(chrome.rim_m(level_map) / dbu_m)
     if outer > _LIMIT:
         got = format_length(outer * dbu_m)
         raise InputError("chrome outer radius", "must fit 32-bit coordinates", got, "Choose a smaller one.")
     if not chrome.chord_error_m >= dbu_m:
         got = format_length(chrome.chord_error_m)
         raise InputError("chrome chord error", "must be one database unit or more", got, "Choose a larger one.")
-    polygons = annulus_sectors(inner, outer, chrome.chord_error_m / dbu_m)
-    return Shapes(polygons=tuple(polygons))
+    chord_error, (half_y, half_x) = chrome.chord_error_m / dbu_m, half_extent(opening, dbu_m)
+    if isinstance(opening, RoundAperture):
+        return Shapes(polygons=tuple(annulus_sectors(half_x, outer, chord_error)))
+    half = frame_half(opening, dbu_m)
+    sectors = sectors_around_square(half, outer, chord_error)
+    return Shapes(polygons=(*sectors, *frame_around_box(half_x, half_y, half)))
+
+
+def half_extent(aperture: Aperture, dbu_m: float) -> tuple[int, int]:
+    """Return half of height and width ``(y, x)`` of the box around an aperture, whole database units."""
+    half_y, half_x = (round(side_m / 2 / dbu_m) for side_m in aperture.extent_m)
+    return half_y, half_x
+
+
+def frame_half(opening: Aperture, dbu_m: float) -> int:
+    """Return half of the edge of the square frame around an opening that is not round, whole database units."""
+    return max(half_extent(opening, dbu_m)) + round(_FRAME_M / dbu_m)
+
+
+def on_units(aperture: Aperture, dbu_m: float) -> Aperture:
+    """Return an aperture as it is drawn: half of its sizes is a whole number of database units."""
+    sizes = [2 * round(size_m / 2 / dbu_m) * dbu_m for size_m in aperture.sizes_m]
+    return aperture_from(sizes if len(sizes) > 1 else sizes[0])
+
+
+def outline_shapes(aperture: Aperture, dbu_m: float, corners: int) -> Shapes:
+    """Draw the outline of an aperture, with so many corners where it is round."""
+    points = np.rint(aperture.outline_m(corners) / dbu_m).astype(np.int32)
+    if isinstance(aperture, RoundAperture):
+        return Shapes(polygons=(points,))
+    return Shapes(np.concatenate([points.min(axis=0), points.max(axis=0)])[None])

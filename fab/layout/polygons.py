@@ -6,7 +6,8 @@ pixel once and nothing else, has no holes and no polygon that touches itself at 
 but it is linear in the pixels, while a merge to large polygons is quadratic in their holes.
 
 A clear aperture is drawn as the annulus around it. GDSII knows neither circles nor holes, so the annulus is cut into
-equal sectors of few vertices that share their radial edges point by point.
+equal sectors of few vertices that share their radial edges point by point. Around a rectangle they end at a square,
+and two angles fill what is left: no corner is sharper than 45 degrees.
 """
 
 import math
@@ -195,17 +196,52 @@ def annulus_sectors(inner: int, outer: int, chord_error: float) -> list[NDArray[
     """
     if not 0 < inner < outer or not chord_error > 0:
         raise ValueError(f"need 0 < inner < outer and chord_error > 0, but got {inner}, {outer}, {chord_error}")
+    circle, per_sector = _circle(outer, chord_error)
+    near, far = (np.rint(radius * circle).astype(np.int32) for radius in (inner, outer))
+    starts = range(0, len(circle) - 1, per_sector)
+    return [np.concatenate([far[s : s + per_sector + 1], near[s : s + per_sector + 1][::-1]]) for s in starts]
+
+
+def _circle(radius: int, chord_error: float) -> tuple[NDArray[np.float64], int]:
+    """Return points ``(n, 2)`` once around the unit circle, the first one again at the end, and steps per sector."""
     # A chord that spans the angle a leaves the sagitta r (1 - cos(a / 2)); the outer circle decides.
-    half = math.acos(max(0.0, 1 - chord_error / outer))
+    half = math.acos(max(0.0, 1 - chord_error / radius))
     steps = math.ceil(math.pi / half)
     sectors = 4 * math.ceil(steps / (4 * (MAX_VERTICES // 2 - 1)))
     per_sector = math.ceil(steps / sectors)
     angle = np.arange(sectors * per_sector + 1) * (2 * math.pi / (sectors * per_sector))
     angle[-1] = 0.0
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    near, far = (np.rint(radius * circle).astype(np.int32) for radius in (inner, outer))
-    starts = range(0, sectors * per_sector, per_sector)
-    return [np.concatenate([far[s : s + per_sector + 1], near[s : s + per_sector + 1][::-1]]) for s in starts]
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1), per_sector
+
+
+def sectors_around_square(half: int, outer: int, chord_error: float) -> list[NDArray[np.int32]]:
+    """Draw what lies between a centred square, of half its edge, and a circle, as `annulus_sectors` does an annulus.
+
+    Radial edges meet the sides of the square at 45 degrees or more. ValueError unless the circle lies around it.
+    """
+    if not 0 < math.hypot(half, half) < outer or not chord_error > 0:
+        raise ValueError(f"need a circle around the square and chord_error > 0, but got {half}, {outer}, {chord_error}")
+    circle, per_sector = _circle(outer, chord_error)
+    far = np.rint(outer * circle).astype(np.int32)
+    # Sectors are a multiple of four: their rays begin and end in one quadrant, whose corner may lie between.
+    ends = circle[::per_sector]
+    near = np.rint(half / np.abs(ends).max(axis=1)[:, None] * ends).astype(np.int64)
+    found = []
+    for number, start in enumerate(range(0, len(circle) - 1, per_sector)):
+        first, last = near[number], near[number + 1]
+        corner = np.copysign(half, ends[number] + ends[number + 1]).astype(np.int64)
+        turns = [x0 * y1 - y0 * x1 for (x0, y0), (x1, y1) in ((first, corner), (corner, last))]
+        inner = [last, corner, first] if min(turns) > 0 else [last, first]
+        found.append(np.concatenate([far[start : start + per_sector + 1], np.array(inner, np.int32)]))
+    return found
+
+
+def frame_around_box(half_x: int, half_y: int, half: int) -> list[NDArray[np.int32]]:
+    """Draw what lies between a centred rectangle, of half its sides, and a square around it, as two angles."""
+    x, y, s = half_x, half_y, half
+    lower = [(-s, -s), (s, -s), (s, -y), (-x, -y), (-x, s), (-s, s)]
+    upper = [(s, -y), (s, s), (-x, s), (-x, y), (x, y), (x, -y)]
+    return [np.array(corners, np.int32) for corners in (lower, upper)]
 
 
 def doubled_area(polygon: NDArray[np.integer]) -> int:

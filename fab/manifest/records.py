@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from fab.aperture import Aperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes
 from fab.grid import Grid
@@ -178,14 +179,17 @@ class ModelEntry:
 
 @dataclass(frozen=True, config=_STRICT)
 class ChromeEntry:
-    """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`."""
+    """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`.
+
+    The diameter of an opening that is a rectangle stands for its [width, height].
+    """
 
     layer: int
     datatype: int
     file: str
     cell: str
     polygon_means: str
-    opening_diameter_mm: float
+    opening_diameter_mm: float | list[float]
     outer_diameter_mm: float
     overlap_um: float
     chord_error_nm: float
@@ -201,7 +205,7 @@ class Manifest:
 
     `source` says where the level map came from, in the words of who asked. All but it and the versions of the tools
     follows from `request` (`fab.order.request`) and the level numbers. `geometry_sha256` is
-    `fab.order.order.Order.geometry`.
+    `fab.order.order.Order.geometry`. `aperture_mm` is the diameter of the relief, or [width, height] of a rectangle.
     """
 
     format: str
@@ -214,7 +218,7 @@ class Manifest:
     step_nm: float
     shape: list[int]
     pitch_um: float
-    aperture_mm: float
+    aperture_mm: float | list[float]
     dbu_nm: float
     pixel_edges: str
     level_map_file: str
@@ -247,7 +251,7 @@ class Manifest:
 
     def level_map(self, level: NDArray[np.uint8]) -> LevelMap:
         """Return the level map of the order from its level numbers ``[y, x]``."""
-        return LevelMap(level, self.staircase(), self.grid(), self.aperture_m, self.name)
+        return LevelMap(level, self.staircase(), self.grid(), self.relief, self.name)
 
     def staircase(self) -> Levels:
         """Return the levels of the order, with the depth that stands at every mask."""
@@ -259,9 +263,14 @@ class Manifest:
         return Grid((self.shape[0], self.shape[1]), round(self.pitch_um * UM, 18))
 
     @property
+    def relief(self) -> Aperture:
+        """Outline of the relief; light passes the opening of the chrome, the clear aperture."""
+        return aperture_from(self.aperture_mm, MM, 18)
+
+    @property
     def aperture_m(self) -> float:
-        """Diameter of the relief, metres; light passes the opening of the chrome, the clear aperture."""
-        return round(self.aperture_mm * MM, 18)
+        """Diameter of a round relief, metres; an InputError for another."""
+        return diameter_of(self.relief)
 
     def to_json(self) -> bytes:
         """Return the bytes of the manifest file, with the digest of everything else in it under ``sha256``."""
@@ -329,4 +338,6 @@ def read_manifest(folder: str | Path) -> Manifest:
             raise InputError(str(path), rule, cell, "Write the order again.")
     manifest.grid()
     manifest.staircase()
+    for size in (manifest.aperture_mm, manifest.chrome.opening_diameter_mm):
+        aperture_from(size)
     return manifest

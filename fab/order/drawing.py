@@ -150,7 +150,7 @@ def manifest_of(
         step_nm=round(levels.step_m / NM, 9),
         shape=list(grid.shape),
         pitch_um=round(grid.pitch_m / UM, 12),
-        aperture_mm=round(level_map.aperture_m / MM, 9),
+        aperture_mm=level_map.relief.record(MM, 9),
         dbu_nm=round(layout.dbu_m / NM, 9),
         pixel_edges=describe_edges(pixel_edges(grid)),
         level_map_file=f"{stem}_LEVELS.npy",

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fab.layout.frame import Frame
-from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer
+from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer, on_units
 from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
 from fab.layout.split import DieSplit
@@ -49,14 +49,15 @@ def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8])
 def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
     """Return the manifest's entry of the chrome around the clear aperture."""
     layer = chrome_layer(order.level_map.levels)
-    inner, outer = (round(radius / layout.dbu_m) for radius in order.chrome.radii_m(order.level_map))
+    opening = on_units(order.chrome.opening(order.level_map.relief), layout.dbu_m)
+    outer = round(order.chrome.rim_m(order.level_map) / layout.dbu_m)
     return ChromeEntry(
         layer=layer.number,
         datatype=layer.datatype,
         file=order.plate_file(f"{order.stem}_CHROME"),
         cell=f"{order.stem}_CHROME",
         polygon_means=CONVENTIONS["chrome layer"],
-        opening_diameter_mm=round(2 * inner * layout.dbu_m / MM, 9),
+        opening_diameter_mm=opening.record(MM, 9),
         outer_diameter_mm=round(2 * outer * layout.dbu_m / MM, 9),
         overlap_um=round(order.chrome.overlap_m / UM, 9),
         chord_error_nm=round(order.chrome.chord_error_m / NM, 9),

@@ -117,7 +117,8 @@ class Order:
         from fab.plots.masks import plot_masks
 
         title = f"{self.stem}: {self.level_map.levels}, level map {self.level_map.digest[:12]}"
-        return plot_masks(self.level_map, self.chrome.radii_m(self.level_map), title, ax)
+        chrome = self.chrome.opening(self.level_map.relief), self.chrome.rim_m(self.level_map)
+        return plot_masks(self.level_map, chrome, title, ax)
 
     def photomask_stem(self, photomask: Photomask) -> str:
         """Return the name of a mask's file (without suffix) and top cell."""
@@ -147,7 +148,7 @@ class Order:
             "level map": level_map.digest,
             "shape": level_map.grid.shape,
             "pitch": level_map.grid.pitch_m,
-            "aperture": level_map.aperture_m,
+            "aperture": level_map.relief.record(),
             "depths": level_map.levels.depths_m,
             "chrome": asdict(self.chrome),
             "wafer": asdict(self.wafer),
@@ -192,7 +193,7 @@ def plan_order(
     """Check a level map against a process, and repair it on request; see `fab.order.write.write_order` and `Order`."""
     made_by = process_from(process, level_map.levels)
     report = check(level_map, made_by)
-    inside = level_map.level[level_map.grid.inside_circle(level_map.aperture_m)]
+    inside = level_map.level[level_map.relief.inside(level_map.grid)]
     if inside.size and inside.min() == inside.max():
         log.warning("every pixel of %s has level %d: it does to light what flat glass does", level_map.name, inside[0])
     for headline in report.headlines():

@@ -67,7 +67,7 @@ def _wafer(drawing: DrawnOrder) -> bytes:
 
     order = drawing.order
     title = f"{order.stem}: what lies where"
-    return png_bytes(plot_wafer(order.wafer, drawing.frame, order.level_map.aperture_m, order.dbu_m, title))
+    return png_bytes(plot_wafer(order.wafer, drawing.frame, order.level_map.relief, order.dbu_m, title))
 
 
 def _marks(drawing: DrawnOrder) -> bytes:
@@ -97,7 +97,7 @@ def run_sheet(drawing: DrawnOrder, plates: Mapping[str, str], made_by: Mapping[s
         photomasks=order.photomasks,
         files=files,
         process=order.process,
-        opening_m=2 * order.chrome.radii_m(order.level_map)[0],
+        opening=order.chrome.opening(order.level_map.relief),
         wafer=order.wafer,
         places=frame.places,
         dies=tuple(

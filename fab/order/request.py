@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from fab.aperture import aperture_from
 from fab.errors import InputError
 from fab.files import canonical_json
 from fab.grid import Grid
@@ -42,7 +43,7 @@ def request_of(order: Order) -> dict[str, Any]:
     level_map = order.level_map
     drawn = {"name": level_map.name, "shape": list(level_map.shape), "pitch_m": level_map.grid.pitch_m}
     asked = {name: _plain(getattr(order, name)) for name in _ASKED}
-    return {"level_map": {**drawn, "aperture_m": level_map.aperture_m}, **asked}
+    return {"level_map": {**drawn, "aperture_m": level_map.relief.record()}, **asked}
 
 
 def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str) -> Order:
@@ -56,7 +57,8 @@ def order_from(request: Mapping[str, Any], level: NDArray[np.uint8], where: str)
         asked = {name: TypeAdapter(hints[name]).validate_python(request[name]) for name in _ASKED}
         drawn = request["level_map"]
         grid = Grid(level.shape, float(drawn["pitch_m"]))
-        level_map = LevelMap(level, asked["process"].levels, grid, float(drawn["aperture_m"]), drawn["name"])
+        relief = aperture_from(drawn["aperture_m"])
+        level_map = LevelMap(level, asked["process"].levels, grid, relief, drawn["name"])
     except ValidationError as errors:
         found = errors.errors(include_url=False)[0]
         raise InputError(f"{where}: request", found["msg"], repr(found["input"])[:60], _CURE) from errors

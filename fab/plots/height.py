@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.figure import CHROME, HEIGHTS, INK, MARK, SMALL, length_text, panels, shrunk
-from fab.plots.maps import box_mm, frame_window, show_map, window_around
-from fab.units import MM, NM
+from fab.figure import CHROME, HEIGHTS, INK, MARK, SMALL, aperture_text, length_text, panels, shrunk
+from fab.plots.maps import box_mm, frame_window, outline_of, show_map, window_around
+from fab.units import NM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ def plot_height(
     from matplotlib import colormaps
 
     grid = height.grid
-    inside = grid.inside_circle(height.aperture_m)
+    inside = height.relief.inside(grid)
     heights = height.height_m[inside]
     ends = _range_m(heights, levels)
     style = {"cmap": colormaps[HEIGHTS].with_extremes(bad=CHROME), "vmin": ends[0] / NM, "vmax": ends[1] / NM}
@@ -43,7 +43,7 @@ def plot_height(
             width_ratios=(4.2, 1.95, 0.16, 1.75),
         )
         _draw_whole(at["whole"], height, inside, style)
-        right_m = height.aperture_m / 2 - _WINDOW / 2 * grid.pitch_m
+        right_m = height.relief.extent_m[1] / 2 - _WINDOW / 2 * grid.pitch_m
         for name, x_m in (("centre", 0.0), ("edge", right_m)):
             window = window_around(grid, 0.0, x_m, _WINDOW)
             cells = np.ma.array(height.height_m[window] / NM, mask=~inside[window])
@@ -63,20 +63,17 @@ def _range_m(heights: NDArray[np.floating], levels: "Levels | None") -> tuple[fl
 
 
 def _draw_whole(axes: "Axes", height: "HeightMap", inside: NDArray[np.bool_], style: dict[str, Any]) -> None:
-    from matplotlib.patches import Circle
-
     grid = height.grid
     # Cells under the chrome have a height too; it must not tint the mean along the edge.
     covered = shrunk(inside.astype(np.float32), _MOST, "smooth")
     mean = shrunk(np.where(inside, height.height_m, 0), _MOST, "smooth") / np.maximum(covered, 1e-3)
     shown = np.ma.array(mean / NM, mask=covered < 0.5)
     axes.imshow(shown, origin="lower", extent=box_mm(grid), interpolation="auto", **style)
-    radius = height.aperture_m / 2 / MM
-    axes.add_patch(Circle((0, 0), radius, fill=False, ec=MARK, lw=1.2, ls="--", clip_on=False))
+    axes.add_patch(outline_of(height.relief, fill=False, ec=MARK, lw=1.2, ls="--", clip_on=False))
     factor = max(grid.shape) / _MOST
     averaged = f", mean over about {factor:.2g} × {factor:.2g}" if factor > 1 else ""
     axes.set_title(f"{grid.shape[1]} × {grid.shape[0]} cells{averaged}")
-    axes.set_title(f"relief {length_text(height.aperture_m)}", loc="right", fontsize=SMALL, color=MARK)
+    axes.set_title(f"relief {aperture_text(height.relief)}", loc="right", fontsize=SMALL, color=MARK)
     axes.set_xlabel("x (mm)")
     axes.set_ylabel("y (mm)")
     axes.locator_params(nbins=6, steps=[1, 2, 5, 10])

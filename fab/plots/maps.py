@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, RoundAperture
 from fab.figure import MARK, SMALL, scale_bar
 from fab.grid import Grid
 from fab.units import MM
@@ -11,6 +12,7 @@ from fab.units import MM
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
+    from matplotlib.patches import Patch
 
 
 class Window(NamedTuple):
@@ -50,6 +52,15 @@ def show_map(
     axes.set_title(title)
     scale_bar(axes, (box[1] - box[0]) * MM)
     return image
+
+
+def outline_of(aperture: Aperture, at_mm: tuple[float, float] = (0.0, 0.0), **style: Any) -> "Patch":
+    """Return the outline of an aperture about a place x, y, in axes with millimetres."""
+    from matplotlib.patches import Circle, Polygon
+
+    if isinstance(aperture, RoundAperture):
+        return Circle(at_mm, aperture.diameter_m / 2 / MM, **style)
+    return Polygon(aperture.outline_m(4) / MM + at_mm, **style)
 
 
 def frame_window(axes: "Axes", grid: Grid, window: Window, name: str = "") -> None:

@@ -4,19 +4,19 @@ Overviews show the mean over parts of the map, since its pixels are finer than t
 single pixels. Up is +y, as in the drawing.
 """
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
-from fab.plots.maps import Window, box_mm, frame_window, show_map, window_around
+from fab.plots.maps import Window, box_mm, frame_window, outline_of, show_map, window_around
 from fab.units import MM, NM, UM, format_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
+    from fab.aperture import Aperture
     from fab.level_map import LevelMap
 
 _MOST = 560
@@ -26,9 +26,9 @@ _SIDE_IN = 2.7
 
 
 def plot_masks(
-    level_map: "LevelMap", chrome_m: tuple[float, float], title: str = "", ax: "Axes | None" = None
+    level_map: "LevelMap", chrome: "tuple[Aperture, float]", title: str = "", ax: "Axes | None" = None
 ) -> "FigureBase":
-    """Draw a mask set: heights, chrome (radii of opening and rim, metres), and every mask whole and in a window.
+    """Draw a mask set: heights, chrome (opening, and radius of the rim in metres), every mask whole and in a window.
 
     The picture takes the place of `ax`; a new figure by default.
     """
@@ -42,9 +42,9 @@ def plot_masks(
     with panels(ax, (_SIDE_IN * columns + 0.3, upper_in + lower_in + 0.4), title) as figure:
         parts: Any = figure.subfigures(2, 1, height_ratios=(upper_in, lower_in))
         above, below = parts
-        heights, detail, chrome = above.subplots(1, 3)
+        heights, detail, around = above.subplots(1, 3)
         _draw_heights(above, heights, detail, level_map, window)
-        _draw_chrome(chrome, level_map, chrome_m)
+        _draw_chrome(around, level_map, chrome)
         style = {"cmap": LinearSegmentedColormap.from_list("etch", [_GLASS, _ETCHED]), "vmin": 0, "vmax": 1}
         panes = below.subplots(2, columns, squeeze=False)
         for bit, plane in enumerate(level_map.planes()):
@@ -74,16 +74,17 @@ def _draw_heights(figure: "FigureBase", whole: "Axes", detail: "Axes", level_map
     bar.set_label("height above the deepest floor (nm)")
 
 
-def _draw_chrome(axes: "Axes", level_map: "LevelMap", radii_m: tuple[float, float]) -> None:
+def _draw_chrome(axes: "Axes", level_map: "LevelMap", chrome: "tuple[Aperture, float]") -> None:
     from matplotlib.patches import Circle
 
-    inner, outer = (radius / MM for radius in radii_m)
+    opening, outer = chrome[0], chrome[1] / MM
     axes.add_patch(Circle((0, 0), outer, color=CHROME, lw=0))
-    axes.add_patch(Circle((0, 0), inner, color=_GLASS, lw=0))
-    aperture_m = min(level_map.aperture_m, math.hypot(*level_map.grid.extent_m))
-    axes.add_patch(Circle((0, 0), aperture_m / 2 / MM, fill=False, ec=MARK, lw=0.8, ls="--"))
+    axes.add_patch(outline_of(opening, color=_GLASS, lw=0))
+    axes.add_patch(outline_of(level_map.shown_relief, fill=False, ec=MARK, lw=0.8, ls="--"))
     x0, x1, y0, y1 = box_mm(level_map.grid)
     axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=INK, lw=0.8)
     axes.set(xlim=(-1.03 * outer, 1.03 * outer), ylim=(-1.03 * outer, 1.03 * outer), aspect="equal")
-    axes.set_title(f"chrome: clear aperture {2 * inner:.6g} mm,\nrelief {aperture_m / MM:.6g} mm (dashed)")
+    outlines = opening, level_map.shown_relief
+    clear, relief = (" × ".join(f"{size / MM:.6g}" for size in outline.sizes_m) for outline in outlines)
+    axes.set_title(f"chrome: clear aperture {clear} mm,\nrelief {relief} mm (dashed)")
     scale_bar(axes, 2.06 * outer * MM)

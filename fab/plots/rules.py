@@ -48,7 +48,7 @@ def plot_rules(report: "RulesReport", title: str = "", ax: "Axes | None" = None)
     """
     level_map = report.level_map
     grid, planes = level_map.grid, level_map.planes()
-    inside = grid.inside_circle(level_map.aperture_m)
+    inside = level_map.relief.inside(grid)
     columns = min(len(planes), _MOST_COLUMNS)
     rows = -(-len(planes) // columns)
     size = (max(2.9 * columns, 6.4), 6.9 * rows + 0.7)

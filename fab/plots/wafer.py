@@ -4,11 +4,13 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from fab.figure import CHROME, FAINT, INK, LINE, MARK, SMALL, length_text, single
+from fab.plots.maps import outline_of
 from fab.units import MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from fab.aperture import Aperture
     from fab.layout.frame import Frame
     from fab.layout.geometry import Shapes
     from fab.layout.wafer import Wafer
@@ -20,12 +22,12 @@ _SITES = {"SITE": "A", "TEST": "M"}
 
 
 def plot_wafer(
-    wafer: "Wafer", frame: "Frame", aperture_m: float, dbu_m: float, title: str = "", ax: "Axes | None" = None
+    wafer: "Wafer", frame: "Frame", relief: "Aperture", dbu_m: float, title: str = "", ax: "Axes | None" = None
 ) -> "Axes":
     """Draw where everything lies on a photomask, seen from the etched side.
 
     The cells around the DOE are the frame (`fab.layout.frame.draw_frame`); dies that draw it differently bear their
-    number. Diameter of the relief and database unit are metres.
+    number. `relief` is its outline; the database unit is metres.
     """
     from matplotlib.patches import Circle, Polygon, Rectangle
 
@@ -43,7 +45,7 @@ def plot_wafer(
         for (x_m, y_m), split in zip(frame.dies, frame.splits, strict=True):
             x, y = x_m / MM, y_m / MM
             axes.add_artist(Rectangle((x - side / 2, y - side / 2), side, side, fill=False, ec=FAINT, lw=0.8))
-            axes.add_artist(Circle((x, y), aperture_m / 2 / MM, facecolor=CHROME, edgecolor="none"))
+            axes.add_artist(outline_of(relief, (x, y), facecolor=CHROME, edgecolor="none"))
             if split:
                 axes.text(x - 0.46 * side, y + 0.46 * side, f"{split}", va="top", fontsize=SMALL)
         for reference in around.references:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture
 from fab.errors import InputError
 from fab.figure import html_of
 from fab.grid import Grid, fewest_pixels
@@ -234,7 +235,7 @@ def _off_grid(grid: Grid, rules: Rules) -> OffGrid:
     return OffGrid(address_m, int(np.count_nonzero(rest)), rest.size, worst / 2 / _FEMTO)
 
 
-def _windows(words: bits.Words, grid: Grid, aperture_m: float, rules: Rules, area: int) -> tuple[float, float, float]:
+def _windows(words: bits.Words, grid: Grid, relief: Aperture, rules: Rules, area: int) -> tuple[float, float, float]:
     """Return the density of the aperture and of its emptiest and fullest window."""
     overall = bits.count(words) / area if area else 0.0
     size = max(1, round(rules.window_m / grid.pitch_m))
@@ -243,11 +244,11 @@ def _windows(words: bits.Words, grid: Grid, aperture_m: float, rules: Rules, are
         np.maximum(abs(axis[: n * size : size]), abs(axis[size - 1 : n * size : size]))
         for axis, n in zip((grid.axis_m("y"), grid.axis_m("x")), counts.shape, strict=True)
     )
-    inside = counts[y[:, None] ** 2 + x**2 <= (aperture_m / 2) ** 2] / size**2
+    inside = counts[relief.contains(y[:, None], x[None, :])] / size**2
     return (overall, float(inside.min()), float(inside.max())) if inside.size else (overall, overall, overall)
 
 
-def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture_m: float, area: int) -> PlaneRules:
+def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, relief: Aperture, area: int) -> PlaneRules:
     pitch, (ny, nx) = grid.pitch_m, grid.shape
     corner = (nx / 2, ny / 2)
     places: list[Violation] = []
@@ -289,7 +290,7 @@ def _check_plane(words: bits.Words, bit: int, rules: Rules, grid: Grid, aperture
         places += [place("kissing corner", x + 1, y + 1, 0, 0) for y, x, _ in listed]
     places.sort(key=lambda p: (p.size_m, -p.length_m, p.y_m, p.x_m))
     line, space = widths
-    density = _windows(words, grid, aperture_m, rules, area)
+    density = _windows(words, grid, relief, rules, area)
     return PlaneRules(bit, line, space, int(kisses), *density, tuple(places[:_MOST_PLACES]))
 
 
@@ -305,10 +306,10 @@ def check(level_map: LevelMap, process: Process | Rules | str) -> RulesReport:
     """
     levels = level_map.levels
     rules = process if isinstance(process, Rules) else Rules.from_process(process_from(process, levels))
-    grid, aperture_m = level_map.grid, level_map.aperture_m
-    area = grid.count_inside_circle(aperture_m)
+    grid, relief = level_map.grid, level_map.relief
+    area = relief.count_inside(grid)
     words = bits.pack(level_map.level, levels.count)
     with ThreadPoolExecutor() as pool:
-        tasks = [pool.submit(_check_plane, w, k, rules, grid, aperture_m, area) for k, w in enumerate(words)]
+        tasks = [pool.submit(_check_plane, w, k, rules, grid, relief, area) for k, w in enumerate(words)]
         planes = tuple(task.result() for task in tasks)
     return RulesReport(level_map, rules, planes, _off_grid(grid, rules))

@@ -224,7 +224,7 @@ def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repai
     if max(line, space) > _WIDEST:
         rule = f"the narrowest line and space must not exceed {_WIDEST} pixels"
         raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")
-    free, after = grid.inside_circle(level_map.aperture_m), before
+    free, after = level_map.relief.inside(grid), before
     if not before.clean:
         # Moves and the runs beside them reach no farther than this.
         pad = 2 * max(line, space) + 2

@@ -5,7 +5,7 @@ where nanometres are asked for, a wall measured from the horizontal or a share i
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from fab.errors import InputError
 from fab.files import read_json
 from fab.level_map import LevelMap
+from fab.runsheet.tables import OPENING_KEYS
 from fab.runsheet.write import BARS, FORMAT, PADS
 from fab.units import NM, UM
 
@@ -188,15 +189,18 @@ def _mask(table: _Table, target_m: float, edge_move_m: float, reference: bool) -
     return measured
 
 
-def _chrome(table: _Table, opening_m: float) -> ChromeMeasured:
+def _chrome(table: _Table, sizes_m: Sequence[float]) -> ChromeMeasured:
     x, y = _overlay(table)
     edges = _edges_m(table)
-    target = opening_m / UM
-    cure = "Check the unit (micrometres), and that it is the diameter."
-    opening = table.number("opening_diameter_um", 0.9 * target, 1.1 * target, cure)
+    wider = []
+    for key, target in zip(OPENING_KEYS[len(sizes_m)], (size_m / UM for size_m in sizes_m), strict=True):
+        cure = f"Check the unit (micrometres), and that it is the {key.split('_')[1]}."
+        opening = table.number(key, 0.9 * target, 1.1 * target, cure)
+        wider += [] if opening is None else [(opening - target) * UM]
     table.finish()
-    wider = None if edges is None else -2 * edges  # chrome that grows closes the opening from both sides
-    return ChromeMeasured(x, y, wider if opening is None else (opening - target) * UM)
+    if wider:
+        return ChromeMeasured(x, y, sum(wider) / len(wider))
+    return ChromeMeasured(x, y, None if edges is None else -2 * edges)  # growing chrome closes it from both sides
 
 
 def _sheet_number(path: Path, data: Mapping[str, Any], key: str) -> float:
@@ -227,8 +231,10 @@ def read_as_built(path: Path, level_map: LevelMap) -> AsBuilt:
         _mask(measured.table(name), levels.etch_depth_m(bit), moves.get(name, 0.0), name == data.get("reference"))
         for bit, name in enumerate(names)
     )
-    opening_m = _sheet_number(path, data, "opening_um") * UM
-    chrome = _chrome(measured.table("chrome"), opening_m)
+    opening = data.get("opening_um")
+    sizes = opening if isinstance(opening, list) and len(opening) == 2 else [opening]
+    sizes_m = [_sheet_number(path, {"opening_um": size}, "opening_um") * UM for size in sizes]
+    chrome = _chrome(measured.table("chrome"), sizes_m)
     plate, notes = measured.table("plate"), measured.table("notes")
     tilt = "Give the tilt from the upright: 5 for a wall of 85 degrees."
     share = "Write 5 % as 0.05; it is a share of the light through the empty window."

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
+from fab.aperture import Aperture
 from fab.errors import InputError
 from fab.layout.part import Photomask
 from fab.layout.wafer import Wafer
@@ -124,6 +125,10 @@ class SheetPrediction(NamedTuple):
     picture: Callable[[], bytes]
 
 
+# Blanks for the sizes of the chrome's opening: a diameter, or width and height.
+OPENING_KEYS = {1: ("opening_diameter_um",), 2: ("opening_width_um", "opening_height_um")}
+
+
 @dataclass(frozen=True)
 class RunSheet:
     """Everything that stands on the sheet.
@@ -134,7 +139,7 @@ class RunSheet:
         photomasks: all photomasks in the order in which they are used (`fab.layout.part.photomasks_of`).
         files: the file of every photomask, by its name.
         process: what the lab does and how far it strays.
-        opening_m: diameter of the opening in the chrome, metres.
+        opening: the opening in the chrome.
         wafer: the substrate, and the blanks of the masks.
         places: named points to measure at, from the middle of the wafer in metres, named as in `fab.layout.marks` and
             `fab.layout.structures` with the place before them ("left site: vernier x, mask 3"). Line widths and depths
@@ -155,7 +160,7 @@ class RunSheet:
     photomasks: tuple[Photomask, ...]
     files: Mapping[str, PhotomaskFile]
     process: Process
-    opening_m: float
+    opening: Aperture
     wafer: Wafer
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     dies: tuple[Die, ...] = ()

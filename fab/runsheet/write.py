@@ -27,7 +27,7 @@ from fab.runsheet.recipe import (
     steps_of,
     tone_words,
 )
-from fab.runsheet.tables import Predictions, RunSheet
+from fab.runsheet.tables import OPENING_KEYS, Predictions, RunSheet
 from fab.units import MM, NM, UM
 
 FORMAT = "doedesign run sheet 1"
@@ -237,7 +237,7 @@ def _blanks(sheet: RunSheet) -> dict[str, Any]:
     overlay = {"overlay_x_um": None, "overlay_y_um": None}
     widths = {"cd_bias_um": None, "cd_um": dict.fromkeys(BARS)}
     mask = {**overlay, **widths, "times_etched": None, "depth_nm": None, "depth_by_pad_nm": dict.fromkeys(PADS)}
-    chrome = {**overlay, **widths, "opening_diameter_um": None}
+    chrome = {**overlay, **widths, **dict.fromkeys(OPENING_KEYS[len(sheet.opening.sizes_m)])}
     etched = [photomask for photomask in sheet.photomasks if photomask.bit is not None]
     named = {photomask.name: dict(mask) for photomask in sorted(etched, key=lambda photomask: photomask.layer)}
     for key in overlay if sheet.photomasks[0].bit is not None else ():
@@ -259,8 +259,8 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "level_map_sha256": sheet.level_map.digest,
         "request_sha256": sheet.request_sha256,
         "levels": sheet.level_map.levels.count,
-        "aperture_mm": round(sheet.level_map.aperture_m / MM, 9),
-        "opening_um": _um(sheet.opening_m),
+        "aperture_mm": sheet.level_map.relief.record(MM, 9),
+        "opening_um": sheet.opening.record(UM, 6),
         "process": {
             "name": process.name,
             "order": [f"mask {bit + 1}" for bit in process.order],

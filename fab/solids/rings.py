@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fab.aperture import RoundAperture
 from fab.level_map import LevelMap
 from fab.solids.substrate import Rings
 from fab.units import NM
@@ -56,12 +57,14 @@ def _ring_levels(level_map, inside, out):  # pragma: no cover - compiled
 def ring_levels(level_map: LevelMap) -> NDArray[np.uint8] | None:
     """Return the level of every ring ``(n,)`` from the axis on if a map is a raster of rings, otherwise None.
 
-    Rings in which no pixel's centre lies are not etched.
+    Rings end at the rim of a round relief; another has none. Rings in which no pixel's centre lies are not etched.
     """
-    grid, aperture_m = level_map.grid, level_map.aperture_m
-    count = max(1, math.ceil((aperture_m / 2 - _REST_M) / grid.pitch_m))
+    grid, relief = level_map.grid, level_map.relief
+    if not isinstance(relief, RoundAperture):
+        return None
+    count = max(1, math.ceil((relief.diameter_m / 2 - _REST_M) / grid.pitch_m))
     found = np.full(count, -1, dtype=np.int16)
-    if not _ring_levels(level_map.level, grid.inside_circle(aperture_m), found):
+    if not _ring_levels(level_map.level, relief.inside(grid), found):
         return None
     return np.where(found < 0, level_map.levels.count - 1, found).astype(np.uint8)
 

@@ -99,6 +99,23 @@ def outline(width_m: float, flat_m: float | None) -> Any:
     return occ.BRepBuilderAPI_MakeFace(occ.BRepBuilderAPI_MakeWire(arc, flat).Wire()).Face()
 
 
+def filled(corners_m: Sequence[tuple[float, float]]) -> Any:
+    """Return a polygon without thickness in the plane z = 0, by its corners x, y, metres."""
+    return occ.BRepBuilderAPI_MakeFace(_polygon([_point(x, y, 0) for x, y in corners_m], closed=True)).Face()
+
+
+def _holed(surface: Any, hole: Any) -> Any:
+    """Return a plane face less another inside it."""
+    wire = occ.TopoDS.Wire_s(next(_inside(hole, occ.TopAbs_WIRE)).Reversed())
+    return occ.BRepBuilderAPI_MakeFace(surface, wire).Face()
+
+
+def framed(radius_m: float, corners_m: Sequence[tuple[float, float]], thickness_m: float) -> Any:
+    """Return a disc of some thickness (metres) on z = 0 with a polygon, by its corners x, y, cut out of it."""
+    ring = _holed(outline(2 * radius_m, 0.0), filled(corners_m))
+    return occ.BRepPrimAPI_MakePrism(ring, occ.gp_Vec(0, 0, thickness_m / MM)).Shape()
+
+
 def _compound(shapes: Iterable[Any]) -> Any:
     builder, compound = occ.BRep_Builder(), occ.TopoDS_Compound()
     builder.MakeCompound(compound)
@@ -149,12 +166,21 @@ def plate(surface: Any, thickness_m: float, profile_m: list[tuple[float, float]]
     The relief is given by its corners r, z from the axis to its rim at z = 0, metres.
     """
     relief = revolved(profile_m, closed=False)
-    prism = slab(surface, thickness_m)
     hole = occ.BRepBuilderAPI_MakeWire(_rim(relief, profile_m[-1][0])).Wire()
     top = occ.BRepBuilderAPI_MakeFace(surface, hole).Face()
+    return _closed([*_walls(surface, thickness_m), top, *_faces(relief)])
+
+
+def _walls(surface: Any, thickness_m: float) -> list[Any]:
+    """Return the faces of a slab below a face, but for that face."""
+    return [face for face in _faces(slab(surface, thickness_m)) if not face.IsSame(surface)]
+
+
+def _closed(faces: Iterable[Any]) -> Any:
+    """Return the solid that faces with common edges enclose."""
     builder, shell = occ.BRep_Builder(), occ.TopoDS_Shell()
     builder.MakeShell(shell)
-    for face in (*(f for f in _faces(prism) if not f.IsSame(surface)), top, *_faces(relief)):
+    for face in faces:
         builder.Add(shell, face)
     shell.Closed(True)
     fix = occ.ShapeFix_Shell()
@@ -162,6 +188,12 @@ def plate(surface: Any, thickness_m: float, profile_m: list[tuple[float, float]]
     solid = occ.BRepBuilderAPI_MakeSolid(fix.Shell()).Solid()
     occ.BRepLib.OrientClosedSolid_s(solid)
     return solid
+
+
+def marked_plate(surface: Any, thickness_m: float, corners_m: Sequence[tuple[float, float]]) -> Any:
+    """Return a plate below a face at z = 0 with a polygon, by its corners x, y (metres), as a face of its own."""
+    mark = filled(corners_m)
+    return _closed([*_walls(surface, thickness_m), _holed(surface, mark), mark])
 
 
 @contextmanager

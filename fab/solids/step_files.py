@@ -33,7 +33,11 @@ _RELATIVE_ERROR = 1e-11
 
 def _die(model: DoeModel) -> tuple[Substrate, ChromeRing]:
     glass = Substrate("die", model.die_m, model.wafer.thickness_m)
-    return glass, ChromeRing(*model.chrome.radii_m(model.level_map))
+    return glass, _chrome(model)
+
+
+def _chrome(model: DoeModel) -> ChromeRing:
+    return ChromeRing(model.chrome.opening(model.level_map.relief), model.chrome.rim_m(model.level_map))
 
 
 def _rings(model: DoeModel) -> tuple[Rings | None, str]:
@@ -57,13 +61,13 @@ def _die_entry(path: Path, model: DoeModel) -> ModelEntry:
 def _write_die(path: Path, model: DoeModel) -> None:
     """Write one die, with its rings if the map is radial."""
     glass, chrome = _die(model)
-    substrate_step(path, glass, model.level_map.aperture_m, chrome, _rings(model)[0])
+    substrate_step(path, glass, model.level_map.relief, chrome, _rings(model)[0])
 
 
 def _wafer(model: DoeModel) -> tuple[Substrate, ChromeRing]:
     """Return the wafer, with a flat unless the dies need its place, and the chrome of a die."""
     wafer = model.wafer
-    chrome = ChromeRing(*model.chrome.radii_m(model.level_map))
+    chrome = _chrome(model)
     glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m, wafer.usual_flat_m)
     if glass.flat_m and not all(glass.holds(x, y, chrome.outer_m) for x, y in model.dies):
         glass = Substrate("wafer", wafer.diameter_m, wafer.thickness_m)
@@ -82,7 +86,7 @@ def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry:
 
 def _write_wafer(path: Path, model: DoeModel) -> None:
     glass, chrome = _wafer(model)
-    wafer_step(path, glass, model.level_map.aperture_m, chrome, model.dies)
+    wafer_step(path, glass, model.level_map.relief, chrome, model.dies)
 
 
 def _patch_entry(path: Path, model: DoeModel) -> ModelEntry | None:

@@ -2,7 +2,8 @@
 
 The origin is the centre of the clear aperture, z = 0 the blank surface (the datum, on which the relief is etched and
 the chrome lies), and the z axis the light axis. The glass lies below, the relief faces +z. A file holds named parts:
-SUBSTRATE and CHROME are solids, DATUM_RELIEF is a disc without thickness in the plane z = 0, to be referred to.
+SUBSTRATE and CHROME are solids, DATUM_RELIEF is the relief's outline, filled and without thickness, in the plane z = 0,
+to be referred to.
 
 A radial design is exact: its rings are the faces of one revolved profile, flat tops and cylindrical walls, set into the
 top of the substrate. Any other map belongs in a mesh; a small window of one can be STEP (`fab.solids.patch`).
@@ -17,8 +18,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, RoundAperture, diameter_of
 from fab.errors import InputError
-from fab.solids.step import Body, Copies, disc, outline, plate, revolved, slab, write_step
+from fab.solids.step import (
+    Body,
+    Copies,
+    disc,
+    filled,
+    framed,
+    marked_plate,
+    outline,
+    plate,
+    revolved,
+    slab,
+    write_step,
+)
 from fab.units import NM, format_length
 
 # The kernel takes points 1e-7 mm apart for one; edges must be clearly longer.
@@ -77,28 +91,38 @@ class Substrate:
 
 @dataclass(frozen=True)
 class ChromeRing:
-    """Chrome around the clear aperture: radius of the opening, outer radius and thickness of the film, metres."""
+    """Chrome around the clear aperture: the opening, outer radius and thickness of the film, metres.
 
-    inner_m: float
+    Raises:
+        InputError: the opening does not lie inside, or a length is not positive.
+    """
+
+    opening: Aperture
     outer_m: float
     thickness_m: float = 100 * NM
 
     def __post_init__(self) -> None:
-        if not (0 < self.inner_m < self.outer_m < math.inf and _SHORTEST_M <= self.thickness_m < math.inf):
-            got = ", ".join(format_length(v) for v in (self.inner_m, self.outer_m, self.thickness_m))
-            rule = "inner radius, outer radius and thickness must be positive and make a ring"
-            raise InputError("chrome", rule, got, "Check the three lengths.")
+        inside = self.opening.narrowest_m > 0 and self.opening.reach_m < self.outer_m < math.inf
+        if not (inside and _SHORTEST_M <= self.thickness_m < math.inf):
+            got = f"{self.opening}, {format_length(self.outer_m)}, {format_length(self.thickness_m)}"
+            rule = "opening, outer radius and thickness must be positive and make a ring"
+            raise InputError("chrome", rule, got, "Check the lengths.")
 
     @property
     def body(self) -> Body:
         """The ring around the axis, on z = 0."""
-        volume = math.pi * (self.outer_m + self.inner_m) * (self.outer_m - self.inner_m) * self.thickness_m
-        return Body(volume, (0.0, 0.0, self.thickness_m / 2))
+        area = math.pi * self.outer_m**2 - self.opening.area_m2
+        if isinstance(self.opening, RoundAperture):
+            area = math.pi * (self.outer_m + self.opening.reach_m) * (self.outer_m - self.opening.reach_m)
+        return Body(area * self.thickness_m, (0.0, 0.0, self.thickness_m / 2))
 
     def solid(self) -> Any:
         """The same as a shape of the kernel."""
         low, high = 0.0, self.thickness_m
-        corners = [(self.inner_m, low), (self.outer_m, low), (self.outer_m, high), (self.inner_m, high)]
+        if not isinstance(self.opening, RoundAperture):
+            return framed(self.outer_m, self.opening.outline_m(4).tolist(), high)
+        inner_m = self.opening.reach_m
+        corners = [(inner_m, low), (self.outer_m, low), (self.outer_m, high), (inner_m, high)]
         return revolved(corners, closed=True)
 
 
@@ -155,9 +179,9 @@ class Rings:
         return corners if corners[-1][0] == rim else [*corners, (rim, 0.0)]
 
 
-def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | None, rings: Rings | None) -> None:
+def _require_fit(substrate: Substrate, relief: Aperture, chrome: ChromeRing | None, rings: Rings | None) -> None:
     # Chrome may reach the edge of the glass; the rim of the relief must leave some surface around it.
-    most = {"relief": (aperture_m / 2, 1 - 1e-6)}
+    most = {"relief": (relief.reach_m, 1 - 1e-6)}
     if chrome is not None:
         most["chrome"] = (chrome.outer_m, 1 + 1e-12)
     for name, (radius, share) in most.items():
@@ -165,8 +189,8 @@ def _require_fit(substrate: Substrate, aperture_m: float, chrome: ChromeRing | N
             got = f"a diameter of {format_length(2 * radius)}"
             rule = f"must lie inside the substrate's surface, a circle of {format_length(2 * substrate.inside_m)}"
             raise InputError(name, rule, got, "Choose a larger die or a smaller circle.")
-    if rings is not None and not rings.outer_m[-1] <= aperture_m / 2 * (1 + 1e-9):
-        got = f"{format_length(float(rings.outer_m[-1]))} of {format_length(aperture_m / 2)}"
+    if rings is not None and not rings.outer_m[-1] <= diameter_of(relief) / 2 * (1 + 1e-9):
+        got = f"{format_length(float(rings.outer_m[-1]))} of {format_length(relief.reach_m)}"
         raise InputError("rings", "must lie inside the relief", got, "Cut them at its edge.")
     if rings is not None and not rings.blank_m < substrate.thickness_m:
         got = f"{format_length(rings.blank_m)} into {format_length(substrate.thickness_m)}"
@@ -192,22 +216,31 @@ def substrate_bodies(
 def substrate_step(
     path: str | Path,
     substrate: Substrate,
-    aperture_m: float,
+    relief: Aperture,
     chrome: ChromeRing | None = None,
     rings: Rings | None = None,
 ) -> None:
     """Write the plate as STEP: glass, chrome and the place of the relief in the datum plane.
 
-    Without rings the surface is flat, with the relief (diameter in metres) as a face of its own. The chrome
-    lies flat at z = 0, also where it reaches over etched rings.
+    Without rings the surface is flat, with the relief as a face of its own. The chrome lies flat at z = 0, also where
+    it reaches over etched rings.
     """
-    _require_fit(substrate, aperture_m, chrome, rings)
-    profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (aperture_m / 2, 0.0)]
+    _require_fit(substrate, relief, chrome, rings)
     surface = outline(substrate.width_m, None if substrate.outline == "die" else substrate.flat_m)
-    parts = {"SUBSTRATE": plate(surface, substrate.thickness_m, profile), "DATUM_RELIEF": disc(aperture_m / 2)}
+    if isinstance(relief, RoundAperture):
+        profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (relief.reach_m, 0.0)]
+        glass = plate(surface, substrate.thickness_m, profile)
+    else:
+        glass = marked_plate(surface, substrate.thickness_m, relief.outline_m(4).tolist())
+    parts = {"SUBSTRATE": glass, "DATUM_RELIEF": _face(relief)}
     if chrome is not None:
         parts["CHROME"] = chrome.solid()
     write_step(path, "DOE", parts)
+
+
+def _face(relief: Aperture) -> Any:
+    """The outline of a relief, filled, as a shape of the kernel."""
+    return disc(relief.reach_m) if isinstance(relief, RoundAperture) else filled(relief.outline_m(4).tolist())
 
 
 def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
@@ -218,7 +251,7 @@ def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[
 
 
 def wafer_step(
-    path: str | Path, wafer: Substrate, aperture_m: float, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
+    path: str | Path, wafer: Substrate, relief: Aperture, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]
 ) -> None:
     """Write a wafer as STEP: flat glass; chrome and place of the relief of every die about its middle x, y, metres."""
     for x, y in places_m:
@@ -227,7 +260,7 @@ def wafer_step(
             raise InputError("wafer", "the dies must lie on it", got, "Take fewer dies, or a larger wafer.")
     parts = {
         "SUBSTRATE": slab(outline(wafer.width_m, wafer.flat_m), wafer.thickness_m),
-        "DATUM_RELIEF": Copies(disc(aperture_m / 2), places_m),
+        "DATUM_RELIEF": Copies(_face(relief), places_m),
         "CHROME": Copies(chrome.solid(), places_m),
     }
     write_step(path, "WAFER", parts)

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fab.aperture import Aperture, RoundAperture, aperture_from
 from fab.errors import InputError
 from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
-from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes
+from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes, frame_half
 from fab.layout.polygons import doubled_area, paint
 from fab.manifest.cells import cell_entry, shapes_digest
 from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
@@ -65,32 +66,54 @@ def _count_problem(layer: Layer, count: int, what: str) -> list[str]:
 
 
 def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: ChromeEntry, dbu_m: float) -> list[str]:
-    """Check that polygons make the stated annulus: count, radii, chords, area, and every vertex."""
+    """Check that polygons make the stated chrome: count, opening and outer circle, chords, area, and every vertex."""
     if len(polygons) != chrome.polygons:
         return [f"layer {layer}: {len(polygons)} chrome polygons instead of {chrome.polygons}"]
-    inner, outer = (mm * MM / 2 / dbu_m for mm in (chrome.opening_diameter_mm, chrome.outer_diameter_mm))
+    opening, outer = aperture_from(chrome.opening_diameter_mm, MM), chrome.outer_diameter_mm * MM / 2 / dbu_m
     x, y = np.concatenate(polygons).astype(np.float64).T
-    radius = np.hypot(x, y)
     # A vertex is rounded by up to half a unit in x and in y.
-    on_inner, on_outer = (np.abs(radius - wanted) <= 1 for wanted in (inner, outer))
-    problems = _count_problem(
-        layer, int(np.count_nonzero(~(on_inner | on_outer))), "chrome vertices lie on neither of the two circles"
-    )
+    on_outer = np.abs(np.hypot(x, y) - outer) <= 1
     chord = chrome.chord_error_nm * NM / dbu_m + 1
-    for name, on_circle, wanted in (("opening", on_inner, inner), ("outer edge", on_outer, outer)):
-        angle = np.sort(np.arctan2(y[on_circle], x[on_circle]))
-        widest = np.max(np.diff(angle, append=angle[:1] + 2 * math.pi), initial=0.0) if angle.size else 2 * math.pi
-        sagitta = wanted * (1 - math.cos(min(widest, 2 * math.pi) / 2))
-        if sagitta > chord:
-            problems.append(f"layer {layer}: the {name} leaves its circle by {sagitta * dbu_m / NM:.3g} nm")
+    on_inner, inner_edge = _on_opening(opening, x, y, chord, dbu_m)
+    outline = "circle" if isinstance(opening, RoundAperture) else "outline"
+    stray = int(np.count_nonzero(~(on_inner | on_outer)))
+    problems = _count_problem(layer, stray, f"chrome vertices lie on neither of the two {outline}s")
+    for name, edge in (("opening", inner_edge), ("outer edge", _off_circle(outer, x[on_outer], y[on_outer], chord))):
+        if edge:
+            problems.append(f"layer {layer}: the {name} leaves its {outline} by {edge * dbu_m / NM:.3g} nm")
     area = sum(abs(doubled_area(polygon)) for polygon in polygons) / 2
-    off = abs(area - math.pi * (outer**2 - inner**2))
-    if off > 2 * math.pi * (outer + inner) * chord:
+    off = abs(area - (math.pi * outer**2 - opening.area_in(dbu_m)))
+    if off > 2 * math.pi * (outer + opening.reach_m / dbu_m) * chord:
         problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
     drawn = Shapes(polygons=tuple(polygon.astype(np.int32) for polygon in polygons))
     if shapes_digest(drawn) != chrome.shapes_sha256:
         problems.append(f"layer {layer}: the chrome has another vertex, or one elsewhere")
     return problems
+
+
+def _off_circle(radius: float, x: NDArray[np.float64], y: NDArray[np.float64], chord: float) -> float:
+    """Return by how much the chords between vertices on a circle leave it, 0 if by no more than they may; units."""
+    angle = np.sort(np.arctan2(y, x))
+    widest = np.max(np.diff(angle, append=angle[:1] + 2 * math.pi), initial=0.0) if angle.size else 2 * math.pi
+    sagitta = radius * (1 - math.cos(min(widest, 2 * math.pi) / 2))
+    return sagitta if sagitta > chord else 0.0
+
+
+def _on_opening(
+    opening: Aperture, x: NDArray[np.float64], y: NDArray[np.float64], chord: float, dbu_m: float
+) -> tuple[NDArray[np.bool_], float]:
+    """Return which vertices lie on the rim of the opening or on its frame, and how far it leaves its outline; units."""
+    if isinstance(opening, RoundAperture):
+        radius = opening.diameter_m / 2 / dbu_m
+        on_rim = np.abs(np.hypot(x, y) - radius) <= 1
+        return on_rim, _off_circle(radius, x[on_rim], y[on_rim], chord)
+    # Its sides are whole units, but for the digits of the manifest.
+    half_y, half_x = (side / 2 / dbu_m for side in opening.extent_m)
+    on_rim = np.abs(np.maximum(np.abs(x) - half_x, np.abs(y) - half_y)) <= 0.1
+    corners = [np.hypot(x[on_rim] - sx * half_x, y[on_rim] - sy * half_y) for sx in (-1, 1) for sy in (-1, 1)]
+    farthest = max(float(corner.min(initial=math.inf)) for corner in corners)
+    on_frame = np.maximum(np.abs(x), np.abs(y)) == frame_half(opening, dbu_m)
+    return on_rim | on_frame, farthest if farthest > 0.1 else 0.0
 
 
 def _etch_problems(layer: Layer, shapes: Shapes, mask: Drawn, expected: Expected) -> list[str]:

@@ -5,8 +5,8 @@ follow a map, a weight must be a cheap formula of two places: a sample at x coun
 pixel from `low` to `high`. The step is 0 and 1 beyond `REACH` samples, and a sum of odd Chebyshev polynomials between.
 Neighbours share their edge, so that no light is lost or counted twice whatever the places are.
 
-The coefficients minimise the same expectation as those weights: the squared error over developed speckle behind a
-round aperture, a strong term for the mean energy, pixels at all fractions of a sample and a few per cent wider or
+The coefficients minimise the same expectation as those weights: the squared error over developed speckle behind the
+aperture, a strong term for the mean energy, pixels at all fractions of a sample and a few per cent wider or
 narrower than on the axis.
 """
 
@@ -33,9 +33,9 @@ class EdgeStep(NamedTuple):
 
 
 @lru_cache(maxsize=32)
-def fit_edge_step(width: float, cutoff: float) -> EdgeStep:
+def fit_edge_step(width: float, cutoff: float, is_round: bool = True) -> EdgeStep:
     """The best step for pixels `width` samples wide on an intensity of highest frequency `cutoff` per sample."""
-    nu, spectrum = speckle_spectrum(cutoff, width)
+    nu, spectrum = speckle_spectrum(cutoff, width, is_round)
     half = slice(len(nu) // 2, None, 4)  # responses at -nu are conjugates
     nu, spectrum = nu[half], np.where(nu[half] > 0, 2.0, 1.0) * spectrum[half]
     spectrum = spectrum / spectrum.sum()

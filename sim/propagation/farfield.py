@@ -42,6 +42,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 from scipy.fft import next_fast_len
 
+from fab.aperture import RoundAperture
 from sim.camera import Camera
 from sim.propagation.field_weights import FIELD_TAPS, field_weights
 from sim.propagation.mapped import MappedPixels, plan_mapped_pixels
@@ -112,8 +113,8 @@ def plan_far_field(
         wavelength_m: vacuum wavelength.
         depth_m: source depth; without influence below a `sampling` of 2, where the cell's sinc stays centred on the
             axis.
-        sampling: samples per lambda d / D on the sensor, at least 1; by default as many as predict an error of
-            `TOLERANCE`.
+        sampling: samples per lambda d / D on the sensor, D the longer side of an aperture that is not round, at least
+            1; by default as many as predict an error of `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
         field_rad: field angles (y, x); without influence if the lens has the mapping "sine" and no distortion, and no
             beam is tilted.
@@ -122,13 +123,14 @@ def plan_far_field(
     ny, nx = camera.grid.shape
     if ny != nx:
         raise ValueError(f"`camera.grid` must be square, but got {camera.grid.shape}")
+    is_round = isinstance(camera.opening, RoundAperture)
     if sampling is None:
-        airy = wavelength_m * camera.sensor_distance_m / camera.aperture_m
-        sampling = sampling_for(camera.pixel_m * camera.fill / airy, TOLERANCE)
+        airy = wavelength_m * camera.sensor_distance_m / camera.opening.widest_m
+        sampling = sampling_for(camera.pixel_m * camera.fill / airy, TOLERANCE, is_round)
     if sampling < 1:
         raise ValueError(f"`sampling` must be at least 1, but got {sampling}")
     scale = wavelength_m * camera.sensor_distance_m
-    pitch, aperture = camera.grid.pitch_m, camera.aperture_m
+    pitch, aperture = camera.grid.pitch_m, camera.opening.widest_m
     # Below two samples the intensity is aliased whatever is done, and the bare transform is the cheapest estimate.
     bare = sampling < 2
     needed = (sampling if bare else _FIELD_SAMPLING) * aperture / pitch
@@ -145,23 +147,23 @@ def plan_far_field(
     kept = samples if bare else 64 * int(np.ceil((samples * fine / spacing + FIELD_TAPS + 2) / 64))
     positions = (np.arange(samples) - samples // 2) * fine
     # An amplitude per cell of area pitch² gives U = sum t pitch² / (lambda d); a sample stands for fine².
-    amount = pitch**2 / scale * fine / np.sqrt(np.pi * aperture**2 / 4)
+    amount = pitch**2 / scale * fine / np.sqrt(camera.opening.area_m2)
     envelope = np.sinc(positions * pitch / scale) ** 2 if cell and bare else np.ones(samples)
     cutoff, factor = aperture * fine / scale, amount * envelope
     gather, spread, pixels, refine, missed = None, None, None, None, 0.0
     # Bare transforms are those of long optimisations, compiled once.
     banded = partial(Banded.from_dense, batched=not bare)
     if places is None:
-        weights = _pixel_rule(camera, width, fine, cutoff, samples)
+        weights = _pixel_rule(camera, width, fine, cutoff, samples, is_round)
         matrix, miscounted = weights.matrix * factor[:, None], np.sqrt(2) * weights.expected_error
         gather, spread = banded(matrix), banded(matrix.T, 256)
     else:
-        pixels, miscounted = plan_mapped_pixels(places, camera.window, camera.fill, cutoff, factor, room)
+        pixels, miscounted = plan_mapped_pixels(places, camera.window, camera.fill, cutoff, factor, room, is_round)
     if not bare:
         curvature = camera.curvature_per_m(1 / depth_m)
         curvature += 0.0 if camera.beam is None else camera.beam.curvature_per_m(wavelength_m)
         slope = curvature * pitch**2 / wavelength_m if cell else None
-        refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope)
+        refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope, is_round)
     return FarField(
         gather=gather,
         spread=spread,
@@ -180,9 +182,9 @@ def plan_far_field(
 
 
 @lru_cache(maxsize=32)
-def _pixel_rule(camera: Camera, width: float, fine: float, cutoff: float, samples: int) -> PixelWeights:
+def _pixel_rule(camera: Camera, width: float, fine: float, cutoff: float, samples: int, is_round: bool) -> PixelWeights:
     """`pixel_weights` for samples `fine` metres apart; kept, for every depth of a wavelength has the same."""
-    return pixel_weights(camera.axis_m() / fine + samples // 2, width, cutoff, samples)
+    return pixel_weights(camera.axis_m() / fine + samples // 2, width, cutoff, samples, is_round)
 
 
 def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 from scipy.fft import next_fast_len
 
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from sim.camera import Camera, wrapped_waves
 from sim.propagation.pixel import Banded, pixel_weights
@@ -80,14 +81,14 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m) if camera.distance_m is None else 0.0
     if nyquist > camera.focal_length_m * (1 + 1e-9):
-        limit = wavelength_m * camera.focal_length_m / camera.aperture_m
+        limit = wavelength_m * camera.focal_length_m / camera.opening.widest_m
         raise InputError(
             "propagation",
             f"the direct path needs N pitch^2 / wavelength (eq. 6) of at most the focal length, "
             f"{camera.focal_length_m * 1e3:.4g} mm",
             f"{nyquist * 1e3:.4g} mm at {wavelength_m * 1e9:.4g} nm with N = {cells} and {pitch * 1e6:.4g} um",
             f'Use propagation = "far_field", or a pitch of at most {limit * 1e6:.3g} um '
-            f"(N = {int(np.ceil(camera.aperture_m / limit))}) for this aperture.",
+            f"(N = {int(np.ceil(camera.opening.widest_m / limit))}) for this aperture.",
         )
     cells, pitch = cells * parts, pitch / parts
     half = camera.window * camera.pixel_m / 2 / pitch
@@ -101,11 +102,11 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
     padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
     middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
     first = int(np.floor(middle)) - kept // 2
+    cutoff = camera.opening.widest_m * pitch / (wavelength_m * distance)
     weights = pixel_weights(
-        camera.axis_m() / pitch + middle - first, width, camera.aperture_m * pitch / (wavelength_m * distance), kept
+        camera.axis_m() / pitch + middle - first, width, cutoff, kept, isinstance(camera.opening, RoundAperture)
     )
-    area = np.pi * camera.aperture_m**2 / 4
-    matrix = weights.matrix * (pitch / np.sqrt(area))
+    matrix = weights.matrix * (pitch / np.sqrt(camera.opening.area_m2))
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
     # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d;
     # without a lens it holds r^2/2d, which this takes out again.
@@ -124,7 +125,7 @@ def _parts(camera: Camera, wavelength_m: float) -> int:
     """Samples per cell and axis that carry light from one rim to the far corner of the window; one behind a lens."""
     if camera.distance_m is None:
         return 1
-    across = camera.aperture_m / 2 + camera.window * camera.pixel_m / np.sqrt(2)
+    across = camera.opening.reach_m + camera.window * camera.pixel_m / np.sqrt(2)
     sine = across / np.hypot(across, camera.distance_m)
     # Intensity has twice the band of the field.
     return max(1, int(np.ceil(4 * camera.grid.pitch_m * sine / wavelength_m)))

@@ -232,7 +232,13 @@ def _at_edges(strips: Strips, low: Any, high: Any) -> Strips:
 
 
 def plan_mapped_pixels(
-    places: PlaceMap, window: int, fill: float, cutoff: float, factor: Float[np.ndarray, " sample"], room: float = 0.0
+    places: PlaceMap,
+    window: int,
+    fill: float,
+    cutoff: float,
+    factor: Float[np.ndarray, " sample"],
+    room: float = 0.0,
+    is_round: bool = True,
 ) -> tuple[MappedPixels, float]:
     """Prepare the two passes for a map, on the host.
 
@@ -243,6 +249,7 @@ def plan_mapped_pixels(
         cutoff: highest frequency of the intensity, cycles per sample.
         factor: what a sample counts, along either axis; there are as many as samples.
         room: how far other maps (`MappedPixels.at`) may differ from this one in their derivatives, relatively.
+        is_round: whether the light is that behind a disc, and not behind another aperture.
 
     Returns:
         the passes, and the predicted relative L2 error of the energies of a speckle-like image.
@@ -250,7 +257,7 @@ def plan_mapped_pixels(
     samples, way = len(factor), (places, window, fill)
     tall = float(places(0.5, 0.0)[0] - places(-0.5, 0.0)[0])
     wide = float(places(0.0, 0.5)[1] - places(0.0, -0.5)[1])
-    step = fit_edge_step(fill * np.sqrt(tall * wide), cutoff)
+    step = fit_edge_step(fill * np.sqrt(tall * wide), cutoff, is_round)
 
     def planned(edges: Callable[[int], Any], across: float) -> Strips:
         """One pass; `across` is the distance of two pixels along it in samples."""

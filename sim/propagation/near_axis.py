@@ -114,7 +114,7 @@ def profiles(
     pitch, field = camera.grid.pitch_m, _flat(camera, field, line)
     light, path = _towards_axis(field, y, x, distance_m, wavelength, pitch)
     sines = y / path / wavelength, x / path / wavelength
-    scale = 1 / np.sqrt(np.pi * camera.aperture_m**2 / 4)
+    scale = 1 / np.sqrt(camera.opening.area_m2)
     ideal = float(np.sum(np.abs(field) / path**2)) * pitch**2 * distance_m / wavelength
     return scale * np.stack([_transform(light, sine, places_m) for sine in sines]), scale * ideal
 

@@ -6,9 +6,9 @@ the weights are chosen well. Point samples at the pixel pitch are not enough: be
 rough DOE is finer than a pixel, and they miss the integral by 60-90 %.
 
 The weights of one pixel minimise the expected squared error over fully developed speckle, whose power at spatial
-frequency nu is the autocorrelation of the disc (J. W. Goodman, *Speckle Phenomena in Optics*, §4.2), plus a strong term
-at nu = 0 that makes energy come out right. The same expectation predicts the error of the rule. The two axes separate;
-with fewer samples the rule stays the best linear estimate.
+frequency nu is the autocorrelation of the aperture (J. W. Goodman, *Speckle Phenomena in Optics*, §4.2), that of a disc
+or else of a rectangle, plus a strong term at nu = 0 that makes energy come out right. The same expectation predicts the
+error of the rule. The two axes separate; with fewer samples the rule stays the best linear estimate.
 """
 
 from dataclasses import replace
@@ -47,27 +47,36 @@ def disc_autocorrelation(frequency: Float[np.ndarray, "*s"]) -> Float[np.ndarray
     return 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v * v))
 
 
-def speckle_spectrum(cutoff: float, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (cycles per sample) and the power of speckle, already integrated along the other axis."""
+def speckle_spectrum(cutoff: float, width: float, is_round: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (cycles per sample) and the power of speckle, already integrated along the other axis.
+
+    That is the same for all frequencies behind a rectangle.
+    """
     nu = np.linspace(-cutoff, cutoff, _FREQUENCIES)
+    if not is_round:
+        triangle = 1 - np.abs(nu) / cutoff
+        return nu, triangle / triangle.sum()
     other = np.linspace(0.0, cutoff, _FREQUENCIES)
     power = disc_autocorrelation(np.hypot(nu[:, None], other[None, :]) / cutoff)
     spectrum = (power * np.sinc(width * other) ** 2).sum(axis=1)
     return nu, spectrum / spectrum.sum()
 
 
-def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: float, samples: int) -> PixelWeights:
+def pixel_weights(
+    centres: Float[np.ndarray, " pixel"], width: float, cutoff: float, samples: int, is_round: bool = True
+) -> PixelWeights:
     """Weights that integrate samples at 0 .. samples-1 over pixels; each pixel's sum is `width`.
 
     In units of the sample spacing: pixel centres, which must lie inside by two samples (else a ValueError), the side
     `width` of a sensitive square, and the highest spatial frequency `cutoff` of the intensity (1/2 is just enough).
+    `is_round` tells light behind a disc from that behind any other aperture.
     """
     # Two samples beyond the pixel's edge on both sides: the gain of a third is below the plan's tolerance.
     taps = int(np.ceil(width)) + 5
     first = np.floor(centres - (taps - 1) / 2 + 0.5).astype(np.int64)
     if first.min() < 0 or first.max() + taps > samples:
         raise ValueError(f"pixels need samples {first.min()}..{first.max() + taps - 1}, but there are {samples}")
-    nu, spectrum = speckle_spectrum(cutoff, width)
+    nu, spectrum = speckle_spectrum(cutoff, width, is_round)
     lags = np.arange(taps)
     gram_row = (spectrum * np.cos(2 * np.pi * np.outer(lags, nu))).sum(axis=1) + MEAN_WEIGHT
     gram = gram_row[np.abs(lags[:, None] - lags[None, :])] + _FLOOR * np.eye(taps)
@@ -84,7 +93,7 @@ def pixel_weights(centres: Float[np.ndarray, " pixel"], width: float, cutoff: fl
 
 
 @lru_cache(maxsize=32)  # every depth asks for the same
-def sampling_for(pixel: float, tolerance: float) -> float:
+def sampling_for(pixel: float, tolerance: float, is_round: bool = True) -> float:
     """Samples per lambda d / D with which pixels of side `pixel` (in lambda d / D) are integrated to `tolerance`.
 
     The error is predicted for pixels at eight positions between two samples, both axes together. Wide pixels need
@@ -95,7 +104,7 @@ def sampling_for(pixel: float, tolerance: float) -> float:
         width = pixel * sampling
         span = 2 * int(np.ceil(width) + 8)
         centres = span // 2 + np.arange(8) / 8
-        if np.sqrt(2) * pixel_weights(centres, width, 1 / sampling, span).expected_error <= tolerance:
+        if np.sqrt(2) * pixel_weights(centres, width, 1 / sampling, span, is_round).expected_error <= tolerance:
             return sampling
     return _SAMPLINGS[-1]
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
+from fab.aperture import Aperture
 from fab.grid import Grid
 from sim.camera import Camera
 from sim.material import refractive_index
@@ -86,21 +87,22 @@ class CertifiedPiece(NamedTuple):
 
 
 def cut_rows(
-    height_m: Float[np.ndarray, "y x"], grid: Grid, aperture_m: float, cells: int, shares: Sequence[float] = SHARES
+    height_m: Float[np.ndarray, "y x"], grid: Grid, aperture: Aperture, cells: int, shares: Sequence[float] = SHARES
 ) -> list[Row]:
     """Cut rows of `cells` cells: along x on the x axis, along y on the y axis, and along x on the diagonal.
 
     On the axes of a design of rings they cross the rings, where walls stand closest. Rows without relief are left out,
-    and parts of rows beyond the aperture (a diameter, metres).
+    and parts of rows beyond the aperture.
     """
     found = []
-    for axis, centre_m in _places(shares, aperture_m):
+    for axis, centre_m in _places(shares, aperture):
         row, column = _cell_at(grid, centre_m)
         line, middle = (height_m[row], column) if axis == "x" else (height_m[:, column], row)
         across_m = grid.axis_m("y")[row] if axis == "x" else grid.axis_m("x")[column]
         start = int(np.clip(middle - cells // 2, 0, len(line) - cells))
         along_m = grid.axis_m(axis)[start : start + cells]
-        inside = np.hypot(along_m, across_m) <= aperture_m / 2
+        at_m = (np.full(1, across_m), along_m) if axis == "x" else (along_m, np.full(1, across_m))
+        inside = aperture.contains(*at_m)
         part = np.asarray(line[start : start + cells], np.float64)[inside]
         if len(part) > 1 and np.ptp(part) > 0:
             own, other = float(along_m[inside].mean()), float(across_m)
@@ -108,14 +110,14 @@ def cut_rows(
     return found
 
 
-def _places(shares: Sequence[float], aperture_m: float) -> Iterator[tuple[Literal["x", "y"], tuple[float, float]]]:
+def _places(shares: Sequence[float], aperture: Aperture) -> Iterator[tuple[Literal["x", "y"], tuple[float, float]]]:
     """Yield the direction in which to cut, and where (y, x), metres."""
     for share in shares:
-        reach = share * aperture_m / 2
-        yield "x", (0.0, reach)
+        reach_y, reach_x = (share * side_m / 2 for side_m in aperture.extent_m)
+        yield "x", (0.0, reach_x)
         if share:
-            yield "y", (reach, 0.0)
-            yield "x", (reach / np.sqrt(2), reach / np.sqrt(2))
+            yield "y", (reach_y, 0.0)
+            yield "x", (reach_y / np.sqrt(2), reach_x / np.sqrt(2))
 
 
 def _cell_at(grid: Grid, place_m: tuple[float, float]) -> tuple[int, int]:
@@ -126,7 +128,7 @@ def _cell_at(grid: Grid, place_m: tuple[float, float]) -> tuple[int, int]:
 def cut_pieces(
     height_m: Float[np.ndarray, "y x"],
     grid: Grid,
-    aperture_m: float,
+    aperture: Aperture,
     side: int,
     count: int,
     *,
@@ -138,7 +140,7 @@ def cut_pieces(
     The places are spread over radii and directions, the outermost first. Of the squares along a row the one with the
     highest walls is taken, which is the hardest for a thin element; none where all are flat or beyond the aperture.
     """
-    places, found = list(_places(shares, aperture_m)), []
+    places, found = list(_places(shares, aperture)), []
     for chosen in np.linspace(len(places) - 1, 0, count).round().astype(int):
         axis, centre_m = places[chosen]
         row, column = _cell_at(grid, centre_m)
@@ -149,7 +151,7 @@ def cut_pieces(
                 if min(y, x) < 0 or y + side > height_m.shape[0] or x + side > height_m.shape[1]:
                     continue
                 y_m, x_m = grid.axis_m("y")[y : y + side], grid.axis_m("x")[x : x + side]
-                if np.hypot(y_m[:, None], x_m).max() <= aperture_m / 2:
+                if aperture.contains(y_m[:, None], x_m[None, :]).all():
                     part = np.asarray(height_m[y : y + side, x : x + side], np.float64)
                     squares.append(Piece((float(y_m.mean()), float(x_m.mean())), part))
         if squares and _wall_heights(hardest := max(squares, key=_wall_heights)) > 0:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
 
 from fab.grid import Grid
-from sim.aperture import circle_coverage
+from sim.aperture import open_cells
 from sim.camera import Camera
 from sim.material import refractive_index
 from sim.optic import HeightOptic, ViewedOptic
@@ -143,7 +143,7 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
             series = width_series(highest, wavelength, index, camera.polarisation, axis)
             walls.append(Walls.of(series, highest, _at_borders(taps, camera, axis), camera.grid.pitch_m))
         found.append(light_of_cells_and_walls(height, camera.waves_per_metre(wavelength), *walls))
-    coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+    coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
     return EdgeOptic(drawn, drawn_m, camera, coverage, jnp.stack(found), tuple(views), wavelengths, depths)
 
 
@@ -217,7 +217,7 @@ def _at_borders(
 ) -> Inexact[np.ndarray, "tap border"]:
     """Weights for every border between two cells along an axis."""
     at = camera.grid.axis_m(axis)
-    share = (at[1:] + at[:-1]) / camera.aperture_m
+    share = (at[1:] + at[:-1]) / camera.opening.widest_m
     place = np.minimum(np.abs(share), 1.0) * (len(weights) - 1)
     below = np.minimum(place.astype(int), len(weights) - 2)
     part = (place - below)[:, None]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.aperture import open_shares
+from sim.aperture import Box, Disc
 from sim.surface.cell import DEGREES, Cuts, axis_moments
 from sim.surface.pieces import PRECISION, TILE
 from sim.surface.relief import TilePlan
@@ -27,7 +27,7 @@ class Opening(NamedTuple):
 
     coverage: Float[Array, "v u"]  # open share of every part of a cell
     centre_m: Float[Array, "2"]  # (y, x)
-    diameter_m: Float[Array, ""]
+    outline: Disc | Box
 
 
 def through_opening(
@@ -67,7 +67,7 @@ def _shares(
         ((first - n / 2) + within - centre / plan.grid.pitch_m) * squares
         for first, n, centre in zip(start, plan.grid.shape, opening.centre_m, strict=True)
     ]
-    found = open_shares(at[0], at[1], opening.diameter_m / 2 / side)
+    found = opening.outline.shares(at[0], at[1], side)
     found = found.reshape(TILE, plan.parts, _SQUARES, TILE, plan.parts, _SQUARES)
     found = jnp.transpose(found, (1, 4, 2, 5, 0, 3))
     # Where a pinhole opens the chrome, or where no square is cut, all squares are alike.

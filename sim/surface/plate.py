@@ -16,7 +16,7 @@ from fab.grid import Grid
 from fab.layout.polygons import run_lengths
 from fab.levels import height_of, planes
 from fab.process import MaskDisc, Process, Variation
-from sim.aperture import circle_coverage, displaced_circle_coverage
+from sim.aperture import circle_coverage, displaced_cells, open_cells, outline_of
 from sim.camera import Camera, SpectralLine
 from sim.metrics import in_parts
 from sim.optic import ViewedOptic, height_transmission
@@ -113,7 +113,7 @@ def as_fabricated(
     if not traced and variation.nominal:
         height = jnp.asarray(height_of(level_map, levels).astype(np.float32))
         flat = jnp.stack([height_transmission(height, rate) for rate in rates])
-        coverage = jnp.asarray(circle_coverage(camera.grid, camera.aperture_m))
+        coverage = jnp.asarray(open_cells(camera.grid, camera.opening))
         views = tuple(View(wavelength, 0.0, np.inf) for wavelength in lines)
         return FabricatedDoe(camera, coverage, coverage * flat, views, flat, lines, height)
     if not traced:
@@ -143,7 +143,7 @@ def as_fabricated(
     grid = _parted(camera.grid, plan.parts)
     coverage = _coverage(grid, camera, variation, traced)
     centre = stacked([single(variation.chrome_y_m), single(variation.chrome_x_m)])
-    opening = Opening(coverage, centre, single(camera.aperture_m + variation.chrome_diameter_m))
+    opening = Opening(coverage, centre, outline_of(camera.opening, variation.chrome_diameter_m))
     transmission, means = transmission_of(plan, packed, widths, relief, rates, left, opening, weights)
     found = FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, lines)
     if camera.light == "scalar":
@@ -188,7 +188,7 @@ def drawn_alike(
     plan, views = plan_of(camera, process, variation, drawn.wavelengths_m, depths, traced=False)
     means = jnp.asarray(in_parts(drawn.means, plan.parts))
     grid = _parted(camera.grid, plan.parts)
-    coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
+    coverage = jnp.asarray(open_cells(grid, camera.opening))
     transmission = coverage * means[np.array([number for number, _ in plan.views])]
     return FabricatedDoe(replace(camera, grid=grid), coverage, transmission, views, means, drawn.wavelengths_m)
 
@@ -211,10 +211,9 @@ def _keep_off(etched: UInt8[np.ndarray, "mask y x"], particle: MaskDisc, grid: G
 def _coverage(grid: Grid, camera: Camera, variation: Variation, traced: bool) -> Array:
     chrome = (variation.chrome_y_m, variation.chrome_x_m, variation.chrome_diameter_m)
     if traced or any(chrome):
-        diameter = camera.aperture_m + variation.chrome_diameter_m
-        coverage = displaced_circle_coverage(grid, diameter, chrome[:2])
+        coverage = displaced_cells(grid, camera.opening, variation.chrome_diameter_m, chrome[:2])
     else:
-        coverage = jnp.asarray(circle_coverage(grid, camera.aperture_m))
+        coverage = jnp.asarray(open_cells(grid, camera.opening))
     for hole in variation.pinholes:
         light = circle_coverage(grid, 2 * hole.radius_m, (hole.y_m, hole.x_m))
         coverage = jnp.maximum(coverage, jnp.asarray(light))

@@ -139,7 +139,7 @@ def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int)
     axis holds real and imaginary parts, if there are any. Kinds are those of `moment_weights`: of lines, with edges.
     """
     grid, size = camera.grid, tile * parts
-    count, radius = -(-grid.shape[0] // tile), camera.aperture_m / 2 / grid.pitch_m * parts
+    count, radius = -(-grid.shape[0] // tile), camera.opening.widest_m / 2 / grid.pitch_m * parts
     cells = grid.shape[0] * parts
     place = (np.arange(count * size) - (cells - 1) / 2) / radius
     nodes = np.linspace(-1, 1, _NODES)

@@ -86,9 +86,9 @@ def test_what_an_exr_does_not_say_must_be_given(tmp_path: Path):
     write_height(path, np.zeros((4, 6)), 2e-6, 5e-6)
     height = read_any_height(path)
     assert (height.grid.pitch_m, height.aperture_m) == (2e-6, 5e-6)
-    height = read_any_height(path, pitch_m=3e-6, aperture_m=7e-6)
+    height = read_any_height(path, pitch_m=3e-6, aperture=7e-6)
     assert (height.grid.pitch_m, height.aperture_m) == (3e-6, 7e-6)
-    for wrong in ({"pitch_m": 0.0}, {"aperture_m": 0.0}):
+    for wrong in ({"pitch_m": 0.0}, {"aperture": 0.0}):
         with pytest.raises(InputError, match="positive"):
             read_any_height(path, **wrong)
 

@@ -24,7 +24,7 @@ NOTHING = Obstacle(np.zeros((VIEW, VIEW)))
 
 
 def half_camera() -> Camera:
-    return replace(camera(), grid=Grid((160, 160), RIG.pitch_m), aperture_m=RIG.aperture_m)
+    return replace(camera(), grid=Grid((160, 160), RIG.pitch_m), aperture=RIG.aperture_m)
 
 
 def rough_m() -> np.ndarray:

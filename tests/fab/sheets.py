@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from fab.aperture import RoundAperture
 from fab.grid import Grid
 from fab.layout.marks import alignment_site, die_marks
 from fab.layout.part import moved, photomasks_of, prefixed
@@ -66,7 +67,7 @@ def sheet(
         for plate in plates
     }
     wafer = Wafer(chrome=chrome, zero_layer=zero_layer)
-    given = {"level_map": doe(levels), "opening_m": 4.43e-3, **rest}
+    given = {"level_map": doe(levels), "opening": RoundAperture(4.43e-3), **rest}
     dies = (Die("A1", 0.0, 0.0), Die("A2", 10e-3, 0.0, 'edges of <all> masks "+50 nm"'))
     return RunSheet(
         stem=STEM, photomasks=plates, files=files, process=process, wafer=wafer, places=places, dies=dies,

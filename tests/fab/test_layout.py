@@ -114,7 +114,7 @@ def test_a_layout_holds_each_plane_on_its_layer_and_the_chrome_last(level_map, l
 
 
 def test_the_chrome_reaches_inside_the_aperture_and_past_the_corners(level_map, levels, grid):
-    layout = mask_layout(replace(level_map, aperture_m=25 * UM), "DOE", Chrome(overlap_m=2 * UM))
+    layout = mask_layout(replace(level_map, aperture=25 * UM), "DOE", Chrome(overlap_m=2 * UM))
     vertices = np.concatenate(layout.cells[0].shapes[Layer(5)].polygons).astype(float)
     radius_m = np.hypot(*vertices.T) * layout.dbu_m
     assert radius_m.min() == pytest.approx(10.5 * UM, abs=NM)
@@ -135,7 +135,7 @@ def test_the_chrome_reaches_inside_the_aperture_and_past_the_corners(level_map, 
 )
 def test_impossible_chrome_is_refused(level_map, levels, grid, chrome, rule):
     with pytest.raises(InputError, match=rule):
-        mask_layout(replace(level_map, aperture_m=25 * UM), "DOE", chrome)
+        mask_layout(replace(level_map, aperture=25 * UM), "DOE", chrome)
 
 
 def test_the_rim_of_the_chrome_may_lie_on_the_last_32_bit_coordinate_and_no_further(level_map):
@@ -150,7 +150,7 @@ def test_the_rim_of_the_chrome_may_lie_on_the_last_32_bit_coordinate_and_no_furt
 def test_an_aperture_wider_than_the_raster_is_refused(level_map, levels, grid):
     for aperture_m in (0.0, 50 * UM):
         with pytest.raises(InputError, match="aperture"):
-            mask_layout(replace(level_map, aperture_m=aperture_m), "DOE")
+            mask_layout(replace(level_map, aperture=aperture_m), "DOE")
 
 
 def test_area_and_box_of_shapes():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.figure import png_bytes
 from fab.grid import Grid
@@ -231,7 +232,7 @@ def test_an_order_says_every_depth_and_gives_the_staircase_back(order):
 def test_the_picture_of_an_order_takes_heights_from_the_levels():
     level_map = np.arange(64, dtype=np.uint8).reshape(8, 8) % 4
     pictures = {
-        png_bytes(plot_masks(level_map_from(level_map, levels, 1e-6, 8e-6), (4e-6, 8e-6)))
+        png_bytes(plot_masks(level_map_from(level_map, levels, 1e-6, 8e-6), (RoundAperture(8e-6), 8e-6)))
         for levels in (UNEVEN, SWAPPED, Levels(4, STEP_M))
     }
     assert len(pictures) == 3

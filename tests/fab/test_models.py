@@ -72,6 +72,7 @@ def test_the_wafer_of_an_order(written_order):
     half = np.arcsin(0.325)
     area = 2500 * (np.pi - half + np.sin(half) * np.cos(half))
     assert body["SUBSTRATE"].volume_m3 / MM**3 == pytest.approx(area * 0.5, rel=1e-12)
+    assert isinstance(manifest.chrome.opening_diameter_mm, float)
     inner, outer = manifest.chrome.opening_diameter_mm / 2, manifest.chrome.outer_diameter_mm / 2
     # The STEP has the radii as asked for, the masks on whole nanometres.
     assert body["CHROME"].volume_m3 / MM**3 == pytest.approx(dies * 1e-4 * np.pi * (outer**2 - inner**2), rel=1e-5)

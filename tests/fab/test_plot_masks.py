@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fab.aperture import RoundAperture
 from fab.figure import png_bytes
 from fab.levels import Levels
 from fab.plots.masks import plot_masks
@@ -17,7 +18,7 @@ def test_the_bytes_depend_on_the_masks_alone(count, shape):
     level_map = level_map_from(level, Levels(count, 75 * NM), UM, 3 * UM)
 
     def draw():
-        return plot_masks(level_map, (UM, 600 * UM), "DOE")
+        return plot_masks(level_map, (RoundAperture(2 * UM), 600 * UM), "DOE")
 
     require_whole(draw())
     data = png_bytes(draw())
@@ -29,7 +30,7 @@ def test_the_bytes_depend_on_the_masks_alone(count, shape):
 def test_masks_are_shown_where_they_etch():
     level = np.full((40, 40), 3)
     level[30:, 5:10] = 2  # bit 0 alone, above and left of the middle
-    drawn = plot_masks(level_map_from(level, Levels(4, 300 * NM)), (10 * UM, 50 * UM))
+    drawn = plot_masks(level_map_from(level, Levels(4, 300 * NM)), (RoundAperture(20 * UM), 50 * UM))
     first, second = (panel(drawn, f"mask {k}: etches").images[0] for k in (1, 2))
     x0, x1, y0, y1 = first.get_extent()
     assert (x0, y0) == (-x1, -y1)
@@ -46,4 +47,4 @@ def test_masks_are_shown_where_they_etch():
 
 def test_it_takes_the_place_of_axes():
     level_map = level_map_from(np.random.default_rng(1).integers(0, 4, (20, 20)), Levels(4, 300 * NM))
-    require_place_of_axes(lambda ax: plot_masks(level_map, (10 * UM, 50 * UM), "DOE", ax))
+    require_place_of_axes(lambda ax: plot_masks(level_map, (RoundAperture(20 * UM), 50 * UM), "DOE", ax))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fab.aperture import RoundAperture
 from fab.figure import png_bytes
 from fab.layout.frame import draw_frame
 from fab.layout.geometry import Shapes
@@ -29,7 +30,7 @@ def plot(wafer, ax=None):
         chrome=Shapes(polygons=tuple(annulus_sectors(2_000_000, 4_000_000, 5))),
         dbu_m=1e-9,
     )
-    return plot_wafer(wafer, frame, 4e-3, 1e-9, "plate", ax)
+    return plot_wafer(wafer, frame, RoundAperture(4e-3), 1e-9, "plate", ax)
 
 
 def test_every_relief_is_there_and_the_bytes_repeat():

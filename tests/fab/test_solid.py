@@ -4,6 +4,7 @@ import cadquery
 import numpy as np
 import pytest
 
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.solids.step import step_bodies
 from fab.solids.substrate import (
@@ -20,8 +21,8 @@ from fab.units import MM, NM, UM
 DIE = Substrate("die", 10 * MM, 0.5 * MM)
 WAFER = Substrate("wafer", 100 * MM, 0.5 * MM)
 FLAT = Substrate("wafer", 100 * MM, 0.5 * MM, 32.5 * MM)
-CHROME = ChromeRing(2.195 * MM, 3.7 * MM)
-APERTURE = 4.4 * MM
+CHROME = ChromeRing(RoundAperture(2 * 2.195 * MM), 3.7 * MM)
+APERTURE = RoundAperture(4.4 * MM)
 # The kernel integrates planes and cylinders in closed form; what is left is float64 of millimetres in text.
 CLOSE = 1e-12
 
@@ -30,7 +31,7 @@ def volumes(bodies):
     return {name: body.volume_m3 for name, body in bodies.items()}
 
 
-def some_rings(count=60, aperture_m=APERTURE):
+def some_rings(count=60, aperture_m=APERTURE.diameter_m):
     outer = np.arange(1, count + 1) * aperture_m / 2 / count
     return Rings(outer, np.random.default_rng(5).integers(0, 16, count) * 75 * NM, 1125 * NM)
 
@@ -206,8 +207,8 @@ def test_writing_prints_nothing(tmp_path, capfd):
         (lambda: Substrate("die", MM, math.nan), "substrate thickness"),
         (lambda: Substrate("die", 10 * MM, MM, MM), "a die has none"),
         (lambda: Substrate("wafer", 10 * MM, MM, 10 * MM), "shorter than the diameter"),
-        (lambda: ChromeRing(2 * MM, 2 * MM), "make a ring"),
-        (lambda: ChromeRing(1 * MM, 2 * MM, 0.0), "make a ring"),
+        (lambda: ChromeRing(RoundAperture(2 * 2 * MM), 2 * MM), "make a ring"),
+        (lambda: ChromeRing(RoundAperture(2 * 1 * MM), 2 * MM, 0.0), "make a ring"),
         (lambda: Rings(np.array([2.0, 1.0]) * MM, np.zeros(2), UM), "at least 0.3 nm wide"),
         (lambda: Rings(np.array([MM]), np.zeros(2), UM), "one length"),
         (lambda: Rings(np.array([MM]), np.array([2 * UM]), UM), "heights must lie"),
@@ -220,19 +221,19 @@ def test_impossible_parts_are_refused(make, words):
 
 
 @pytest.mark.parametrize(
-    ("substrate", "aperture_m", "chrome", "rings", "words"),
+    ("substrate", "relief", "chrome", "rings", "words"),
     [
         (DIE, 10 * MM, None, None, "relief"),
         (DIE, -MM, None, None, "relief"),
-        (DIE, APERTURE, ChromeRing(2 * MM, 5.1 * MM), None, "chrome"),
+        (DIE, APERTURE, ChromeRing(RoundAperture(2 * 2 * MM), 5.1 * MM), None, "chrome"),
         (Substrate("wafer", 10 * MM, MM, 8 * MM), APERTURE, CHROME, None, "circle of 6 mm"),
         (DIE, 4.3 * MM, None, some_rings(), "inside the relief"),
         (Substrate("die", 10 * MM, UM), APERTURE, None, some_rings(), "less deep"),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path, substrate, aperture_m, chrome, rings, words):
+def test_what_does_not_fit_is_refused(tmp_path, substrate, relief, chrome, rings, words):
     with pytest.raises(InputError, match=words):
-        substrate_step(tmp_path / "p.step", substrate, aperture_m, chrome, rings)
+        substrate_step(tmp_path / "p.step", substrate, relief, chrome, rings)
     assert not list(tmp_path.iterdir())
 
 

@@ -20,7 +20,7 @@ WAIST = 0.4e-3
 # Four times the waist: the rim cuts off exp(-32) of the light.
 CAMERA = Camera(
     grid=Grid((256, 256), 12.5e-6),
-    aperture_m=3.2e-3,
+    aperture=3.2e-3,
     material="fused_silica",
     colours=(Colour("green", (WAVE,), (1.0,)),),
     focal_length_m=0.2,

@@ -196,7 +196,7 @@ def test_without_errors_it_is_the_drawn_doe_with_edges_bit_for_bit():
 
 def test_errors_that_vanish_lead_to_the_drawn_doe_with_edges():
     """Another sum than that of heights: lines keep second moments and a series of their widths, good to 0.2 nm."""
-    lens = small(aperture_m=1.6 * 64 * CELL)  # no rim, whose cells have moments only where walls move
+    lens = small(aperture=1.6 * 64 * CELL)  # no rim, whose cells have moments only where walls move
     level = np.pad(level_map()[8:-8, 8:-8], 8, constant_values=15)  # and no walls at the border
     drawn = as_fabricated(level, lens, Process(LEVELS), Variation())
     made = as_fabricated(level, lens, Process(LEVELS), Variation(common_depth_scale=1e-7))
@@ -208,7 +208,7 @@ def test_errors_that_vanish_lead_to_the_drawn_doe_with_edges():
 
 
 def test_gradients_go_through_the_light_of_walls():
-    lens, process = small(grid=Grid((32, 32), CELL), aperture_m=32 * CELL, window=64), Process(LEVELS)
+    lens, process = small(grid=Grid((32, 32), CELL), aperture=32 * CELL, window=64), Process(LEVELS)
 
     def spot(value: Any) -> Any:
         errors = Variation(common_depth_scale=value, overlay_x_m=(0.0, 0.3e-6, -0.2e-6 + 1e-5 * value, 0.1e-6))

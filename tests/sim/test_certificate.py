@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fab.aperture import RoundAperture
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
@@ -14,15 +15,15 @@ from sim.rigorous.crossed import travelling_terms
 
 PITCH_M = 1.85e-6
 GRID = Grid((100, 100), PITCH_M)
-APERTURE_M = 100 * PITCH_M
+APERTURE = RoundAperture(100 * PITCH_M)
 GREEN = Colour("green", (552e-9,), (1.0,))
-CAMERA = Camera(GRID, APERTURE_M, "fused_silica", (GREEN,), 8e-3, 3.7e-6, 64)
+CAMERA = Camera(GRID, APERTURE, "fused_silica", (GREEN,), 8e-3, 3.7e-6, 64)
 # Every height says where it is.
 PLACES = np.arange(1e4).reshape(100, 100)
 
 
 def test_rows_lie_on_both_axes_and_on_the_diagonal():
-    rows = cut_rows(PLACES, GRID, APERTURE_M, 8, shares=(0.0, 0.5))
+    rows = cut_rows(PLACES, GRID, APERTURE, 8, shares=(0.0, 0.5))
     assert [row.axis for row in rows] == ["x", "x", "y", "x"]
     firsts = [divmod(int(row.height_m[0]), 100) for row in rows]
     # The middle lies between cells 49 and 50, half way to the rim is 25 cells further, 17.7 along either axis.
@@ -33,19 +34,19 @@ def test_rows_lie_on_both_axes_and_on_the_diagonal():
 
 
 def test_rows_end_at_the_aperture_and_have_relief():
-    at_rim = cut_rows(PLACES, GRID, APERTURE_M, 24, shares=(0.95,))
+    at_rim = cut_rows(PLACES, GRID, APERTURE, 24, shares=(0.95,))
     # Toward the rim 24 cells end at the last one; on the diagonal where the circle does.
     assert [len(row.height_m) for row in at_rim] == [24, 24, 16]
     assert at_rim[0].height_m[-1] == 4999
     stripes = np.tile(np.arange(100.0)[:, None], (1, 100))
-    assert [row.axis for row in cut_rows(stripes, GRID, APERTURE_M, 8)] == ["y"] * 4
-    assert cut_rows(0 * PLACES, GRID, APERTURE_M, 8) == []
+    assert [row.axis for row in cut_rows(stripes, GRID, APERTURE, 8)] == ["y"] * 4
+    assert cut_rows(0 * PLACES, GRID, APERTURE, 8) == []
 
 
 @pytest.fixture(scope="module")
 def certified() -> tuple[CertifiedRow, ...]:
     levels = np.random.default_rng(0).integers(0, 16, (100, 100))
-    rows = cut_rows(75e-9 * levels, GRID, APERTURE_M, 8, shares=(0.0, 0.5))[:2]
+    rows = cut_rows(75e-9 * levels, GRID, APERTURE, 8, shares=(0.0, 0.5))[:2]
     return certify_rows(rows, CAMERA, (552e-9, 656e-9))
 
 
@@ -94,13 +95,13 @@ def test_squares_lie_where_rows_do_and_have_the_highest_walls():
     """Along the row of a place, within its reach; the outermost place first."""
     height = np.zeros((100, 100))
     height[45, 60], height[60, 45] = 5e-7, 6e-7  # near the axes, 11 cells from the middle
-    found = cut_pieces(height, GRID, APERTURE_M, 2, 4, cells=8, shares=(0.0, 0.25))
+    found = cut_pieces(height, GRID, APERTURE, 2, 4, cells=8, shares=(0.0, 0.25))
     assert found == []
     height[49, 60], height[60, 50] = 5e-7, 6e-7
-    squares = cut_pieces(height, GRID, APERTURE_M, 2, 3, cells=8, shares=(0.0, 0.25))
+    squares = cut_pieces(height, GRID, APERTURE, 2, 3, cells=8, shares=(0.0, 0.25))
     # Of the three out of four places the diagonal one is flat, and so is the middle.
     assert [np.max(square.height_m) for square in squares] == [6e-7]
-    squares = cut_pieces(height, GRID, APERTURE_M, 2, 4, cells=8, shares=(0.0, 0.25))
+    squares = cut_pieces(height, GRID, APERTURE, 2, 4, cells=8, shares=(0.0, 0.25))
     assert [np.max(square.height_m) for square in squares] == [6e-7, 5e-7]
     # Of squares as high as each other, the first: the cell is the last of its square.
     np.testing.assert_array_equal(squares[1].height_m, [[0, 5e-7], [0, 0]])
@@ -110,16 +111,16 @@ def test_squares_lie_where_rows_do_and_have_the_highest_walls():
 def test_squares_stay_within_the_aperture_and_the_grid():
     height = np.random.default_rng(1).integers(0, 16, (100, 100)) * 75e-9
     for side in (2, 3, 4):
-        squares = cut_pieces(height, GRID, APERTURE_M, side, 13, cells=24)
+        squares = cut_pieces(height, GRID, APERTURE, side, 13, cells=24)
         assert len(squares) == 13
         for square in squares:
             assert square.height_m.shape == (side, side)
             y, x = (np.array(square.centre_m) / PITCH_M + 50 - side / 2).round().astype(int)
             np.testing.assert_array_equal(square.height_m, height[y : y + side, x : x + side])
             corner = np.abs(square.centre_m) + (side - 1) / 2 * PITCH_M
-            assert np.hypot(*corner) <= APERTURE_M / 2
-    assert cut_pieces(height[:3, :3], Grid((3, 3), PITCH_M), 3 * PITCH_M, 4, 2, cells=24) == []
-    assert cut_pieces(height, GRID, APERTURE_M, 2, 0, cells=24) == []
+            assert np.hypot(*corner) <= APERTURE.diameter_m / 2
+    assert cut_pieces(height[:3, :3], Grid((3, 3), PITCH_M), RoundAperture(3 * PITCH_M), 4, 2, cells=24) == []
+    assert cut_pieces(height, GRID, APERTURE, 2, 0, cells=24) == []
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +129,7 @@ def certified_pieces() -> tuple[CertifiedPiece, ...]:
     pytest.importorskip("fmmax")
     height = np.random.default_rng(0).integers(0, 3, (100, 100)) * 150e-9
     grid = Grid((100, 100), 0.5e-6)
-    squares = cut_pieces(height, grid, 50e-6, 2, 2, cells=4)
+    squares = cut_pieces(height, grid, RoundAperture(50e-6), 2, 2, cells=4)
     return certify_pieces(squares, Camera(grid, 50e-6, "fused_silica", (GREEN,), 8e-3, 3.7e-6, 64), (552e-9,))
 
 

@@ -41,7 +41,7 @@ SAME_LIGHT = 1e-5
 NOTHING = Variation()
 
 
-ROUND = dataclasses.replace(CAMERA, aperture_m=0.9 * CELLS * PITCH_M)
+ROUND = dataclasses.replace(CAMERA, aperture=0.9 * CELLS * PITCH_M)
 
 
 def plate(

@@ -58,6 +58,10 @@ def focus_problems(spec: "Spec") -> Iterator[InputError]:
         if focus.through and getattr(focus, name) is not None:
             rule = "a focus all the way is for all distances and colours alike"
             yield InputError(f"focus.{name}", rule, name, "Remove it, or through.")
+    if not isinstance(spec.doe.aperture_m, float):
+        rule, cure = "foci are made by rings, which fill a round aperture", 'Give its diameter, such as "2 mm".'
+        yield InputError("doe.aperture", rule, str(spec.doe.relief), cure)
+        return
     known = [colour.name for colour in spec.optics.colours]
     for index, name in enumerate(focus.colours or ()):
         if name not in known:
@@ -101,7 +105,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
         # An aperture of which only a ring is lit has a focus of 0.7 of an Airy disc's width, and much light beside it.
         if index < len(focus.distances_m):
             distance = focus.distances_m[index]
-            thinnest = 0.7 * AIRY_WIDTH * shortest * distance / spec.doe.aperture_m
+            thinnest = 0.7 * AIRY_WIDTH * shortest * distance / spec.doe.relief.widest_m
             if width < thinnest:
                 rule = f"this aperture focuses light to {thinnest / UM:.3g} um at least at {format_length(distance)}"
                 cure = "Choose a wider one, or a larger aperture."

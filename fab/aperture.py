@@ -1,0 +1,219 @@
+"""Aperture: the outline of what is open, or of what has relief, about the centre of a raster; round or rectangular.
+
+The relief of a DOE fills one, and light passes another, the opening of the chrome, which is smaller by the overlap.
+Whoever needs cells, areas or outlines asks an aperture for them, whatever its kind. In files and texts a round one is
+its diameter and a rectangular one [width, height], along x and along y.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fab.errors import InputError
+from fab.grid import Grid
+from fab.units import format_length
+
+# Pixels whose centre is exactly on the rim count as inside.
+_SLACK = 1e-12
+
+
+class Aperture(ABC):
+    """An outline about the origin."""
+
+    @property
+    @abstractmethod
+    def extent_m(self) -> tuple[float, float]:
+        """Height and width ``(y, x)`` of the smallest box around it, metres."""
+
+    @property
+    @abstractmethod
+    def reach_m(self) -> float:
+        """Distance of its farthest point from the origin, metres."""
+
+    @abstractmethod
+    def area_in(self, pitch_m: float, times: int = 1) -> float:
+        """Area in squares of an edge, metres; of so many of them."""
+
+    @abstractmethod
+    def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Whether points, broadcast against each other, lie inside or on the rim."""
+
+    @abstractmethod
+    def inside(self, grid: Grid) -> NDArray[np.bool_]:
+        """Return ``[y, x]`` true where a pixel's centre lies inside or on the rim."""
+
+    @abstractmethod
+    def count_inside(self, grid: Grid) -> int:
+        """Return the number of pixels that are `inside`, without drawing them."""
+
+    @abstractmethod
+    def shrunk(self, by_m: float) -> "Aperture":
+        """The same with its rim moved inward, metres."""
+
+    @abstractmethod
+    def outline_m(self, corners: int) -> NDArray[np.float64]:
+        """Return the corners x, y ``(n, 2)`` of its outline, metres; so many where it is round."""
+
+    @property
+    @abstractmethod
+    def sizes_m(self) -> tuple[float, ...]:
+        """Lengths by which people call it, metres: its diameter, or width and height."""
+
+    def record(self, unit_m: float = 1.0, digits: int | None = None) -> Any:
+        """Return it as a value of JSON, in multiples of a unit, rounded to some digits; `aperture_from` reads it."""
+        lengths = [size if unit_m == 1.0 else size / unit_m for size in self.sizes_m]
+        lengths = lengths if digits is None else [round(length, digits) for length in lengths]
+        return lengths if len(lengths) > 1 else lengths[0]
+
+    def __str__(self) -> str:
+        """Return "4.44 mm", or "2 mm x 1 mm" with the width first."""
+        return " x ".join(map(format_length, self.sizes_m))
+
+    @property
+    def area_m2(self) -> float:
+        """Area, square metres."""
+        return self.area_in(1.0)
+
+    @property
+    def widest_m(self) -> float:
+        """Longer side of the box around it, metres; the diameter of a round one."""
+        return max(self.extent_m)
+
+    @property
+    def narrowest_m(self) -> float:
+        """Shorter side of the box around it, metres; the diameter of a round one."""
+        return min(self.extent_m)
+
+
+@dataclass(frozen=True)
+class RoundAperture(Aperture):
+    """A disc; of infinite diameter where all of a raster is meant, as in a piece that was cut out of a DOE."""
+
+    diameter_m: float
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """The diameter, twice."""
+        return self.diameter_m, self.diameter_m
+
+    @property
+    def reach_m(self) -> float:
+        """The radius."""
+        return self.diameter_m / 2
+
+    def area_in(self, pitch_m: float, times: int = 1) -> float:
+        """Area of the disc."""
+        return times * np.pi * (self.diameter_m / pitch_m) ** 2 / 4
+
+    def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """By the distance from the middle."""
+        return y_m**2 + x_m**2 <= (self.diameter_m / 2) ** 2
+
+    def inside(self, grid: Grid) -> NDArray[np.bool_]:
+        """Pixels of the disc."""
+        return grid.inside_circle(self.diameter_m)
+
+    def count_inside(self, grid: Grid) -> int:
+        """Number of pixels of the disc."""
+        return grid.count_inside_circle(self.diameter_m)
+
+    def shrunk(self, by_m: float) -> "RoundAperture":
+        """A disc whose diameter is smaller by twice as much."""
+        return RoundAperture(self.diameter_m - 2 * by_m)
+
+    def outline_m(self, corners: int) -> NDArray[np.float64]:
+        """A regular polygon with its corners on the circle."""
+        angle = (np.arange(corners) + 0.5) * 2 * np.pi / corners
+        return self.diameter_m / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    @property
+    def sizes_m(self) -> tuple[float, ...]:
+        """The diameter."""
+        return (self.diameter_m,)
+
+
+@dataclass(frozen=True)
+class RectangularAperture(Aperture):
+    """A rectangle.
+
+    Attributes:
+        size_m: height and width ``(y, x)``, metres.
+    """
+
+    size_m: tuple[float, float]
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Its sides."""
+        return self.size_m
+
+    @property
+    def reach_m(self) -> float:
+        """Half the diagonal."""
+        return math.hypot(*self.size_m) / 2
+
+    def area_in(self, pitch_m: float, times: int = 1) -> float:
+        """Product of the sides."""
+        return times * (self.size_m[0] / pitch_m) * (self.size_m[1] / pitch_m)
+
+    def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """By the distances from the axes."""
+        half_y, half_x = (side / 2 * (1 + _SLACK) for side in self.size_m)
+        return (np.abs(y_m) <= half_y) & (np.abs(x_m) <= half_x)
+
+    def inside(self, grid: Grid) -> NDArray[np.bool_]:
+        """Pixels of the rectangle."""
+        return self.contains(grid.axis_m("y")[:, None], grid.axis_m("x")[None, :])
+
+    def count_inside(self, grid: Grid) -> int:
+        """Number of pixels of the rectangle."""
+        rows = self.contains(grid.axis_m("y"), np.zeros(1))
+        columns = self.contains(np.zeros(1), grid.axis_m("x"))
+        return int(np.count_nonzero(rows)) * int(np.count_nonzero(columns))
+
+    def shrunk(self, by_m: float) -> "RectangularAperture":
+        """A rectangle whose sides are smaller by twice as much."""
+        return RectangularAperture((self.size_m[0] - 2 * by_m, self.size_m[1] - 2 * by_m))
+
+    def outline_m(self, corners: int) -> NDArray[np.float64]:
+        """Its four corners, counter-clockwise from the lowest."""
+        half_y, half_x = (side / 2 for side in self.size_m)
+        return np.array([(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)])
+
+    @property
+    def sizes_m(self) -> tuple[float, ...]:
+        """Width and height."""
+        return self.size_m[::-1]
+
+
+def aperture_from(value: Any, unit_m: float = 1.0, digits: int | None = None) -> Aperture:
+    """Return an aperture from itself, a diameter, or [width, height]: numbers of a unit, rounded to digits of a metre.
+
+    Raises:
+        InputError: a list of more or fewer numbers.
+        TypeError or ValueError: something that is no number.
+    """
+    if isinstance(value, Aperture):
+        return value
+    given = value if isinstance(value, list | tuple) else [value]
+    sizes = [float(size) if unit_m == 1.0 else float(size) * unit_m for size in given]
+    sizes = sizes if digits is None else [round(size, digits) for size in sizes]
+    if len(sizes) not in (1, 2):
+        raise InputError("aperture", "must be a diameter or [width, height]", repr(value), "Give one or two lengths.")
+    return RoundAperture(sizes[0]) if len(sizes) == 1 else RectangularAperture((sizes[1], sizes[0]))
+
+
+def diameter_of(aperture: Aperture) -> float:
+    """Return the diameter of a round `aperture`, metres, for what can do with no other.
+
+    Raises:
+        InputError: it has another shape.
+    """
+    if isinstance(aperture, RoundAperture):
+        return aperture.diameter_m
+    cure = "Give a diameter as the aperture, or leave out what needs a round one."
+    raise InputError("aperture", "must be round here", str(aperture), cure)

@@ -1,0 +1,154 @@
+"""An order whose chrome has a rectangular opening: drawn, read back by other libraries, and proved."""
+
+import math
+import shutil
+from dataclasses import replace
+
+import gdstk
+import numpy as np
+import pytest
+from klayout import db
+
+from fab.aperture import RectangularAperture
+from fab.gds.reader import read_gds
+from fab.gds.writer import write_gds
+from fab.grid import Grid
+from fab.layout.geometry import Layer, Shapes
+from fab.layout.polygons import MAX_VERTICES, frame_around_box, sectors_around_square
+from fab.level_map import LevelMap
+from fab.levels import Levels
+from fab.manifest.records import read_manifest
+from fab.order.order import plan_order
+from fab.order.verify import verify
+from fab.order.write import write_planned
+from fab.solids.step import step_bodies
+from tests.fab.maps import FEW, PLAIN
+from tests.fab.mended import mend, told
+
+UM, MM = 1e-6, 1e-3
+LEVELS = Levels(4, 0.3e-6)
+GRID = Grid((30, 40), 2 * UM)
+RELIEF = RectangularAperture((60 * UM, 80 * UM))
+OPENING_UM = (70.0, 50.0)  # less twice the overlap of 5 um
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    level = np.random.default_rng(5).integers(0, 4, GRID.shape).astype(np.uint8)
+    folder = tmp_path_factory.mktemp("orders") / "slit"
+    slit = LevelMap(level, LEVELS, GRID, RELIEF, "slit")
+    write_planned(folder, plan_order(slit, wafer=FEW, formats=PLAIN, papers=True))
+    return folder
+
+
+def hole_of(region):
+    """The one hole of a region without overlaps."""
+    (merged,) = region.merged().each()
+    assert merged.holes() == 1
+    return db.Polygon(list(merged.each_point_hole(0)))
+
+
+@pytest.mark.parametrize(
+    ("half_x", "half_y", "outer", "chord"),
+    [(35_000, 25_000, 600_000, 5), (100, 100, 200, 1), (90_001, 7, 150_003, 0.5), (3, 2_000_000, 3_500_000, 5)],
+)
+def test_sectors_around_a_rectangle_leave_exactly_it(half_x, half_y, outer, chord):
+    half = max(half_x, half_y) + 3
+    sectors = sectors_around_square(half, outer, chord)
+    assert len(sectors) % 4 == 0
+    sectors += frame_around_box(half_x, half_y, half)
+    assert max(map(len, sectors)) <= MAX_VERTICES
+    region = db.Region()
+    region.merged_semantics = False
+    for sector in sectors:
+        region.insert(db.Polygon([db.Point(*vertex) for vertex in sector.tolist()]))
+    (whole,) = region.merged().each()
+    assert Shapes(polygons=tuple(sectors)).doubled_area == whole.area2()  # no overlap
+    assert hole_of(region) == db.Polygon(db.Box(-half_x, -half_y, half_x, half_y))
+    circle = math.pi * outer**2
+    assert region.area() + 4 * half_x * half_y == pytest.approx(circle, abs=2 * math.pi * outer * (chord + 1))
+    with pytest.raises(ValueError, match="around the square"):
+        sectors_around_square(half, math.floor(math.hypot(half, half)), chord)
+
+
+def test_another_library_sees_the_rectangle_where_it_should_be(written):
+    chrome = read_manifest(written).chrome
+    assert chrome.opening_diameter_mm == [0.07, 0.05]
+    library = gdstk.read_gds(str(written / chrome.file))
+    (cell,) = (cell for cell in library.cells if cell.name == read_manifest(written).doe_cell)
+    outer = gdstk.ellipse((0, 0), chrome.outer_diameter_mm / 2 * 1e3, tolerance=1e-5)
+    drawn = [polygon for polygon in cell.polygons if polygon.layer == chrome.layer]
+    (opening,) = gdstk.boolean(gdstk.rectangle((-200, -200), (200, 200)), drawn, "not", precision=1e-4)
+    assert opening.area() == pytest.approx(OPENING_UM[0] * OPENING_UM[1], rel=1e-9)
+    np.testing.assert_allclose(opening.bounding_box(), [(-35, -25), (35, 25)], atol=1e-9)
+    area = sum(polygon.area() for polygon in drawn)
+    # Chords leave the circle by up to 5 nm.
+    assert area == pytest.approx(outer.area() - 3500, abs=2 * math.pi * 600 * 5e-3)
+    assert chrome.area_um2 == pytest.approx(area, rel=1e-9)
+
+
+def test_the_order_is_proved_from_its_files_and_its_request(written):
+    report = verify(written)
+    assert report.differences == ()
+    manifest = read_manifest(written)
+    assert manifest.aperture_mm == [0.08, 0.06]
+    assert manifest.relief.extent_m == pytest.approx(RELIEF.extent_m, rel=1e-12)
+    assert manifest.request["level_map"]["aperture_m"] == [80 * UM, 60 * UM]
+
+
+def test_solids_have_the_volumes_of_the_rectangle(written):
+    manifest = read_manifest(written)
+    plate = next(written.glob("*_PLATE.step"))
+    bodies = step_bodies(plate)
+    outer = manifest.chrome.outer_diameter_mm / 2
+    wanted = (math.pi * outer**2 - 0.07 * 0.05) * 1e-4
+    assert bodies["CHROME"].volume_m3 / MM**3 == pytest.approx(wanted, rel=1e-9)
+    wafer = step_bodies(next(written.glob("*_WAFER.step")))
+    assert wafer["CHROME"].volume_m3 / MM**3 == pytest.approx(9 * wanted, rel=1e-9)
+    text = plate.read_text()
+    # The outline of the relief, a face of its own on the surface.
+    assert text.count("'DATUM_RELIEF'") > 0
+    assert "CYLINDRICAL_SURFACE" in text  # of the chrome's rim
+
+
+def test_the_run_sheet_asks_for_width_and_height(written):
+    import json
+
+    sheet = json.loads(next(written.glob("*_RUNSHEET.json")).read_text())
+    assert sheet["opening_um"] == [70.0, 50.0]
+    assert {"opening_width_um", "opening_height_um"} <= sheet["measured"]["chrome"].keys()
+    assert "width and height; target 70.0 and 50.0" in next(written.glob("*_RUNSHEET.html")).read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: np.where(p == 35_000, 34_000, p), "leaves its outline by 1e+03 nm"),
+        (lambda p: np.where(p == -25_000, -25_001, p), "lie on neither of the two outlines"),
+        (lambda p: p[~np.all(np.abs(p) == [35_000, 25_000], axis=1)], "leaves its outline by"),
+    ],
+    ids=["narrower", "a unit higher", "without corners"],
+)
+def test_a_forged_opening_is_refused(written, tmp_path, change, words):
+    folder = shutil.copytree(written, tmp_path / "order")
+    manifest = read_manifest(folder)
+    path, layer = folder / manifest.chrome.file, Layer(manifest.chrome.layer)
+    layout = read_gds(path)
+
+    def forged(cell):
+        if cell.name != manifest.doe_cell:
+            return cell
+        polygons = tuple(change(polygon).astype(np.int32) for polygon in cell.shapes[layer].polygons)
+        return replace(cell, shapes={**cell.shapes, layer: Shapes(polygons=polygons)})
+
+    write_gds(path, replace(layout, cells=tuple(map(forged, layout.cells))))
+    mend(folder, path.name)
+    assert words in told(folder, path.name)
+
+
+def test_a_manifest_that_states_another_opening_is_refused(written, tmp_path):
+    from tests.fab.mended import restate
+
+    folder = shutil.copytree(written, tmp_path / "order")
+    restate(folder, lambda m: replace(m, chrome=replace(m.chrome, opening_diameter_mm=[0.08, 0.06])))
+    assert any("opening_diameter_mm" in difference for difference in verify(folder).differences)
