@@ -69,7 +69,7 @@ def spec_of(name: str) -> Spec:
 def make_training(spec: Spec) -> tuple[Trainer, JointState, Batch]:
     """A training, its first state, and a scene."""
     rng = np.random.default_rng(0)
-    height = 1e-6 * rng.random((spec.doe.samples, spec.doe.samples), np.float32)
+    height = 1e-6 * rng.random(spec.doe.shape, np.float32)
     trainer = Trainer.of(spec, "", occlusion_from_spec(spec, ""), obstruction_from_spec(spec, ""), height)
     size = spec.train.size
     background, radiance = (rng.random((3, size, size), np.float32) for _ in range(2))
@@ -112,7 +112,7 @@ def transforms(count: int, length: int, forth: bool = True) -> Call:
 
 def optics_floor(spec: Spec) -> list[Call]:
     """One complex transform of all cells for every line, depth and direction."""
-    cells = jnp.ones((spec.doe.samples, spec.doe.samples), jnp.complex64)
+    cells = jnp.ones(spec.doe.shape, jnp.complex64)
     run = jax.jit(jnp.fft.fft2)
     lines = sum(len(colour.wavelengths_m) for colour in spec.optics.colours)
     return [lambda: run(cells).block_until_ready()] * (lines * 2 * 2)

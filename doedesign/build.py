@@ -37,7 +37,7 @@ _EVENTS = ("particles_per_m2", "pinholes_per_m2", "missed", "doubled")
 def camera_from_spec(spec: Spec) -> Camera:
     """Return lens, sensor, substrate and DOE grid of a spec."""
     return Camera(
-        grid=Grid((spec.doe.samples, spec.doe.samples), spec.doe.pitch_m),
+        grid=Grid(spec.doe.shape, spec.doe.pitch_m),
         # Light passes the opening in the chrome, which is smaller than what is etched.
         aperture=spec.doe.relief.shrunk(spec.process.chrome_overlap_m),
         material=spec.doe.material,

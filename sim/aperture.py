@@ -49,7 +49,7 @@ def circle_coverage(
     return coverage
 
 
-class Disc(NamedTuple):
+class RoundOutline(NamedTuple):
     """A round outline, as numbers that may be traced."""
 
     diameter_m: Any
@@ -59,21 +59,21 @@ class Disc(NamedTuple):
         return open_shares(y, x, self.diameter_m / 2 / side_m, xp)
 
 
-class Box(NamedTuple):
+class BoxOutline(NamedTuple):
     """A rectangular outline, height and width, as numbers that may be traced."""
 
     size_m: Any
 
     def shares(self, y: Any, x: Any, side_m: Any, xp: Any = jnp) -> Any:
-        """The same as of a `Disc`; exact."""
+        """The same as of a `RoundOutline`; exact."""
         return box_shares(y, x, (self.size_m[0] / 2 / side_m, self.size_m[1] / 2 / side_m), xp)
 
 
-def outline_of(aperture: Aperture, wider_m: Array | float = 0.0) -> Disc | Box:
+def outline_of(aperture: Aperture, wider_m: Array | float = 0.0) -> RoundOutline | BoxOutline:
     """The outline of an aperture whose sizes are larger by some length, metres; perhaps traced."""
     if isinstance(aperture, RoundAperture):
-        return Disc(single(aperture.diameter_m + wider_m))
-    return Box(stacked([single(side_m + wider_m) for side_m in aperture.extent_m]))
+        return RoundOutline(single(aperture.diameter_m + wider_m))
+    return BoxOutline(stacked([single(side_m + wider_m) for side_m in aperture.extent_m]))
 
 
 def displaced_cells(

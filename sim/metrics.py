@@ -162,11 +162,11 @@ def strehl(doe: CellOptic, nominal: CellOptic) -> Float[np.ndarray, " w"] | Floa
 
     The cells of `doe` and those of `nominal` may be parts of those that were drawn.
     """
-    own, other = doe.camera.grid.shape[0], nominal.camera.grid.shape[0]
-    xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(own, other)
+    (ny, nx), other = doe.camera.grid.shape, nominal.camera.grid.shape[0]
+    xp, common = jnp if is_traced(doe.means, nominal.means, doe.coverage) else np, math.lcm(ny, other)
     meant = in_parts(xp.conj(xp.asarray(nominal.means)), common // other)
-    if common > own:
-        meant = meant.reshape(len(meant), own, common // own, own, common // own).mean((2, 4))
+    if (parts := common // ny) > 1:
+        meant = meant.reshape(len(meant), ny, parts, nx, parts).mean((2, 4))
     return abs(_mean_over_aperture(doe, xp.asarray(doe.means) * meant)) ** 2
 
 
@@ -193,20 +193,20 @@ def _band_energy(field: Complex[np.ndarray, "y x"], slope: float, band: float = 
     The factor sinc(nu - slope x) of a cell is interpolated between three directions, exact to 1e-3 up to a sixth of the
     band, so nine transforms take the place of one sum per cell.
     """
-    cells = field.shape[0]
-    x, nu = np.arange(cells) - (cells - 1) / 2, np.fft.fftfreq(cells)
-    reach = slope * cells / 2
+    reach = slope * max(field.shape) / 2
     nodes = reach * np.cos(np.pi * np.array([1, 3, 5]) / 6) if slope else np.zeros(1)
-    lit = slope * x
-    shares = [np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells) for a in nodes]
-    seen = [np.sinc(nu - a) for a in nodes]
+    axes = []
+    for cells in field.shape:
+        lit, nu = slope * (np.arange(cells) - (cells - 1) / 2), np.fft.fftfreq(cells)
+        shares = [np.prod([(lit - b) / (a - b) for b in nodes if b != a], axis=0) * np.ones(cells) for a in nodes]
+        axes.append((shares, [np.sinc(nu - a) for a in nodes], (nu >= -band) & (nu < band)))
+    (shares_y, seen_ys, inside_y), (shares_x, seen_xs, inside_x) = axes
     total = np.zeros(field.shape, np.complex64)
-    for share_y, seen_y in zip(shares, seen, strict=True):
-        for share_x, seen_x in zip(shares, seen, strict=True):
+    for share_y, seen_y in zip(shares_y, seen_ys, strict=True):
+        for share_x, seen_x in zip(shares_x, seen_xs, strict=True):
             part = field * (share_y[:, None] * share_x).astype(np.float32)
             total += np.asarray(fft2(part, workers=-1)) * (seen_y[:, None] * seen_x).astype(np.float32)
-    inside = (nu >= -band) & (nu < band)
-    return float(np.sum(np.square(np.abs(total[np.ix_(inside, inside)])), dtype=np.float64))
+    return float(np.sum(np.square(np.abs(total[np.ix_(inside_y, inside_x)])), dtype=np.float64))
 
 
 def energy_budget(

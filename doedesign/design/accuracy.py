@@ -96,24 +96,24 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     extent = camera.window * camera.pixel_m / camera.sensor_distance_m / wavelength  # waves per metre
     waves = [((np.arange(_SIDE) + rng.random(_SIDE)) / _SIDE - 0.5) * extent for _ in "yx"]
     waves = [one - moved / wavelength for one, moved in zip(waves, camera.moved_sines(), strict=True)]
-    axis = camera.grid.axis_m("x")
+    axis_y, axis_x = camera.grid.axis_m("y"), camera.grid.axis_m("x")
     bend = 0.0 if np.isinf(depth_m) else 1 / depth_m
     bend += 0.0 if camera.in_angles else 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
 
-    def kernel(seen: np.ndarray) -> np.ndarray:
+    def kernel(seen: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Far field of the cells of a row in some directions; cells farther from the axis are lit more obliquely."""
         oblique = np.sinc(pitch * (seen - bend * axis[:, None] / wavelength))
         return np.exp(-2j * np.pi * axis[:, None] * seen) * oblique
 
     coverage = np.asarray(optic.coverage, np.float64)
     field = np.asarray(optic.field(line, depth_m), np.complex128)
-    whole = kernel(waves[0]).T @ field @ kernel(waves[1])
+    whole = kernel(waves[0], axis_y).T @ field @ kernel(waves[1], axis_x)
     y, x = np.nonzero((coverage > 0) & (coverage < 1))
     inside = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
-    at_y = np.broadcast_to(axis[y][:, None, None] + inside[:, None] * pitch, (len(y), _PARTS, _PARTS))
-    at_x = np.broadcast_to(axis[x][:, None, None] + inside[None, :] * pitch, at_y.shape)
+    at_y = np.broadcast_to(axis_y[y][:, None, None] + inside[:, None] * pitch, (len(y), _PARTS, _PARTS))
+    at_x = np.broadcast_to(axis_x[x][:, None, None] + inside[None, :] * pitch, at_y.shape)
     open_ = camera.opening.contains(at_y, at_x)
-    path = path_at_m(camera, at_y, at_x, depth_m) - path_at_m(camera, axis[y], axis[x], depth_m)[:, None, None]
+    path = path_at_m(camera, at_y, at_x, depth_m) - path_at_m(camera, axis_y[y], axis_x[x], depth_m)[:, None, None]
     # Within a cell the field has its source's phase.
     passed = (field[y, x] / coverage[y, x])[:, None, None] * np.exp(2j * np.pi * path / wavelength)
     more = (open_ - coverage[y, x][:, None, None]) * passed / _PARTS**2

@@ -59,12 +59,20 @@ def _light(spec: Spec) -> Iterator[InputError]:
 
 def _doe(spec: Spec) -> Iterator[InputError]:
     doe, overlap = spec.doe, spec.process.chrome_overlap_m
-    span_m, aperture, widest_m = doe.samples * doe.pitch_m, str(doe.relief), doe.relief.widest_m
+    relief, aperture = doe.relief, str(doe.relief)
+    # As many cells per side span the longer side of a rectangle; of two numbers each spans its own.
+    sides = relief.extent_m if isinstance(doe.samples, tuple) else (relief.widest_m,)
     # One part in a million of slack, for values that lie on the limit in decimal.
-    if abs(widest_m - span_m) > doe.pitch_m / 2 * (1 + 1e-6):
-        span = format_length(span_m)
-        rule = f"must equal samples x pitch = {doe.samples} x {format_length(doe.pitch_m)} = {span}"
-        cure = f'Set aperture = "{span}" or samples = {max(2, round(widest_m / doe.pitch_m))}.'
+    spanned = zip(sides, doe.shape, strict=False)
+    if any(abs(side - n * doe.pitch_m) > doe.pitch_m / 2 * (1 + 1e-6) for side, n in spanned):
+        spans = [format_length(n * doe.pitch_m) for n in reversed(doe.shape)][: len(sides)]
+        counts: list[int] | int = [max(2, round(side / doe.pitch_m)) for side in reversed(sides)]
+        given: list[int] | int = list(doe.samples) if isinstance(doe.samples, tuple) else doe.samples
+        wanted = f'["{spans[0]}", "{spans[-1]}"]'
+        if isinstance(given, int):
+            counts, wanted = counts[0], f'"{spans[0]}"'
+        rule = f"must equal samples x pitch = {given} x {format_length(doe.pitch_m)} = {' x '.join(spans)}"
+        cure = f"Set aperture = {wanted} or samples = {counts}."
         yield InputError("doe.aperture", f"{rule} to within half a pitch", aperture, cure)
     if spec.optimize.parametrization == "radial" and not isinstance(doe.aperture_m, float):
         rule, cure = "rings fill a round aperture", 'Use "freeform", or give the diameter of the aperture.'
@@ -191,7 +199,7 @@ def _shortest_m(spec: Spec) -> float:
 
 def _nyquist_length_m(spec: Spec) -> float:
     """Radius of the strongest wavefront curvature the cells can sample (paper eq. 6), at the shortest wavelength."""
-    return spec.doe.samples * spec.doe.pitch_m**2 / _shortest_m(spec)
+    return max(spec.doe.shape) * spec.doe.pitch_m**2 / _shortest_m(spec)
 
 
 def _rounded(length_m: float) -> str:
@@ -244,7 +252,7 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
     wavelength_m, focal_m, needed_m = _shortest_m(spec), spec.optics.focal_length_m, _nyquist_length_m(spec)
     if spec.optics.propagation != "fresnel" or focal_m is None or needed_m <= focal_m:
         return
-    span_m = spec.doe.samples * spec.doe.pitch_m
+    span_m = max(spec.doe.shape) * spec.doe.pitch_m
     samples = math.ceil(span_m**2 / (wavelength_m * focal_m))
     samples += samples % 2
     yield InputError(

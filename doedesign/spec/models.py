@@ -174,6 +174,19 @@ def _aperture_sizes(value: Any, info: ValidationInfo) -> Any:
     return tuple(_SIZE(size, info) for size in value)
 
 
+def _cell_counts(value: Any) -> Any:
+    """One whole number, or two of them."""
+    counts = value if isinstance(value, list | tuple) else [value]
+    example = "For example 2400, or [2400, 1200]."
+    if any(not isinstance(n, int) or isinstance(n, bool) for n in counts) or len(counts) != (1 + (counts is value)):
+        raise broken("must be a whole number, or two of them, [along x, along y]", example)
+    for rule, broke in (("must be at least 2", min(counts) < 2), ("must be at most 20000", max(counts) > 20000)):
+        if broke:
+            raise broken(rule, example)
+    return tuple(counts) if counts is value else value
+
+
+Samples = Annotated[int | tuple[int, int], BeforeValidator(_cell_counts)]
 ApertureSizes = Annotated[float | tuple[float, float], BeforeValidator(_aperture_sizes)]
 
 
@@ -181,17 +194,22 @@ class DoeSpec(SpecTable, frozen=True):
     """The DOE.
 
     Attributes:
-        samples: cells per side, N.
+        samples: cells per side, or [along x, along y] of a plate that is not square.
         pitch_m: edge of a cell.
-        aperture_m: diameter of the relief, or [width, height] of a rectangle; N cells must span it, or its longer side,
-            to within half a pitch.
+        aperture_m: diameter of the relief, or [width, height] of a rectangle. The cells must span it to within half a
+            pitch; as many per side its longer side.
         material: substrate, a key of `sim.material.MATERIALS`.
     """
 
-    samples: Annotated[int, Field(strict=True, ge=2, le=20000, examples=["2400"])]
+    samples: Samples = Field(examples=["2400"])
     pitch_m: Pitch = Field(examples=['"1.85 um"'])
     aperture_m: ApertureSizes = Field(examples=['"4.44 mm"'])
     material: Annotated[str, known("material", MATERIALS)] = Field(examples=['"fused_silica"'])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells (ny, nx)."""
+        return (self.samples, self.samples) if isinstance(self.samples, int) else self.samples[::-1]
 
     @property
     def relief(self) -> Aperture:

@@ -11,6 +11,7 @@ from jaxtyping import Complex, Float
 
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
+from fab.aperture import RoundAperture
 from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
@@ -180,8 +181,9 @@ def order_table(
     Args:
         optic: the DOE; its first wavelength is looked at.
         spots: where light should go.
-        period_m: side of a unit cell that is repeated. Only whole periods in a square within the aperture are looked
-            at, as if there were no end of them: behind a round aperture the feet of bright neighbours add to a peak.
+        period_m: side of a unit cell that is repeated. Only whole periods within the aperture, in a square if it is
+            round, are looked at, as if there were no end of them: behind a round aperture the feet of bright neighbours
+            add to a peak.
         count: columns and rows of a grid of equal spots, for the ceiling.
         levels: levels of the DOE, for the ceiling.
         depth_m: distance of the source.
@@ -197,7 +199,7 @@ def order_table(
         light = camera.irradiance(line.wavelength_m)
         field, coverage = field * light, coverage * light
     if period_m is not None:
-        field, coverage, grid = _whole_periods(field, coverage, grid, period_m)
+        field, coverage, grid = _whole_periods(field, coverage, camera, period_m)
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
     found = efficiencies(field, coverage, grid, np.concatenate(asked))
     own, zeroth, rest = np.split(found, [spots.count, spots.count + 1])
@@ -216,15 +218,18 @@ def order_table(
 
 
 def _whole_periods(
-    field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], grid: Grid, period_m: float
+    field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], camera: Camera, period_m: float
 ) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid]:
-    """Field, open share and grid of as many whole periods as fit into the square within the opening, at least one."""
-    period = round(period_m / grid.pitch_m)
-    open_ = np.count_nonzero(coverage[len(coverage) // 2] > 0.999)
-    side = period * max(1, int(open_ / np.sqrt(2)) // period)
-    first = [(n - side) // 2 for n in grid.shape]
-    block = tuple(slice(at, at + side) for at in first)
-    return field[block], coverage[block], Grid((side, side), grid.pitch_m)
+    """Field, open share and grid of as many whole periods as fit into the opening, or the square within a round one."""
+    grid = camera.grid
+    period, within = round(period_m / grid.pitch_m), 1.0
+    if isinstance(camera.opening, RoundAperture):
+        within = np.sqrt(2)
+    open_ = [np.count_nonzero(line > 0.999) for line in (coverage[:, grid.shape[1] // 2], coverage[grid.shape[0] // 2])]
+    height, width = (period * max(1, int(count / within) // period) for count in open_)
+    first = [(n - side) // 2 for n, side in zip(grid.shape, (height, width), strict=True)]
+    block = tuple(slice(at, at + side) for at, side in zip(first, (height, width), strict=True))
+    return field[block], coverage[block], Grid((height, width), grid.pitch_m)
 
 
 def _stray(spots: Spots) -> Float[np.ndarray, "n 2"]:

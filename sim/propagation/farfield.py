@@ -68,7 +68,7 @@ class FarField(eqx.Module):
     coarsen: Banded | None
     # Phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`)
     tilt: tuple[Complex[Array, " cell"], Complex[Array, " cell"]] | None
-    cells: int = eqx.field(static=True)  # DOE cells per axis
+    cells: tuple[int, int] = eqx.field(static=True)  # DOE cells (y, x)
     length: int = eqx.field(static=True)  # transform length per axis
     kept: int = eqx.field(static=True)  # samples of the field kept around the axis
     blocks: tuple[int, int] = eqx.field(static=True)  # rows per block in the pupil and on the sensor
@@ -109,7 +109,7 @@ def plan_far_field(
     """Prepare the transform of one wavelength and depth. Kept, for every DOE of a tolerance study needs the same few.
 
     Args:
-        camera: DOE grid (square), aperture, lens and sensor.
+        camera: DOE grid, aperture, lens and sensor.
         wavelength_m: vacuum wavelength.
         depth_m: source depth; without influence below a `sampling` of 2, where the cell's sinc stays centred on the
             axis.
@@ -121,8 +121,6 @@ def plan_far_field(
         room: by how much `bent` may turn, shear or stretch the image, a share; 0 is for a sensor that is perfect.
     """
     ny, nx = camera.grid.shape
-    if ny != nx:
-        raise ValueError(f"`camera.grid` must be square, but got {camera.grid.shape}")
     is_round = isinstance(camera.opening, RoundAperture)
     if sampling is None:
         airy = wavelength_m * camera.sensor_distance_m / camera.opening.widest_m
@@ -134,7 +132,7 @@ def plan_far_field(
     # Below two samples the intensity is aliased whatever is done, and the bare transform is the cheapest estimate.
     bare = sampling < 2
     needed = (sampling if bare else _FIELD_SAMPLING) * aperture / pitch
-    length = cast(int, next_fast_len(max(nx, int(np.ceil(needed - 1e-9))), real=True))
+    length = cast(int, next_fast_len(max(ny, nx, int(np.ceil(needed - 1e-9))), real=True))
     spacing = scale / (length * pitch)
     fine = spacing if bare else scale / (sampling * aperture)
     width = camera.pixel_m * camera.fill / fine
@@ -171,10 +169,10 @@ def plan_far_field(
         refine=None if refine is None else banded(refine),
         coarsen=None if refine is None else banded(refine.T),
         tilt=None,
-        cells=nx,
+        cells=(ny, nx),
         length=length,
         kept=kept,
-        blocks=(block_size(nx), block_size(kept)),
+        blocks=(block_size(ny), block_size(kept)),
         spacing_m=spacing,
         sample_m=fine,
         expected_error=np.hypot(miscounted, 2 * np.sqrt(2) * missed),
@@ -193,11 +191,10 @@ def displaced(plan: FarField, offset_m: Float[Array, "2"]) -> FarField:
     The optimiser moves the image by a random fraction of a pixel at every step: a design must not depend on where on
     the pixel grid a point falls, and the errors of a sparse `sampling` average out.
     """
-    cells = jnp.arange(plan.cells) - (plan.cells - 1) / 2
-    waves = cells / (plan.length * plan.spacing_m)
-    return eqx.tree_at(
-        lambda p: p.tilt, plan, (cis(waves * offset_m[0]), cis(waves * offset_m[1])), is_leaf=lambda leaf: leaf is None
-    )
+    cells = [jnp.arange(count) - (count - 1) / 2 for count in plan.cells]
+    waves = [one / (plan.length * plan.spacing_m) for one in cells]
+    tilt = cis(waves[0] * offset_m[0]), cis(waves[1] * offset_m[1])
+    return eqx.tree_at(lambda p: p.tilt, plan, tilt, is_leaf=lambda leaf: leaf is None)
 
 
 def bent(plan: FarField, camera: Camera, displacement_m: Float[Array, "2 term"]) -> FarField:
@@ -220,19 +217,20 @@ def _with_pixels(plan: FarField, pixels: MappedPixels | None) -> FarField:
 
 def _transform(plan: FarField, field: Complex[Array, "row n"]) -> Complex[Array, "row length"]:
     """FFT of rows; where it is to be interpolated their middle is the origin, so that it varies slowly enough."""
-    middle = 0 if plan.refine is None else plan.cells // 2
-    if middle or plan.length > plan.cells:
-        gap = jnp.zeros((field.shape[0], plan.length - plan.cells), field.dtype)
+    cells = field.shape[-1]
+    middle = 0 if plan.refine is None else cells // 2
+    if middle or plan.length > cells:
+        gap = jnp.zeros((field.shape[0], plan.length - cells), field.dtype)
         field = jnp.concatenate([field[:, middle:], gap, field[:, :middle]], axis=-1)
     return jnp.fft.fft(field)
 
 
-def _untransform(plan: FarField, spectrum: Complex[Array, "row length"]) -> Complex[Array, "row n"]:
-    """Transpose of `_transform`."""
-    middle, field = 0 if plan.refine is None else plan.cells // 2, jnp.fft.fft(spectrum)
+def _untransform(plan: FarField, spectrum: Complex[Array, "row length"], cells: int) -> Complex[Array, "row n"]:
+    """Transpose of `_transform` of so many cells."""
+    middle, field = 0 if plan.refine is None else cells // 2, jnp.fft.fft(spectrum)
     if not middle:
-        return field[:, : plan.cells]
-    return jnp.concatenate([field[:, plan.length - middle :], field[:, : plan.cells - middle]], axis=-1)
+        return field[:, :cells]
+    return jnp.concatenate([field[:, plan.length - middle :], field[:, : cells - middle]], axis=-1)
 
 
 def _central(spectrum: Complex[Array, "row length"], kept: int) -> Complex[Array, "row kept"]:
@@ -268,10 +266,10 @@ def _forward(plan: FarField, pupil: PupilRows, rows: PyTree, shared: PyTree) -> 
         return _central(_transform(plan, field), plan.kept)
 
     half_done = jax.lax.map(along_x, in_blocks(rows, pupil_block))
-    half_done = half_done.reshape(-1, plan.kept)[: plan.cells]
+    half_done = half_done.reshape(-1, plan.kept)[: plan.cells[0]]
 
     def along_y(block: Array) -> Array:
-        columns = jax.lax.dynamic_slice(half_done, (0, block * sensor_block), (plan.cells, sensor_block)).T
+        columns = jax.lax.dynamic_slice(half_done, (0, block * sensor_block), (plan.cells[0], sensor_block)).T
         if plan.tilt is not None:
             columns = columns * plan.tilt[0]
         return _central(_transform(plan, columns), plan.kept)
@@ -347,7 +345,7 @@ def _adjoint(
     to_pixels: Any = None
 
     def along_y(samples: Array) -> Array:
-        columns = _untransform(plan, _uncentral(samples, plan.length))
+        columns = _untransform(plan, _uncentral(samples, plan.length), plan.cells[0])
         return columns if plan.tilt is None else columns * plan.tilt[0]
 
     if spread is None:
@@ -378,13 +376,13 @@ def _adjoint(
             return along_y(jax.lax.complex(real, imaginary))
 
         half_done = jax.lax.map(coarse_block, back)
-    half_done = half_done.reshape(plan.kept, plan.cells)
-    half_done = jnp.pad(half_done, ((0, 0), (0, -plan.cells % pupil_block)))
+    half_done = half_done.reshape(plan.kept, plan.cells[0])
+    half_done = jnp.pad(half_done, ((0, 0), (0, -plan.cells[0] % pupil_block)))
 
     def along_x(carry: PyTree, block: tuple[Array, PyTree, PyTree]) -> tuple[PyTree, PyTree]:
         index, block_rows, block_constants = block
         columns = jax.lax.dynamic_slice(half_done, (0, index * pupil_block), (plan.kept, pupil_block)).T
-        cotangents = _untransform(plan, _uncentral(columns, plan.length))
+        cotangents = _untransform(plan, _uncentral(columns, plan.length), plan.cells[1])
         if plan.tilt is not None:
             cotangents = cotangents * plan.tilt[1]
 
@@ -397,5 +395,5 @@ def _adjoint(
     count = half_done.shape[1] // pupil_block
     blocks = (jnp.arange(count), *(in_blocks(r, pupil_block) for r in (rows, constant_rows)))
     shared_part, row_parts = jax.lax.scan(along_x, jax.tree.map(jnp.zeros_like, shared), blocks)
-    row_parts = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: plan.cells], row_parts)
+    row_parts = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: plan.cells[0]], row_parts)
     return row_parts, shared_part, to_pixels

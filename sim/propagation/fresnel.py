@@ -31,10 +31,10 @@ _UNTAPERED = 0.75  # share of the kernel's band that passes in full
 class DirectPath(eqx.Module):
     """Operators of one wavelength on the direct path."""
 
-    gather: Banded  # samples at the DOE pitch -> pixels, along either axis
+    gather: tuple[Banded, Banded]  # samples at the DOE pitch -> pixels, along y and x
     lens: Complex[Array, "y x"]  # `[y, x]` transmission of the thin lens, unit modulus
     kernel: Complex[Array, "ky kx"]  # `[ky, kx]` transfer function in FFT order on the padded grid
-    first: int = eqx.field(static=True)  # first sample kept on the sensor, per axis
+    first: tuple[int, int] = eqx.field(static=True)  # first sample (y, x) kept on the sensor
     parts: int = eqx.field(static=True)  # samples per cell and axis
     expected_error: float  # predicted relative L2 error of the pixel integration alone
 
@@ -43,10 +43,11 @@ class DirectPath(eqx.Module):
         field = pupil(rows, shared) * self.lens
         field = jnp.repeat(jnp.repeat(field, self.parts, axis=0), self.parts, axis=1)
         spectrum = jnp.fft.fft2(field, self.kernel.shape) * self.kernel
-        kept = self.gather.inputs  # samples per axis that the pixels use
-        image = jnp.roll(jnp.fft.ifft2(spectrum), (-self.first, -self.first), (0, 1))[:kept, :kept]
+        (y, x), (first_y, first_x) = self.gather, self.first
+        # Samples per axis that the pixels use.
+        image = jnp.roll(jnp.fft.ifft2(spectrum), (-first_y, -first_x), (0, 1))[: y.inputs, : x.inputs]
         intensity = image.real**2 + image.imag**2
-        return self.gather(self.gather(intensity).T).T
+        return y(x(intensity).T).T
 
 
 def nyquist_focal_length_m(cells: int, pitch_m: float, wavelength_m: float) -> float:
@@ -78,7 +79,7 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
         )
         raise InputError("camera.mapping", rule, camera.lens_text, cure)
     parts = _parts(camera, wavelength_m)
-    cells, pitch, distance = camera.grid.shape[0], camera.grid.pitch_m, camera.sensor_distance_m
+    cells, pitch, distance = max(camera.grid.shape), camera.grid.pitch_m, camera.sensor_distance_m
     nyquist = nyquist_focal_length_m(cells, pitch, wavelength_m) if camera.distance_m is None else 0.0
     if nyquist > camera.focal_length_m * (1 + 1e-9):
         limit = wavelength_m * camera.focal_length_m / camera.opening.widest_m
@@ -100,24 +101,26 @@ def plan_direct(camera: Camera, wavelength_m: float, kernel: Kernel = "angular_s
         raise InputError("camera.window", rule, got, "Use a smaller window, or the far-field path behind a lens.")
     # Light from one rim of the aperture to the far edge of the window must pass the kernel's band untapered.
     padded = cast(int, next_fast_len(max(3 * cells, int(np.ceil((cells + 2 * half) / _UNTAPERED)))))
-    middle = (cells - 1) / 2  # the axis, in samples of the propagated grid
-    first = int(np.floor(middle)) - kept // 2
     cutoff = camera.opening.widest_m * pitch / (wavelength_m * distance)
-    weights = pixel_weights(
-        camera.axis_m() / pitch + middle - first, width, cutoff, kept, isinstance(camera.opening, RoundAperture)
-    )
-    matrix = weights.matrix * (pitch / np.sqrt(camera.opening.area_m2))
+    amount = pitch / np.sqrt(camera.opening.area_m2)
+    is_round, firsts, gathers, errors = isinstance(camera.opening, RoundAperture), [], [], []
+    for count in camera.grid.shape:
+        middle = (count * parts - 1) / 2  # the axis, in samples of the propagated grid
+        firsts.append(int(np.floor(middle)) - kept // 2)
+        weights = pixel_weights(camera.axis_m() / pitch + middle - firsts[-1], width, cutoff, kept, is_round)
+        gathers.append(Banded.from_dense(weights.matrix * amount))
+        errors.append(weights.expected_error)
     square = camera.grid.axis_m("y")[:, None] ** 2 + camera.grid.axis_m("x")[None, :] ** 2
     # `source_path_m` already holds the defocus remainder r^2/2 (1/d - 1/f), so what is left of the lens is -r^2/2d;
     # without a lens it holds r^2/2d, which this takes out again.
     lens = wrapped_waves(-square / (2 * distance * wavelength_m), 1.0)
     return DirectPath(
-        gather=Banded.from_dense(matrix),
+        gather=(gathers[0], gathers[1]),
         lens=cis(jnp.asarray(lens)),
         kernel=_kernel(padded, pitch, wavelength_m, distance, kernel, square_cells=camera.distance_m is not None),
-        first=first,
+        first=(firsts[0], firsts[1]),
         parts=parts,
-        expected_error=np.sqrt(2) * weights.expected_error,
+        expected_error=np.hypot(*errors),
     )
 
 

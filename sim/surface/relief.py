@@ -132,15 +132,16 @@ def _views(wavelength_m: float, waves: ObliqueWaves, depths_m: tuple[float, floa
 
 
 @lru_cache(maxsize=8)  # every draw of a study needs the same
-def view_weights(camera: Camera, parts: int, views: tuple[View, ...], tile: int) -> Float[np.ndarray, "..."]:
+def view_weights(
+    camera: Camera, parts: int, views: tuple[View, ...], tile: int, count: int
+) -> Float[np.ndarray, "..."]:
     """Light that moments of a row of tiles add to cells: `[tile, view, 1 or 2, kind, cell, cell + 2 reach]`.
 
-    The same along both axes. A tile is `tile` DOE cells wide, each divided into `parts` along either axis. The third
-    axis holds real and imaginary parts, if there are any. Kinds are those of `moment_weights`: of lines, with edges.
+    Along an axis with `count` DOE cells, of which a tile is `tile` wide; each is divided into `parts`. The third axis
+    holds real and imaginary parts, if there are any. Kinds are those of `moment_weights`: of lines, with edges.
     """
-    grid, size = camera.grid, tile * parts
-    count, radius = -(-grid.shape[0] // tile), camera.opening.widest_m / 2 / grid.pitch_m * parts
-    cells = grid.shape[0] * parts
+    size, cells = tile * parts, count * parts
+    count, radius = -(-count // tile), camera.opening.widest_m / 2 / camera.grid.pitch_m * parts
     place = (np.arange(count * size) - (cells - 1) / 2) / radius
     nodes = np.linspace(-1, 1, _NODES)
     found = []

@@ -23,7 +23,7 @@ def transmission_of(plan: TilePlan, *arrays: Any) -> tuple[Complex[Array, "view 
 
     The arrays, numpy's or jax's: etches of every cell, one bit each; widths of openings in cells, where etches lag;
     `relief`; waves per metre of height of every wavelength; the amplitude that roughness finer than a cell leaves of
-    each; the chrome's `Opening`; and the `view_weights`.
+    each; the chrome's `Opening`; and the `view_weights` along y and x.
     """
     return (_compiled if is_traced(*arrays) or in_jit() else _compiled_quickly())(plan, *arrays)
 
@@ -36,7 +36,8 @@ def _transmission(
     rates: Float[Array, " w"],
     left: Float[Array, " w"],
     opening: Opening,
-    weights: Float[Array, "tile view part kind s wide"],
+    weights_y: Float[Array, "tile_y view part kind s wide"],
+    weights_x: Float[Array, "tile_x view part kind s wide"],
 ) -> tuple[Complex[Array, "view v u"], Complex[Array, "w v u"]]:
     reach = REACH if plan.cut else 0
     ny, nx = plan.grid.shape
@@ -74,7 +75,7 @@ def _transmission(
 
     def strip(start_y: Array, along_y: Array) -> tuple[Array, Array]:
         values = jax.checkpoint(lambda at: lit_tile(start_y, *at))
-        rows, means = jax.lax.map(values, (jnp.arange(count_x) * TILE, weights))
+        rows, means = jax.lax.map(values, (jnp.arange(count_x) * TILE, weights_x))
         rows = _joined(rows, 5, reach)
         if not plan.cut:
             return rows[:, 0], _joined(means, 4, 0)
@@ -84,7 +85,7 @@ def _transmission(
             views.append(_strip_values(rows[v, np.array([0, *kinds + 1])], along_y[v][:, kinds]))
         return jnp.stack(views), _joined(means, 4, 0)
 
-    strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights))
+    strips, means = jax.lax.map(lambda at: strip(*at), (jnp.arange(count_y) * TILE, weights_y))
     inside = (slice(None), slice(ny * plan.parts), slice(nx * plan.parts))
     transmission, means = (
         jax.lax.complex(part[:, 0], part[:, 1])[inside] for part in (_joined(strips, 3, reach), _joined(means, 3, 0))

@@ -14,9 +14,10 @@ SLIT = TINY.replace('aperture = "0.1184 mm"', 'aperture = ["0.1184 mm", "0.074 m
 
 
 @pytest.mark.slow
-def test_a_rectangular_aperture_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, cli):
+@pytest.mark.parametrize("samples", ["64", "[64, 40]"])
+def test_a_rectangular_aperture_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, cli, samples):
     spec, run, order = tmp_path / "slit.toml", tmp_path / "run", tmp_path / "order"
-    spec.write_text(SLIT)
+    spec.write_text(SLIT.replace("samples = 64", f"samples = {samples}"))
     for command in (
         ("optimize", spec, "--out", run),
         ("masks", run, "--out", order),
@@ -28,11 +29,13 @@ def test_a_rectangular_aperture_goes_from_the_spec_to_a_proved_order_and_to_its_
         assert done.code == 0, done.err
     manifest = read_manifest(order)
     assert manifest.relief == RectangularAperture((0.074e-3, 0.1184e-3))
+    assert manifest.shape == ([64, 64] if samples == "64" else [40, 64])
     # The chrome of the process reaches 5 um over every edge.
     assert manifest.chrome.opening_diameter_mm == [0.1084, 0.064]
     rows = json.loads((run / "metrics.json").read_text())["psf"]
     assert all(sum(row["budget"].values()) == pytest.approx(1.0, abs=1e-6) for row in rows)
-    assert '["0.1184 mm", "74 um"]' in (run / "spec.toml").read_text().replace("118.4 um", "0.1184 mm")
+    written = f'samples = {samples}\npitch = "1.85 um"\naperture = ["118.4 um", "74 um"]'
+    assert written in (run / "spec.toml").read_text()
 
 
 @pytest.mark.parametrize(
@@ -42,6 +45,9 @@ def test_a_rectangular_aperture_goes_from_the_spec_to_a_proved_order_and_to_its_
         ('"0.074 mm"]', '"0.2 mm"]', "doe.aperture: must equal samples x pitch"),
         ('"0.074 mm"]', '"9 um"]', "twice the overlap must leave an opening in an aperture of 118.4 um x 9 um"),
         ('"0.074 mm"]', "3]", "must be a number with a unit"),
+        ("samples = 64", "samples = [40, 64]", "samples x pitch = [40, 64] x 1.85 um = 74 um x 118.4 um"),
+        ("samples = 64", "samples = [64, 40, 3]", "doe.samples: must be a whole number, or two of them"),
+        ("samples = 64", "samples = [64, 1]", "doe.samples: must be at least 2"),
         ('start = "ring"', 'start = "ring"\nparametrization = "radial"', "rings fill a round aperture"),
     ],
 )
@@ -63,6 +69,7 @@ def test_a_bare_height_map_takes_width_and_height(tmp_path, cli):
     assert read_manifest(tmp_path / "order").aperture_mm == [0.06, 0.03]
 
 
+@pytest.mark.slow
 def test_obstructions_ask_for_a_round_aperture(tmp_path, cli):
     spec, run = tmp_path / "slit.toml", tmp_path / "run"
     spec.write_text(SLIT)

@@ -131,7 +131,7 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     most = wavelength / (2 * pitch)  # the direction sine at which a grating of two cells sends light
     if spots.period_m is not None:
         cells = spots.period_m / pitch
-        if abs(cells - round(cells)) > 1e-6 or not _FEWEST_CELLS <= round(cells) <= spec.doe.samples:
+        if abs(cells - round(cells)) > 1e-6 or not _FEWEST_CELLS <= round(cells) <= min(spec.doe.shape):
             rule = f"must be a whole number of cells of {format_length(pitch)}, from {_FEWEST_CELLS} to doe.samples"
             cure = f'For example period = "{format_length(max(_FEWEST_CELLS, round(cells)) * pitch)}".'
             yield InputError("spots.period", rule, format_length(spots.period_m), cure)
