@@ -86,5 +86,6 @@ def _draw_chrome(axes: "Axes", level_map: "LevelMap", chrome: "tuple[Aperture, f
     axes.set(xlim=(-1.03 * outer, 1.03 * outer), ylim=(-1.03 * outer, 1.03 * outer), aspect="equal")
     outlines = opening, level_map.shown_relief
     clear, relief = (" × ".join(f"{size / MM:.6g}" for size in outline.sizes_m) for outline in outlines)
-    axes.set_title(f"chrome: clear aperture {clear} mm,\nrelief {relief} mm (dashed)")
+    name = "clear aperture" if len(opening.sizes_m) == 1 else "clear"
+    axes.set_title(f"chrome: {name} {clear} mm,\nrelief {relief} mm (dashed)")
     scale_bar(axes, 2.06 * outer * MM)

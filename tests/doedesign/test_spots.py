@@ -1,5 +1,6 @@
 """Spots and orders: sums over cells in closed form, the search against known ceilings, and a judge of its own."""
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +11,7 @@ from doedesign.spots.orders import ceiling_of, order_table
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
 from doedesign.spots.superposition import SpotProblem, Staircase, WaveSet, spot_light
+from fab.aperture import RectangularAperture
 from fab.grid import Grid
 from sim.camera import Camera, Colour
 from sim.optic import HeightOptic
@@ -224,3 +226,13 @@ def test_a_picture_of_a_table():
     )
     bars = cast(Any, table.plot()).axes[0].containers[0]
     assert [bar.get_height() for bar in bars] == pytest.approx(100 * table.efficiency, abs=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(48, 48), (24, 48)])
+def test_the_table_of_a_slit_looks_at_all_its_whole_periods(shape):
+    slit = replace(camera(48), grid=Grid(shape, PITCH_M), aperture=RectangularAperture((24 * PITCH_M, 48 * PITCH_M)))
+    height = np.tile(np.random.default_rng(6).uniform(0, 1e-6, (8, 8)), (6, 6))[: shape[0]]
+    spots = orders_of((3, 3), 8)
+    assert spots.orders is not None
+    found = order_table(HeightOptic.of(slit, height), spots, period_m=8 * PITCH_M)
+    np.testing.assert_allclose(found.efficiency, judged(height, slit, spots.orders, 8), rtol=1e-3)

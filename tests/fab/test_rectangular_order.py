@@ -1,5 +1,6 @@
 """An order whose chrome has a rectangular opening: drawn, read back by other libraries, and proved."""
 
+import json
 import math
 import shutil
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 from klayout import db
 
 from fab.aperture import RectangularAperture
+from fab.errors import InputError
 from fab.gds.reader import read_gds
 from fab.gds.writer import write_gds
 from fab.grid import Grid
@@ -21,9 +23,10 @@ from fab.manifest.records import read_manifest
 from fab.order.order import plan_order
 from fab.order.verify import verify
 from fab.order.write import write_planned
+from fab.runsheet.as_built import read_as_built
 from fab.solids.step import step_bodies
 from tests.fab.maps import FEW, PLAIN
-from tests.fab.mended import mend, told
+from tests.fab.mended import mend, restate, told
 
 UM, MM = 1e-6, 1e-3
 LEVELS = Levels(4, 0.3e-6)
@@ -32,12 +35,15 @@ RELIEF = RectangularAperture((60 * UM, 80 * UM))
 OPENING_UM = (70.0, 50.0)  # less twice the overlap of 5 um
 
 
+def slit() -> LevelMap:
+    level = np.random.default_rng(5).integers(0, 4, GRID.shape).astype(np.uint8)
+    return LevelMap(level, LEVELS, GRID, RELIEF, "slit")
+
+
 @pytest.fixture(scope="session")
 def written(tmp_path_factory):
-    level = np.random.default_rng(5).integers(0, 4, GRID.shape).astype(np.uint8)
     folder = tmp_path_factory.mktemp("orders") / "slit"
-    slit = LevelMap(level, LEVELS, GRID, RELIEF, "slit")
-    write_planned(folder, plan_order(slit, wafer=FEW, formats=PLAIN, papers=True))
+    write_planned(folder, plan_order(slit(), wafer=FEW, formats=PLAIN, papers=True))
     return folder
 
 
@@ -111,13 +117,20 @@ def test_solids_have_the_volumes_of_the_rectangle(written):
     assert "CYLINDRICAL_SURFACE" in text  # of the chrome's rim
 
 
-def test_the_run_sheet_asks_for_width_and_height(written):
-    import json
-
+def test_the_run_sheet_asks_for_width_and_height(written, tmp_path):
     sheet = json.loads(next(written.glob("*_RUNSHEET.json")).read_text())
     assert sheet["opening_um"] == [70.0, 50.0]
     assert {"opening_width_um", "opening_height_um"} <= sheet["measured"]["chrome"].keys()
     assert "width and height; target 70.0 and 50.0" in next(written.glob("*_RUNSHEET.html")).read_text()
+    sheet["measured"]["chrome"] |= {"opening_width_um": 70.6, "opening_height_um": 50.2}
+    filled = tmp_path / "filled.json"
+    filled.write_text(json.dumps(sheet))
+    # One number of the model is how much wider and higher the opening is: their mean.
+    assert read_as_built(filled, slit()).chrome.wider_m == pytest.approx(0.4 * UM)
+    sheet["measured"]["chrome"]["opening_height_um"] = 0.05
+    filled.write_text(json.dumps(sheet))
+    with pytest.raises(InputError, match="that it is the height"):
+        read_as_built(filled, slit())
 
 
 @pytest.mark.parametrize(
@@ -147,8 +160,6 @@ def test_a_forged_opening_is_refused(written, tmp_path, change, words):
 
 
 def test_a_manifest_that_states_another_opening_is_refused(written, tmp_path):
-    from tests.fab.mended import restate
-
     folder = shutil.copytree(written, tmp_path / "order")
     restate(folder, lambda m: replace(m, chrome=replace(m.chrome, opening_diameter_mm=[0.08, 0.06])))
     assert any("opening_diameter_mm" in difference for difference in verify(folder).differences)

@@ -4,7 +4,7 @@ import cadquery
 import numpy as np
 import pytest
 
-from fab.aperture import RoundAperture
+from fab.aperture import RectangularAperture, RoundAperture
 from fab.errors import InputError
 from fab.solids.step import step_bodies
 from fab.solids.substrate import (
@@ -223,12 +223,15 @@ def test_impossible_parts_are_refused(make, words):
 @pytest.mark.parametrize(
     ("substrate", "relief", "chrome", "rings", "words"),
     [
-        (DIE, 10 * MM, None, None, "relief"),
-        (DIE, -MM, None, None, "relief"),
+        (DIE, RoundAperture(10 * MM), None, None, "relief"),
+        (DIE, RoundAperture(-MM), None, None, "relief"),
         (DIE, APERTURE, ChromeRing(RoundAperture(2 * 2 * MM), 5.1 * MM), None, "chrome"),
         (Substrate("wafer", 10 * MM, MM, 8 * MM), APERTURE, CHROME, None, "circle of 6 mm"),
-        (DIE, 4.3 * MM, None, some_rings(), "inside the relief"),
+        (DIE, RoundAperture(4.3 * MM), None, some_rings(), "inside the relief"),
         (Substrate("die", 10 * MM, UM), APERTURE, None, some_rings(), "less deep"),
+        # The corners of a rectangle decide, and rings need a circle.
+        (Substrate("die", 4.9 * MM, MM), RectangularAperture((4 * MM, 3 * MM)), None, None, "relief"),
+        (DIE, RectangularAperture((4 * MM, 4 * MM)), None, some_rings(), "must be round here"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, substrate, relief, chrome, rings, words):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fab.aperture import RoundAperture
+from fab.aperture import RectangularAperture, RoundAperture
 from fab.figure import png_bytes
 from fab.grid import Grid
 from sim.camera import Camera, Colour
@@ -48,6 +48,18 @@ def certified() -> tuple[CertifiedRow, ...]:
     levels = np.random.default_rng(0).integers(0, 16, (100, 100))
     rows = cut_rows(75e-9 * levels, GRID, APERTURE, 8, shares=(0.0, 0.5))[:2]
     return certify_rows(rows, CAMERA, (552e-9, 656e-9))
+
+
+def test_rows_of_a_rectangle_lie_at_shares_of_its_own_sides():
+    slit = RectangularAperture((40 * PITCH_M, 80 * PITCH_M))
+    rows = cut_rows(PLACES, GRID, slit, 8, shares=(0.0, 0.5))
+    assert [row.axis for row in rows] == ["x", "x", "y", "x"]
+    np.testing.assert_allclose([row.centre_m[1] for row in rows[:2]], [0, 20 * PITCH_M], atol=PITCH_M)
+    np.testing.assert_allclose(rows[2].centre_m, (10 * PITCH_M, 0), atol=PITCH_M)
+    # Beyond the rim nothing is cut out: of a row of 24 cells at 38 of 40 cells to the side, so many are inside.
+    at_rim = cut_rows(PLACES, GRID, slit, 24, shares=(0.95,))[0]
+    assert len(at_rim.height_m) == 14
+    assert all(np.abs(piece.centre_m[0]) < 20 * PITCH_M for piece in cut_pieces(PLACES, GRID, slit, 2, 4, cells=8))
 
 
 def test_rows_are_settled_and_edges_are_near_maxwell(certified: tuple[CertifiedRow, ...]):

@@ -52,17 +52,16 @@ def field64(height: np.ndarray, source: np.ndarray, coverage: np.ndarray, rate: 
 def energy64(plan: FarField, field: np.ndarray) -> np.ndarray:
     """The plan's operators applied to a pupil, written as dense products in float64."""
     samples = np.arange(plan.kept) - plan.kept // 2
-    cells = np.arange(plan.cells) - plan.cells // 2
-    matrix = np.exp(-2j * np.pi * np.outer(samples, cells) / plan.length)
+    axes = [np.exp(-2j * np.pi * np.outer(samples, np.arange(n) - n // 2) / plan.length) for n in plan.cells]
     if plan.tilt is not None:
         field = np.asarray(plan.tilt[0])[:, None] * field * np.asarray(plan.tilt[1])
     if plan.refine is not None:
         unit = jnp.eye(plan.kept, dtype=jnp.float32)
         real, imaginary = np.asarray(plan.refine.of_complex(jnp.stack([unit, 0 * unit])), np.float64)
-        matrix = (real + 1j * imaginary).T @ matrix
+        axes = [(real + 1j * imaginary).T @ matrix for matrix in axes]
     assert plan.gather is not None
-    gather = dense(plan.gather, len(matrix))
-    return gather.T @ np.abs(matrix @ field @ matrix.T) ** 2 @ gather
+    gather = dense(plan.gather, len(axes[0]))
+    return gather.T @ np.abs(axes[0] @ field @ axes[1].T) ** 2 @ gather
 
 
 def planned(name: str, moved: bool) -> tuple[Camera, FarField]:
@@ -155,11 +154,7 @@ def test_the_default_sampling_predicts_its_tolerance():
         assert planned(name, moved=False)[1].expected_error <= TOLERANCE
 
 
-@pytest.mark.parametrize(
-    ("grid", "sampling", "message"),
-    [(Grid((8, 9), 1e-6), None, "must be square"), (Grid((8, 8), 1e-6), 0.5, "must be at least 1")],
-)
-def test_impossible_plans_are_refused(grid: Grid, sampling: float | None, message: str):
-    camera = Camera(grid, 8e-6, "fused_silica", (), 1e-3, 2e-6, 8)
-    with pytest.raises(ValueError, match=message):
-        plan_far_field(camera, YELLOW_M, sampling=sampling)
+def test_impossible_plans_are_refused():
+    camera = Camera(Grid((8, 8), 1e-6), 8e-6, "fused_silica", (), 1e-3, 2e-6, 8)
+    with pytest.raises(ValueError, match="must be at least 1"):
+        plan_far_field(camera, YELLOW_M, sampling=0.5)

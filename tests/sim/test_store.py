@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
 from sim.psf_bank import PsfBank
 from sim.store import read_bank, read_height, read_picture, write_bank, write_height, write_picture
@@ -290,3 +291,12 @@ def test_a_header_of_an_immense_picture_is_refused(tmp_path: Path):
     (tmp_path / "a.exr").write_bytes(bombs.exr_promise())
     with pytest.raises(InputError, match="whole OpenEXR picture"):
         read_picture(tmp_path / "a.exr")
+
+
+def test_a_rectangular_aperture_comes_back_with_all_its_digits(tmp_path: Path):
+    slit = RectangularAperture((1 / 3 * 1e-3, 2 / 7 * 1e-2))
+    write_height(tmp_path / "slit.exr", np.zeros((2, 3), np.float32), 1.85e-6, slit)
+    stored = read_height(tmp_path / "slit.exr")
+    assert stored.aperture == slit
+    with pytest.raises(InputError, match="must be round here"):
+        _ = stored.aperture_m
