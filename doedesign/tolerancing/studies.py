@@ -288,7 +288,9 @@ def _at_least_one(name: str, value: int) -> int:
 def _given(camera: Camera) -> dict[str, Any]:
     """A camera without what is as it was before there was a choice, so that earlier studies go on."""
     usual = {field.name: field.default for field in fields(Camera) if field.name not in ("fill", "defocus_m")}
-    return {name: value for name, value in asdict(camera).items() if name not in usual or value != usual[name]}
+    given = {name: value for name, value in asdict(camera).items() if name not in usual or value != usual[name]}
+    del given["aperture"]
+    return {**given, "aperture_m": camera.opening.record()}
 
 
 def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate) -> dict[str, Any]:
