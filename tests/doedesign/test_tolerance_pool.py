@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -20,8 +21,10 @@ from typing import Any, cast
 
 import pytest
 
+from doedesign.tolerancing import studies as studies_module
 from doedesign.tolerancing.pool import DrawModel, default_workers
 from doedesign.tolerancing.studies import Study, study
+from fab.aperture import RectangularAperture
 from fab.draws import normal_keys
 from fab.errors import InputError
 from fab.process import variation_of
@@ -312,3 +315,11 @@ def test_there_are_as_many_workers_as_cores_and_memory_allow(monkeypatch: pytest
     assert default_workers(2400**2) == 1
     monkeypatch.setattr("doedesign.tolerancing.pool._free_gib", lambda: 0.1)
     assert default_workers(100) == 1
+
+
+def test_a_study_knows_a_round_aperture_by_its_diameter_as_ever(fakes: ModuleType):
+    record = studies_module._given(fakes.CAMERA)
+    assert record["aperture_m"] == 1e-3
+    assert "aperture" not in record
+    slit = replace(fakes.CAMERA, aperture=RectangularAperture((0.5e-3, 1e-3)))
+    assert studies_module._given(slit)["aperture_m"] == [1e-3, 0.5e-3]
