@@ -79,6 +79,11 @@ class Aperture(ABC):
         return self.area_in(1.0)
 
     @property
+    def disc_m(self) -> float:
+        """Diameter of a disc of the same area, metres; its own, if it is one."""
+        return 2 * math.sqrt(self.area_m2 / math.pi)
+
+    @property
     def widest_m(self) -> float:
         """Longer side of the box around it, metres; the diameter of a round one."""
         return max(self.extent_m)
@@ -104,6 +109,11 @@ class RoundAperture(Aperture):
     def reach_m(self) -> float:
         """The radius."""
         return self.diameter_m / 2
+
+    @property
+    def disc_m(self) -> float:
+        """The diameter."""
+        return self.diameter_m
 
     def area_in(self, pitch_m: float, times: int = 1) -> float:
         """Area of the disc."""

@@ -292,7 +292,7 @@ class Camera:
         """
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
         if self.in_angles:
-            return self.aperture_m / 2 * inverse_depth
+            return self.opening.reach_m * inverse_depth
         if self.distance_m is not None:
             return self.opening.reach_m * (self.distance_m * inverse_depth + 1.0)
         distance = self.focal_length_m + self.defocus_m

@@ -144,7 +144,7 @@ class EvenBeam:
     """Light that is as bright all over the aperture, of whose power energies are shares.
 
     Attributes:
-        aperture_m: diameter of the clear aperture.
+        aperture_m: diameter of the clear aperture, or of a disc as large as one that is not round.
         distance_m: distance of the point before the DOE that it comes from; infinite for a plane wave.
         angle_rad: angles (y, x) of its chief ray, which the sensor's window follows.
         tilt_rad: the same, added to it; the window stays.
@@ -215,7 +215,7 @@ def beam_amplitude(
     Its mean square over that clear aperture would be 1 if the beam were to end at its rim: plane light
     has the amplitude 1, and PSFs count energies over the power of the beam.
     """
-    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(aperture.area_m2)
+    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(np.pi) * aperture.disc_m / 2
     found = found.astype(np.complex64)
     found.setflags(write=False)
     return found

@@ -396,11 +396,11 @@ def _window_warnings(spec: Spec) -> Iterator[str]:
 
 def _pixel_warning(spec: Spec) -> Iterator[str]:
     """Warn of directions told apart far more finely than diffraction by the aperture lets them differ."""
-    detail = _shortest_m(spec) / spec.doe.aperture_m
+    detail = _shortest_m(spec) / spec.doe.relief.widest_m
     if spec.sensor.in_angles and spec.sensor.pixel_m < detail / _FINEST:
         yield (
             f"sensor.pixel_angle: pixels of {_pixel_text(spec)} are more than {_FINEST} times finer than what an "
-            f"aperture of {format_length(spec.doe.aperture_m)} can show, {DEGREES.of(detail):.4g} deg at "
+            f"aperture of {spec.doe.relief} can show, {DEGREES.of(detail):.4g} deg at "
             f'{format_length(_shortest_m(spec))}; "{DEGREES.of(detail / 4):.2g} deg" is enough.'
         )
 

@@ -87,12 +87,12 @@ def _sensor(spec: Spec, missing: Set[str]) -> dict[str, Any]:
     """Keys of the sensor that are missing, for a spec that has stand-ins in their place."""
     sensor, distance = spec.sensor, spec.image_distance_m
     shortest = min(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
-    detail = shortest * distance / spec.doe.aperture_m
+    detail = shortest * distance / spec.doe.relief.widest_m
     full = max(2 * _MARGIN * _reach_m(spec, detail), _LEAST / _PER_DETAIL * detail)
     # Cells steer light so far, directions end at 90 degrees, and nothing is computed beyond three apertures near by.
     most = shortest * distance / spec.doe.pitch_m
     most = min(most, 2.0 if sensor.in_angles else math.inf)
-    most = most if sensor.distance_m is None else min(most, 3 * spec.doe.samples * spec.doe.pitch_m)
+    most = most if sensor.distance_m is None else min(most, 3 * max(spec.doe.shape) * spec.doe.pitch_m)
     found: dict[str, Any] = {}
     pixel = sensor.pixel_m
     if missing - {"window"}:
@@ -113,7 +113,7 @@ def _sensor(spec: Spec, missing: Set[str]) -> dict[str, Any]:
 def _reach_m(spec: Spec, detail_m: float) -> float:
     """How far from the axis light is asked for, metres on the sensor; `detail_m` is what diffraction shows there."""
     distance, near = spec.image_distance_m, spec.sensor.distance_m is not None
-    shadow = spec.doe.aperture_m / 2 if near else 0.0
+    shadow = spec.doe.relief.reach_m if near else 0.0
     moved = max(map(abs, spec.moved_sines)) * distance
     longest = max(wavelength for colour in spec.optics.colours for wavelength in colour.wavelengths_m)
     if (spots := spec.spots) is not None:
@@ -129,7 +129,7 @@ def _reach_m(spec: Spec, detail_m: float) -> float:
         return 4 * (spec.focus.widths_m or (0.0,))[0]
     start, sine = spec.optimize.start, _steepest(spec, longest)
     focuses = near and start in _LENSES
-    return (spec.doe.aperture_m / 2 if start == "lens_array" else 0.0) if focuses else shadow + moved + sine * distance
+    return (spec.doe.relief.reach_m if start == "lens_array" else 0.0) if focuses else shadow + moved + sine * distance
 
 
 def _far_end_m(area: AreaSpec, detail_m: float) -> float:
@@ -141,7 +141,7 @@ def _far_end_m(area: AreaSpec, detail_m: float) -> float:
 
 def _steepest(spec: Spec, wavelength_m: float) -> float:
     """Largest direction sine to which a classic start sends light; 0 where its options are still to be mended."""
-    start, options, radius = spec.optimize.start, spec.optimize.start_options, spec.doe.aperture_m / 2
+    start, options, radius = spec.optimize.start, spec.optimize.start_options, spec.doe.relief.reach_m
     try:
         if start == "axicon":
             return math.sin(abs(parse_angle(options.get("angle", ""))))
