@@ -18,7 +18,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
 import scipy.linalg
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
@@ -26,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 _HALVINGS = 3  # of the depth, before the power series
 _NODES = 24  # of the depth, for the integral of the gradient
-_DEGREE = 40  # of the polynomials that carry fields to those nodes
+_DEGREE = 24  # of the polynomials that carry fields to those nodes
 _JONES_WEIGHT = 0.05  # fmmax's, of the roughness of directions
 
 
@@ -87,7 +86,7 @@ class _Product:
 
     def matrix(self, raster: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "row column"]:
         """Return the matrix."""
-        waves = scipy.fft.fft2(raster) / raster.size
+        waves = np.fft.fft2(raster) / raster.size
         waves = 1j * waves if self.odd else waves
         return (np.concatenate([waves.real.ravel(), waves.imag.ravel()])[self._places] * self._signs).sum(0)
 
@@ -96,7 +95,7 @@ class _Product:
         size = self.shape[0] * self.shape[1]
         flat = np.bincount(self._places.ravel(), (self._signs * matrix).ravel(), 2 * size)
         real, imaginary = flat.reshape(2, *self.shape)
-        return scipy.fft.ifft2(real + 1j * imaginary).real
+        return np.fft.ifft2(real + 1j * imaginary).real
 
 
 class _Media(NamedTuple):
@@ -156,27 +155,27 @@ class MirroredLayer:
         self._light = np.zeros(len(self._k2), complex)
         self._light[at] = 1 / np.sqrt(face[0][at, at].real)
 
-    def _slope(self, rows: _Sector, columns: _Sector) -> sparse.csr_matrix:
+    def _slope(self, rows: _Sector, columns: _Sector) -> sparse.csr_array:
         """Derivative along y."""
         return self._joined(rows, columns, -1, -self._step * columns.n)
 
-    def _slope_x(self, columns: _Sector, rows: _Sector) -> sparse.csr_matrix:
+    def _slope_x(self, columns: _Sector, rows: _Sector) -> sparse.csr_array:
         """Derivative along x, which makes odd functions of even ones."""
         return self._joined(rows, columns, 1, (-1 if columns.even else 1) * self._step * columns.m)
 
     @staticmethod
-    def _joined(rows: _Sector, columns: _Sector, turn: int, value: np.ndarray) -> sparse.csr_matrix:
+    def _joined(rows: _Sector, columns: _Sector, turn: int, value: np.ndarray) -> sparse.csr_array:
         place = {key: i for i, key in enumerate(zip(rows.m.tolist(), rows.n.tolist(), strict=True))}
         found = [place.get(key, -1) for key in zip(columns.m.tolist(), (turn * columns.n).tolist(), strict=True)]
         row, kept = np.array(found), np.array(found) >= 0
         column = np.arange(len(columns.m))[kept]
-        return sparse.csr_matrix((value[kept], (row[kept], column)), (len(rows.m), len(columns.m)))
+        return sparse.csr_array((value[kept], (row[kept], column)), (len(rows.m), len(columns.m)))
 
-    def _faces(self, index: float) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+    def _faces(self, index: float) -> tuple[sparse.csr_array, sparse.csr_array]:
         q = np.sqrt((index * self._omega) ** 2 - self._k2 + 0j)
-        one = sparse.identity(len(q))
-        admittance = sparse.diags(1 / q) @ (self._omega**2 * one - self._curl.T @ self._curl / index**2)
-        impedance = sparse.diags(1 / q) @ (index**2 * one - self._divergences / self._omega**2)
+        one = sparse.eye_array(len(q))
+        admittance = sparse.diags_array(1 / q) @ (self._omega**2 * one - self._curl.T @ self._curl / index**2)
+        impedance = sparse.diags_array(1 / q) @ (index**2 * one - self._divergences / self._omega**2)
         return admittance.tocsr(), impedance.tocsr()
 
     def solve(
@@ -230,8 +229,8 @@ class MirroredLayer:
         laurent = [each.matrix(permittivity) for each in (first, second)]
         across = scipy.linalg.inv(laurent[0])
         xx, yy, xy = walls
-        products = [[self._products[i][j].matrix(each) for j, each in enumerate(row)] for i, row in enumerate(((xx, xy), (xy, yy)))]
-        product = np.block(products)
+        (upper, beside), (below, lower) = self._products
+        product = np.block([[upper.matrix(xx), beside.matrix(xy)], [below.matrix(xy), lower.matrix(yy)]])
         cut = self._first
         g = np.concatenate([(inverses[0] - laurent[0]) @ product[:cut], (inverses[1] - laurent[1]) @ product[cut:]])
         g[:cut, :cut] += laurent[0]
@@ -239,21 +238,22 @@ class MirroredLayer:
         g -= self._divergences.toarray() / self._omega**2
         b = -(self._curl.T @ (self._curl.T @ across.T).T)
         b[np.diag_indices_from(b)] += self._omega**2
-        return _Media(g, b, across, inverses, product)
+        single = [each.astype(np.float32) for each in (g, b, across, *inverses, product)]
+        return _Media(single[0], single[1], single[2], (single[3], single[4]), single[5])
 
     def _solve(self, media: _Media, depth_m: float) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
         """Factors of the matrix that takes h behind the layer to twice the light before it, and h behind the layer."""
         g, b = media.g, media.b
         depth = depth_m / self._unit_m
         cosine, sine, both = _waves(g @ b, depth)
-        matrix = cosine.astype(complex)
+        matrix = cosine.astype(np.complex64)
         matrix -= 1j * _right(sine @ g, self._admittance)
         electric = -1j * (b @ sine) - _right(b @ (both @ g), self._admittance)
         matrix += self._impedance @ (electric + self._admittance.toarray())
-        factors = scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)
-        return factors, scipy.linalg.lu_solve(factors, 2 * self._light)
+        factors = scipy.linalg.lu_factor(matrix.astype(np.complex64), overwrite_a=True, check_finite=False)
+        return factors, scipy.linalg.lu_solve(factors, 2 * self._light.astype(np.complex64))
 
-    def _selection(self, reach: int) -> sparse.csr_matrix:
+    def _selection(self, reach: int) -> sparse.csr_array:
         """Matrix to the orders (component, n from -reach to reach, m from 0) in exponentials."""
         blocks = []
         for sector in self._sectors:
@@ -267,7 +267,7 @@ class MirroredLayer:
                         columns.append(place[key])
                         values.append(half * (np.sqrt(0.5) if n else 1.0) * value)
             count = (2 * reach + 1) * (reach + 1)
-            blocks.append(sparse.csr_matrix((values, (rows, columns)), (count, len(sector.m))))
+            blocks.append(sparse.csr_array((values, (rows, columns)), (count, len(sector.m))))
         return sparse.block_diag(blocks).tocsr()
 
     def _orders(self, h: np.ndarray, reach: int) -> MirroredOrders:
@@ -276,7 +276,12 @@ class MirroredLayer:
         return MirroredOrders(np.concatenate([power[:, :0:-1], power], 1), float(np.vdot(e, h).real))
 
     def _gradient(
-        self, media: _Media, permittivity: np.ndarray, depth_m: float, behind: tuple[np.ndarray, np.ndarray], adjoint: np.ndarray
+        self,
+        media: _Media,
+        permittivity: np.ndarray,
+        depth_m: float,
+        behind: tuple[np.ndarray, np.ndarray],
+        adjoint: np.ndarray,
     ) -> MirroredGradient:
         depth = depth_m / self._unit_m
         nodes, share = np.polynomial.legendre.leggauss(_NODES)
@@ -284,8 +289,10 @@ class MirroredLayer:
         highest = self._omega**2 * permittivity.max()
         bounds = (self._omega**2 * permittivity.min() - self._k2.max()) - 0.3 * highest, 1.3 * highest
         before = adjoint, self._impedance.T @ adjoint
-        h, e = _fields(media.g, media.b, *behind, depth - place, bounds)
-        first, second = _fields(media.b.T, media.g.T, *before, place, bounds)
+        squared = media.g @ media.b
+        h, e = _fields(media.g, media.b, squared, behind, np.append(depth - place, depth), bounds)
+        h, e, h0, e0 = h[:, :-1], e[:, :-1], h[:, -1], e[:, -1]
+        first, second = _fields(media.b.T, media.g.T, squared.T, before, place, bounds)
         # d(number) = Re(i sum(share (first . dG e + second . dB h))): products of few real columns.
         left, right = _real(1j * first * share, e)
         cut = self._first
@@ -299,8 +306,7 @@ class MirroredLayer:
         left, right = _real(1j * second * share, h)
         left, right = media.across.T @ (self._curl @ left), media.across @ (self._curl @ right)
         total += self._products[0][0].adjoint(left @ right.T)
-        h0, e0 = (each[:, 0] for each in _fields(media.g, media.b, *behind, np.array([depth]), bounds))
-        slope = (1j * (adjoint @ (media.g @ e0) + before[1] @ (media.b @ h0))).real
+        slope = (1j * (adjoint @ _thin(media.g, e0) + before[1] @ _thin(media.b, h0))).real
         return MirroredGradient(total - inner / permittivity**2, float(slope / self._unit_m))
 
     def products_of_directions(self, permittivity: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "3 y x"]:
@@ -316,22 +322,22 @@ class MirroredLayer:
         def raster(waves: np.ndarray, count: int) -> np.ndarray:
             full = np.zeros((count, count), complex)
             full[n, m] = waves
-            return scipy.fft.ifft2(full) * count**2
+            return np.fft.ifft2(full) * count**2
 
-        across = np.stack([raster((scipy.fft.fft2(each) / each.size)[n, m], size) for each in gradient])
+        across = np.stack([raster((np.fft.fft2(each) / each.size)[n, m], size) for each in gradient])
         weight = np.sqrt((abs(across) ** 2).sum(0))
         weight /= weight.max() or 1.0
         target = _jones(np.stack([across[1], -across[0]]))
-        wave = scipy.fft.fft2(weight) / weight.size
+        wave = np.fft.fft2(weight) / weight.size
         matrix = wave[n[:, None] - n, m[:, None] - m]
         matrix[np.diag_indices_from(matrix)] += _JONES_WEIGHT / len(m) * (2 * np.pi) ** 2 * (m**2 + n**2)
-        given = np.stack([(scipy.fft.fft2(weight * each) / weight.size)[n, m] for each in target], 1)
+        given = np.stack([(np.fft.fft2(weight * each) / weight.size)[n, m] for each in target], 1)
         with threadpool_limits(1):
             found = scipy.linalg.solve(matrix, given, assume_a="her")
         x, y = (raster(each, self._shape[0]) for each in found.T)
         norm = abs(x) ** 2 + abs(y) ** 2
         norm = np.where(norm > 1e-8 * norm.max(), norm, np.inf)
-        return np.stack([abs(x) ** 2, abs(y) ** 2, (np.conj(x) * y).real]) / norm
+        return np.stack([abs(x) ** 2, abs(y) ** 2, np.real(np.conj(x) * y)]) / norm
 
 
 def _jones(field: np.ndarray) -> np.ndarray:
@@ -342,7 +348,8 @@ def _jones(field: np.ndarray) -> np.ndarray:
     tilt = np.where(near, np.pi / 4, np.pi / 8 * (1 + np.cos(np.pi * np.where(near, 0.0, 1.0))))
     turn = x + 1j * y
     turn = turn / abs(turn)
-    return np.stack([turn * (x * np.cos(tilt) - 1j * y * np.sin(tilt)), turn * (y * np.cos(tilt) + 1j * x * np.sin(tilt))])
+    cosine, sine = np.cos(tilt), 1j * np.sin(tilt)
+    return turn * np.stack([x * cosine - y * sine, y * cosine + x * sine])
 
 
 def _waves(squared: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -351,7 +358,7 @@ def _waves(squared: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray, n
     x = squared * step**2
     x2 = x @ x
     x3 = x2 @ x
-    one = np.identity(len(x))
+    one = np.identity(len(x), x.dtype)
 
     def series(first: int) -> np.ndarray:
         c = [(-1) ** k / math.factorial(2 * k + first) for k in range(9)]
@@ -367,37 +374,50 @@ def _waves(squared: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray, n
     return 2 * (cosine @ cosine) - one, 2 * (sine @ cosine), 2 * (sine @ sine)
 
 
-def _right(matrix: np.ndarray, thin: sparse.csr_matrix) -> np.ndarray:
+def _right(matrix: np.ndarray, thin: sparse.csr_array) -> np.ndarray:
     return (thin.T @ matrix.T).T
 
 
 def _real(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Real columns whose product left @ right.T is the real part of that of complex ones."""
-    return np.concatenate([left.real, -left.imag], 1), np.concatenate([right.real, right.imag], 1)
+    pairs = ((np.real(left), -np.imag(left)), (np.real(right), np.imag(right)))
+    first, second = (np.concatenate(pair, 1).astype(np.float32) for pair in pairs)
+    return first, second
 
 
 def _fields(
-    g: np.ndarray, b: np.ndarray, h: np.ndarray, e: np.ndarray, way: np.ndarray, bounds: tuple[float, float]
+    g: np.ndarray,
+    b: np.ndarray,
+    squared: np.ndarray,
+    known: tuple[np.ndarray, np.ndarray],
+    way: np.ndarray,
+    bounds: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """h and e at distances before a place where they are known: exp(-i A s) of A = [[0, G], [B, 0]]."""
+    """Both fields at distances before a place where they are known: exp(-i A s), A = [[0, G], [B, 0]]; squared: G B."""
+    h, e = known
     middle, half = (bounds[1] + bounds[0]) / 2, (bounds[1] - bounds[0]) / 2
-    given = np.stack([h, g @ e], 1)
-    count = given.shape[1]
-    given = np.concatenate([given.real, given.imag], 1)
+    given = np.stack([h, _thin(g, e)], 1)
+    given = np.concatenate([np.real(given), np.imag(given)], 1).astype(g.dtype)
 
     def times(columns: np.ndarray) -> np.ndarray:
-        return (g @ (b @ columns) - middle * columns) / half
+        return (squared @ columns - np.float32(middle) * columns) / np.float32(half)
 
     chain = [given, times(given)]
     while len(chain) < _DEGREE:
         chain.append(2 * times(chain[-1]) - chain[-2])
     columns = np.stack(chain)
-    columns = columns[..., :count] + 1j * columns[..., count:]
+    columns = columns[..., :2] + 1j * columns[..., 2:]
     points = np.cos(np.pi * (np.arange(_DEGREE) + 0.5) / _DEGREE)
     q = np.sqrt(middle + half * points + 0j)[:, None]
     values = np.stack([np.cos(q * way), np.sin(q * way) / q, (1 - np.cos(q * way)) / q**2]).real
-    weights = scipy.fft.dct(values, axis=1) / _DEGREE
+    weights = np.einsum("fps,kp->fks", values, np.cos(np.arange(_DEGREE)[:, None] * np.arccos(points))) * 2 / _DEGREE
     weights[:, 0] /= 2
     cosine, sine, both = np.einsum("fks,knv->fnvs", weights, columns)
     found = cosine[:, 0] - 1j * sine[:, 1]
-    return found, e[:, None] - b @ (both[:, 1] + 1j * sine[:, 0])
+    return found, e[:, None] - _thin(b, both[:, 1] + 1j * sine[:, 0])
+
+
+def _thin(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Product of a real matrix with few complex columns, without a complex copy of the matrix."""
+    found = matrix @ np.stack([np.real(columns), np.imag(columns)], -1).reshape(len(columns), -1).astype(matrix.dtype)
+    return found[:, ::2].reshape(columns.shape) + 1j * found[:, 1::2].reshape(columns.shape)
