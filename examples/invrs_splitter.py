@@ -28,7 +28,7 @@ from fab.units import metres
 from sim.rigorous.crossed import layered_orders, require_fmmax
 
 PERIOD_M, WAVELENGTH_M, GLASS, ORDERS, TERMS = 7.2e-6, 632.8e-9, 1.46, 3, 800
-_PIXELS = 180
+PIXELS = 180
 
 
 class Score(NamedTuple):
@@ -63,9 +63,9 @@ class Score(NamedTuple):
 def read_design(path: Path) -> np.ndarray:
     """Read a design; an InputError for anything else than 180 x 180 numbers from 0 to 1."""
     design = read_npy(path)
-    within = design.dtype.kind == "f" and design.shape == (_PIXELS, _PIXELS) and design.min() >= 0 and design.max() <= 1
+    within = design.dtype.kind == "f" and design.shape == (PIXELS, PIXELS) and design.min() >= 0 and design.max() <= 1
     if not within:
-        rule = f"a design is {_PIXELS} x {_PIXELS} numbers from 0 to 1"
+        rule = f"a design is {PIXELS} x {PIXELS} numbers from 0 to 1"
         raise InputError(str(path), rule, f"{design.dtype} of shape {design.shape}", "Give such an array.")
     return design.astype(np.float64)
 
@@ -74,7 +74,7 @@ def thin_score(design: np.ndarray, height_m: float) -> Score:
     """Score of a thin element, Fresnel loss of a bare face taken off."""
     phase = 2 * np.pi * (GLASS - 1) * height_m / WAVELENGTH_M
     orders = np.fft.fftshift(np.abs(np.fft.fft2(np.exp(1j * phase * design), norm="forward")) ** 2)
-    middle, face = _PIXELS // 2, 4 * GLASS / (1 + GLASS) ** 2
+    middle, face = PIXELS // 2, 4 * GLASS / (1 + GLASS) ** 2
     kept = slice(middle - ORDERS, middle + ORDERS + 1)
     return Score(face * orders[kept, kept])
 

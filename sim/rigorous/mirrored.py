@@ -23,6 +23,8 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
+from fab.errors import InputError
+
 _HALVINGS = 3  # of the depth, before the power series
 _NODES = 24  # of the depth, for the integral of the gradient
 _DEGREE = 24  # of the polynomials that carry fields to those nodes
@@ -188,7 +190,11 @@ class MirroredLayer:
             depth_m: thickness of the layer.
             walls: of `products_of_directions`, of this permittivity or of one nearby.
             reach: orders from -reach to reach are told.
+
+        Raises:
+            InputError: the permittivity has another size, is not positive or not its own mirror image.
         """
+        self._require(permittivity)
         with threadpool_limits(1):
             solution = self._solve(self._media(permittivity, walls), depth_m)
             return self._orders(solution[1], reach)
@@ -208,8 +214,12 @@ class MirroredLayer:
             depth_m: as in `solve`.
             walls: as in `solve`; they are taken as constant, as fmmax takes its directions.
             reach: as in `solve`.
-            weights: makes the derivative of the number by each order from the orders.
+            weights: makes the derivative of the number by each order from the orders; alike for the orders m and -m.
+
+        Raises:
+            InputError: as in `solve`.
         """
+        self._require(permittivity)
         with threadpool_limits(1):
             media = self._media(permittivity, walls)
             factors, h = self._solve(media, depth_m)
@@ -222,6 +232,12 @@ class MirroredLayer:
             source += self._admittance.T @ (selection.T @ (weight * np.conj(selection @ h)))
             adjoint = scipy.linalg.lu_solve(factors, source, trans=1)
             return orders, self._gradient(media, permittivity, depth_m, (h, e), adjoint)
+
+    def _require(self, permittivity: np.ndarray) -> None:
+        fits = permittivity.shape == self._shape and permittivity.min() > 0
+        if not fits or not np.allclose(permittivity, np.roll(permittivity[:, ::-1], 1, 1), rtol=1e-6, atol=0):
+            rule = f"a layer has {self._shape[0]} x {self._shape[1]} positive permittivities, and a mirror at column 0"
+            raise InputError("permittivity", rule, f"shape {permittivity.shape}", "Give such an array.")
 
     def _media(self, permittivity: np.ndarray, walls: np.ndarray) -> _Media:
         (first, _), (_, second) = self._products
