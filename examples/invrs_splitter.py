@@ -9,7 +9,8 @@ in the orders -3 to 3 along both axes, all together, times 1 - (max - min) / (ma
 terms of a circular truncation with fmmax's formulation JONES_DIRECT_FOURIER; fewer than about 600 mean nothing. One
 score takes one to four minutes and 2 GB.
 
-A design is an array of 180 x 180 numbers from 0 (etched) to 1 (not), `.npy`, x along its first axis as fmmax has it.
+A design is an array of 180 x 180 numbers from 0 (etched) to 1 (not), `.npy`, x along its first axis as fmmax has it; or
+a PNG of 8 bits, black where it is etched, x to the right and y upwards.
 `--thin` adds what a thin element would say of it. The best public entry (0.5964, features of 400 nm and more) scores
 0.5991 here in light along y, the public case's TE, and 0.5024 in light along x; as a thin element 0.2746.
 """
@@ -24,6 +25,7 @@ import numpy as np
 
 from fab.errors import InputError
 from fab.files import read_npy
+from fab.pictures import read_pixels
 from fab.units import metres
 from sim.rigorous.crossed import layered_orders, require_fmmax
 
@@ -61,8 +63,9 @@ class Score(NamedTuple):
 
 
 def read_design(path: Path) -> np.ndarray:
-    """Read a design; an InputError for anything else than 180 x 180 numbers from 0 to 1."""
-    design = read_npy(path)
+    """Read a design; an InputError for anything else than 180 x 180 numbers from 0 to 1, or grey levels of 8 bits."""
+    picture = path.suffix.lower() == ".png"
+    design = read_pixels(path)[::-1].T / 255 if picture else read_npy(path)
     within = design.dtype.kind == "f" and design.shape == (PIXELS, PIXELS) and design.min() >= 0 and design.max() <= 1
     if not within:
         rule = f"a design is {PIXELS} x {PIXELS} numbers from 0 to 1"
@@ -96,7 +99,7 @@ def rigorous_scores(design: np.ndarray, height_m: float, terms: int = TERMS) -> 
 def main() -> int:
     """Print the scores of a design."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("design", type=Path, help="180 x 180 numbers from 0 to 1, .npy")
+    parser.add_argument("design", type=Path, help="180 x 180 numbers from 0 to 1, .npy, or a PNG")
     parser.add_argument("--height", required=True, help='depth of the etch, such as "0.7262474um"')
     parser.add_argument("--terms", type=int, default=TERMS, help="orders that are kept (800)")
     parser.add_argument("--thin", action="store_true", help="also say what a thin element would make of it")

@@ -8,9 +8,9 @@ cos(sqrt(G B) d) and sin(sqrt(G B) d) / sqrt(G B) of a layer d thick are found b
 The gradient is that of the adjoint field: one more solution of the same system, and an integral over the depth.
 
 Walls: the directions along them are those of fmmax's JONES_DIRECT_FOURIER (after V. Liu and S. Fan, Comput. Phys.
-Commun. 183, 2233 (2012)), of which this keeps the real part of their products. The imaginary part breaks the mirror,
-and changes the orders in second order only: 800 terms of the public splitter case give the same orders to the number
-that `examples/invrs_splitter.py` states.
+Commun. 183, 2233 (2012)), of which this keeps the real part of their products. The imaginary part breaks the mirror, and
+changes the orders in second order only: by 1.2e-5 of the incident light in a splitter of 49 orders (800 terms, orders of
+0.016), by 4e-4 to 6e-4 in blobs of 2.4 um (100 terms). Matrices are in single precision: 1e-6 of the incident light.
 """
 
 import math
@@ -44,15 +44,30 @@ class MirroredOrders(NamedTuple):
 
 
 class MirroredGradient(NamedTuple):
-    """How a number changes that depends on the orders of a mirrored layer.
+    """How a number changes that depends on the orders of a mirrored layer, walls held in their directions.
 
     Attributes:
-        permittivity: `[y, x]` its derivative by the permittivity of every pixel, walls held in their directions.
+        permittivity: `[y, x]` its derivative by the permittivity of every pixel.
+        inverse: the part of it that comes by 1 / permittivity, as a derivative by that.
         depth: its derivative by the depth, 1/m.
     """
 
     permittivity: Float[np.ndarray, "y x"]
+    inverse: Float[np.ndarray, "y x"]
     depth: float
+
+    def exchanged(self, old: Float[np.ndarray, "y x"], new: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+        """Tell what every pixel adds to the number if it gets another permittivity altogether.
+
+        First order in the matrices, which permittivity and its inverse enter for different fields: of glass in air, the
+        derivative alone is wrong by the glass's permittivity for fields across a wall.
+
+        Args:
+            old: permittivity of every pixel that the gradient was taken at.
+            new: another.
+        """
+        direct = self.permittivity + self.inverse / old**2
+        return direct * (new - old) + self.inverse * (1 / new - 1 / old)
 
 
 class _Sector(NamedTuple):
@@ -199,22 +214,25 @@ class MirroredLayer:
             solution = self._solve(self._media(permittivity, walls), depth_m)
             return self._orders(solution[1], reach)
 
-    def gradient(
+    def gradients(
         self,
         permittivity: Float[np.ndarray, "y x"],
         depth_m: float,
         walls: Float[np.ndarray, "3 y x"],
         reach: int,
-        weights: Callable[[Float[np.ndarray, "y x"]], Float[np.ndarray, "y x"]],
-    ) -> tuple[MirroredOrders, MirroredGradient]:
-        """Transmit light, and tell how a number that depends on its orders changes with the layer.
+        weights: Callable[[Float[np.ndarray, "y x"]], Float[np.ndarray, "number y x"]],
+    ) -> tuple[MirroredOrders, list[MirroredGradient]]:
+        """Transmit light, and tell how numbers that depend on its orders change with the layer.
 
         Args:
             permittivity: as in `solve`.
             depth_m: as in `solve`.
             walls: as in `solve`; they are taken as constant, as fmmax takes its directions.
             reach: as in `solve`.
-            weights: makes the derivative of the number by each order from the orders; alike for the orders m and -m.
+            weights: makes the derivatives of the numbers by each order from the orders; those by m and -m are added.
+
+        Returns:
+            The orders, and a gradient per number. The first costs about a quarter more than the orders alone.
 
         Raises:
             InputError: as in `solve`.
@@ -225,13 +243,16 @@ class MirroredLayer:
             factors, h = self._solve(media, depth_m)
             orders = self._orders(h, reach)
             e, selection = self._admittance @ h, self._selection(reach)
-            weight = np.tile(weights(orders.orders)[:, reach:].ravel(), 2)
-            # Both orders m and -m, which are alike.
-            weight = weight * np.tile(np.arange(reach + 1) > 0, 2 * (2 * reach + 1)) + weight
-            source = selection.T @ (weight * np.conj(selection @ e))
-            source += self._admittance.T @ (selection.T @ (weight * np.conj(selection @ h)))
-            adjoint = scipy.linalg.lu_solve(factors, source, trans=1)
-            return orders, self._gradient(media, permittivity, depth_m, (h, e), adjoint)
+            found = []
+            for each in weights(orders.orders):
+                folded = each[:, reach:].copy()
+                folded[:, 1:] += each[:, :reach][:, ::-1]
+                weight = np.tile(folded.ravel(), 2)
+                source = selection.T @ (weight * np.conj(selection @ e))
+                source += self._admittance.T @ (selection.T @ (weight * np.conj(selection @ h)))
+                adjoint = scipy.linalg.lu_solve(factors, source, trans=1)
+                found.append(self._gradient(media, permittivity, depth_m, (h, e), adjoint))
+            return orders, found
 
     def _require(self, permittivity: np.ndarray) -> None:
         fits = permittivity.shape == self._shape and permittivity.min() > 0
@@ -323,7 +344,7 @@ class MirroredLayer:
         left, right = media.across.T @ (self._curl @ left), media.across @ (self._curl @ right)
         total += self._products[0][0].adjoint(left @ right.T)
         slope = (1j * (adjoint @ _thin(media.g, e0) + before[1] @ _thin(media.b, h0))).real
-        return MirroredGradient(total - inner / permittivity**2, float(slope / self._unit_m))
+        return MirroredGradient(total - inner / permittivity**2, inner, float(slope / self._unit_m))
 
     def products_of_directions(self, permittivity: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "3 y x"]:
         """Products xx, yy and xy of directions along the walls: fmmax's JONES_DIRECT_FOURIER, the real part of xy.
