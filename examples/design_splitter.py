@@ -4,8 +4,8 @@
     python examples/design_splitter.py splitter.png --resume 0.6830017um --rounds 20
 
 The case is that of `invrs_splitter.py`, which scores what this writes. The cell is its own mirror image, which makes
-light of 800 terms cheap (`sim.rigorous.mirrored`) and costs little: thin elements reach 0.725 instead of 0.752, mirrored
-along both axes 0.546 (the best of six each). From seeded noise:
+light of 800 terms cheap (`sim.rigorous.mirrored`) and costs little: thin elements reach 0.725 instead of 0.752, and
+0.546 if mirrored along both axes (the best of six each). From seeded noise:
 
 1. thin: a smoothed density, pressed to 0 or 1, and the depth, by the gradient of a soft score;
 2. few terms: the same density by rigorous light of 450 terms;
@@ -15,8 +15,8 @@ along both axes 0.546 (the best of six each). From seeded noise:
 5. exchange: bumps and dents of walls that follow the same rule, those that promise most by the derivatives of all
    orders, as long as the score grows. `--resume` goes on with it.
 
-It prints lines of the score by its own light; `invrs_splitter.py` has the last word. Twenty-two minutes on half a core
-made `examples/results/invrs_splitter.png` (seed 10, depth 0.6830017 um), which scores 0.6865 there.
+It prints lines of the score by its own light; `invrs_splitter.py` has the last word. Twenty-two minutes on two busy
+cores made `examples/results/invrs_splitter.png` (seed 10, depth 0.6830017 um), which scores 0.6865 there.
 """
 
 import argparse
