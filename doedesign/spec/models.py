@@ -209,7 +209,8 @@ class DoeSpec(SpecTable, frozen=True):
     @property
     def shape(self) -> tuple[int, int]:
         """Cells (ny, nx)."""
-        return (self.samples, self.samples) if isinstance(self.samples, int) else self.samples[::-1]
+        nx, ny = (self.samples, self.samples) if isinstance(self.samples, int) else self.samples
+        return ny, nx
 
     @property
     def relief(self) -> Aperture:

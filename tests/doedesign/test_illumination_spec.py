@@ -70,6 +70,7 @@ def test_a_spec_has_x_before_y_and_a_beam_y_before_x(tmp_path: Path):
 def test_light_without_a_shape_is_plane_or_comes_from_a_point(tmp_path: Path):
     """On the opening that the chrome leaves, tilted or not."""
     plane = spec_of(tmp_path, PLANE, 'illumination.tilt=["2 deg", "-1 deg"]')
+    assert isinstance(plane.doe.aperture_m, float)
     opening = plane.doe.aperture_m - 2 * plane.process.chrome_overlap_m
     assert camera_from_spec(plane).beam == EvenBeam(opening, tilt_rad=(parse_angle("-1 deg"), parse_angle("2 deg")))
     point = camera_from_spec(spec_of(tmp_path, POINT, 'illumination.angle=["0 deg", "1 deg"]')).beam

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import gdstk
 import numpy as np
@@ -81,7 +82,8 @@ def test_another_library_sees_the_rectangle_where_it_should_be(written):
     chrome = read_manifest(written).chrome
     assert chrome.opening_diameter_mm == [0.07, 0.05]
     library = gdstk.read_gds(str(written / chrome.file))
-    (cell,) = (cell for cell in library.cells if cell.name == read_manifest(written).doe_cell)
+    cells: list[Any] = library.cells
+    (cell,) = (cell for cell in cells if cell.name == read_manifest(written).doe_cell)
     outer = gdstk.ellipse((0, 0), chrome.outer_diameter_mm / 2 * 1e3, tolerance=1e-5)
     drawn = [polygon for polygon in cell.polygons if polygon.layer == chrome.layer]
     (opening,) = gdstk.boolean(gdstk.rectangle((-200, -200), (200, 200)), drawn, "not", precision=1e-4)

@@ -166,7 +166,7 @@ def on_square(map_: np.ndarray, side: int) -> np.ndarray:
         ((48, 96), 96, {}),
         ((48, 96), 96, {"depths": 0.05}),
         ((97, 49), 97, {"sampling": 1.0}),
-        ((97, 49), 97, {"mapping": "tangent"}),
+        pytest.param((97, 49), 97, {"mapping": "tangent"}, marks=pytest.mark.slow),
         ((97, 49), 97, {"propagation": "fresnel"}),
     ],
     ids=str,
