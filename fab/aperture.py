@@ -96,7 +96,7 @@ class Aperture(ABC):
 
 @dataclass(frozen=True)
 class RoundAperture(Aperture):
-    """A disc; of infinite diameter where all of a raster is meant, as in a piece that was cut out of a DOE."""
+    """A disc of a diameter in metres; an infinite one is all of a raster, as of a piece that was cut out of a DOE."""
 
     diameter_m: float
 

@@ -40,7 +40,7 @@ def test_changed_specs_in_a_warm_process(tmp_path: Path):
         for _ in range(30):
             data, done = changed(rng, spec.name, SPEC.read_bytes())
             spec.write_bytes(data)
-            end = process.run(("optimize", "spec.toml", "--out", "out", "--set", "process.levels=12"), tmp_path)
+            end = process.run(("optimize", "spec.toml", "--out", "out", "--set", "process.levels=65"), tmp_path)
             assert (end.code, said_badly(end)) == (2, []), (done, end.err)
             assert end.peak_bytes < MOST_BYTES
             assert [path.name for path in spec.parent.iterdir()] == ["spec.toml"]

@@ -150,6 +150,10 @@ def test_what_cannot_be_is_refused(tmp_path: Path, changes: list[str], where: st
 
 def test_neither_lens_nor_distance_is_refused(tmp_path: Path):
     path = tmp_path / "bare.toml"
-    path.write_text(SPEC.replace('distance = "5 mm"\n', ""))
+    text = SPEC.replace('distance = "5 mm"\n', "")
+    # A start that is a lens has its focus in a distance.
+    path.write_text(text)
+    assert load_spec(path).sensor.distance_m == 5e-3
+    path.write_text(text.replace('start = "fresnel"\nstart_options = { focal_length = "5 mm" }\n', ""))
     with pytest.raises(InputError, match="a camera has a lens, or a sensor at a distance"):
         load_spec(path)
