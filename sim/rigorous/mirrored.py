@@ -9,7 +9,7 @@ The gradient is that of the adjoint field: one more solution of the same system,
 
 Walls: the directions along them are those of fmmax's JONES_DIRECT_FOURIER (after V. Liu and S. Fan, Comput. Phys.
 Commun. 183, 2233 (2012)), of which this keeps the real part of their products. The imaginary part breaks the mirror,
-and changes the orders in second order only: by 1.2e-5 of the incident light in a splitter of 49 orders of 0.016 each
+and changes the orders in second order only: by 1e-5 to 3e-5 of the incident light in splitters of 49 orders of 0.016
 (800 terms), by 4e-4 to 6e-4 in blobs of 2.4 um (100 terms). Matrices are in single precision: 1e-6 of that light.
 """
 

@@ -67,11 +67,11 @@ def test_the_cell_that_it_made_follows_the_rule():
 def test_the_cell_that_it_made_has_the_score_that_is_stated():
     """Both solvers, which share nothing but the case."""
     pytest.importorskip("fmmax")
-    cell, height_m = invrs_splitter.read_design(RESULT), 0.6830017e-6
+    cell, height_m = invrs_splitter.read_design(RESULT), 0.6828558e-6
     score = invrs_splitter.rigorous_scores(cell, height_m)[1]
-    assert score.value == pytest.approx(0.6865, abs=1e-3)
+    assert score.value == pytest.approx(0.6877, abs=1e-3)
     layer = MirroredLayer(180, invrs_splitter.PERIOD_M, invrs_splitter.WAVELENGTH_M, (invrs_splitter.GLASS, 1.0), 800)
     permittivity = 1 + (invrs_splitter.GLASS**2 - 1) * cell.T
     found = layer.solve(permittivity, height_m, layer.products_of_directions(permittivity), 3)
-    # The imaginary part of the products of directions, 1.2e-5, and single precision.
-    assert found.orders == pytest.approx(score.orders, abs=3e-5)
+    # The imaginary part of the products of directions, 2.9e-5, and single precision.
+    assert found.orders == pytest.approx(score.orders, abs=5e-5)
