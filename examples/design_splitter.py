@@ -33,7 +33,7 @@ from scipy.ndimage import distance_transform_edt
 from fab.errors import InputError
 from fab.pictures import write_pixels
 from fab.units import metres
-from sim.rigorous.mirrored import MirroredLayer
+from sim.rigorous import MirroredLayer
 
 BRUSH = 10  # pixels
 _SMOOTHED = 10.0  # pixels, radius of the cone that smoothes densities; a width of the same is held by 0.75 and 0.25
