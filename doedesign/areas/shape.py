@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
-from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, in_plane
+from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, colour_number, in_plane
 from doedesign.design.design import Design
 from doedesign.spec import input_files
 from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length
@@ -247,8 +247,7 @@ def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
         picture = input_files(spec, key)[key] if area.picture else None
         target = AreaTarget.of(area, camera_for(area, design.camera), picture, _SAMPLES)
         seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
-        number = 0 if area.colour is None else [colour.name for colour in doe.camera.colours].index(area.colour)
-        tables.append(area_table(seen, target, number))
+        tables.append(area_table(seen, target, colour_number(area, doe.camera)))
     return tuple(tables)
 
 

@@ -29,8 +29,12 @@ _TAPER = 3.0  # samples
 
 def camera_for(table: AreaSpec, camera: Camera) -> Camera:
     """The camera whose first and only colour lights an area, with its sensor where the area lies."""
-    number = 0 if table.colour is None else [colour.name for colour in camera.colours].index(table.colour)
-    return replace(in_plane(table, camera), colours=(camera.colours[number],))
+    return replace(in_plane(table, camera), colours=(camera.colours[colour_number(table, camera)],))
+
+
+def colour_number(table: AreaSpec, camera: Camera) -> int:
+    """Which of a camera's colours lights an area."""
+    return 0 if table.colour is None else [colour.name for colour in camera.colours].index(table.colour)
 
 
 def in_plane(table: AreaSpec, camera: Camera) -> Camera:

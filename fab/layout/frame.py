@@ -162,20 +162,23 @@ def _lane_marks(photomask: Photomask, die_m: float, lane_m: float, dbu_m: float)
     return Part(dbu_m, {photomask.on(1): Shapes(np.array(boxes, dtype=np.int32)[:, [0, 2, 1, 3]])}, {})
 
 
-def _chrome_to_edge(annulus: Shapes, layer: Layer, die_m: float, bare: Sequence[Part]) -> Part:
-    """Draw chrome from the annulus around the aperture to the edges of the die, with room around marks and words."""
+def _chrome_to_edge(chrome: Shapes, layer: Layer, die_m: float, bare: Sequence[Part]) -> Part:
+    """Draw chrome from that around the aperture to the edges of the die, with room around marks and words."""
     dbu_m = bare[0].dbu_m
     unit = _InUnits(dbu_m)
     edge, margin = unit(die_m / 2), unit(_BAR_M)
-    square = max(map(abs, annulus.box or (0,))) + unit(GAP_M / 2)
+    square = max(map(abs, chrome.box or (0,))) + unit(GAP_M / 2)
     holes = [(x0 - margin, y0 - margin, x1 + margin, y1 + margin) for x0, y0, x1, y1 in (part.box for part in bare)]
     rest = without([(-edge, -edge, edge, edge)], [(-square, -square, square, square), *holes])
-    polygons = tuple(_to_square(sector, square) for sector in annulus.polygons)
+    # Sectors reach the outer circle; the frame around a rectangular opening lies within them.
+    reaches = [np.hypot(*polygon.T.astype(np.float64)).max() for polygon in chrome.polygons]
+    sectors = (p for p, reach in zip(chrome.polygons, reaches, strict=True) if reach > max(reaches) - 2)
+    polygons = tuple(_to_square(sector, square) for sector in sectors)
     return Part(dbu_m, {layer: Shapes(rest.astype(np.int32), polygons)}, {})
 
 
 def _to_square(sector: NDArray[np.int32], square: int) -> NDArray[np.int32]:
-    """Return what lies between the outer arc of a sector of an annulus and a centred square of half the edge."""
+    """Return what lies between the outer arc of a sector and a centred square around it, of half the edge."""
     radius = np.hypot(*sector.T.astype(np.float64))
     arc = sector[radius > radius.mean()].astype(np.float64)
     first, last = (np.rint(point * (square / np.abs(point).max())) for point in (arc[0], arc[-1]))

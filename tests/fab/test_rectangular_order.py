@@ -95,6 +95,19 @@ def test_another_library_sees_the_rectangle_where_it_should_be(written):
     assert chrome.area_um2 == pytest.approx(area, rel=1e-9)
 
 
+def test_no_chrome_of_a_die_lies_in_its_opening(written):
+    """All of the die counts: that around the DOE, and that from there to the edges of the die."""
+    chrome = read_manifest(written).chrome
+    cells: list[Any] = gdstk.read_gds(str(written / chrome.file)).cells
+    dies = [cell for cell in cells if cell.name.endswith("_DIE")]
+    assert dies
+    for die in dies:
+        drawn = [polygon for polygon in die.get_polygons() if polygon.layer == chrome.layer]
+        around = gdstk.rectangle((-560, -560), (560, 560))  # its corners lie beyond the outer circle
+        (opening,) = gdstk.boolean(around, drawn, "not", precision=1e-4)
+        assert opening.area() == pytest.approx(OPENING_UM[0] * OPENING_UM[1], rel=1e-6)
+
+
 def test_the_order_is_proved_from_its_files_and_its_request(written):
     report = verify(written)
     assert report.differences == ()
