@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 from fab.files import scratch_folder
 from fab.gds.plain import PlainCell, plain_cells
+from fab.layout.arrays import cell_name
 from fab.layout.geometry import Cell, Layer, PixelEdges, Reference, Shapes
 from fab.layout.limits import Tally
 from fab.units import NM, UM
@@ -158,11 +159,16 @@ class GdstkReader:
             for name, references in self._references.items()
         ]
 
-    def gds(self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer]) -> Iterator[LayerReading]:
+    def gds(
+        self, path: str | Path, layers: Mapping[Layer, int], others: Iterable[Layer], most: int = 10**8
+    ) -> Iterator[LayerReading]:
         """Read a GDSII file, few enough shapes at a time to bound the memory; unpack it first if it ends in .gz.
 
         `layers` are those of the DOE with the number of shapes expected on each, `others` all other ones. Yields one
         reading per layer, in the order given, and cell of the DOE.
+
+        Raises:
+            InputError: copies of one cell in those of the DOE stand for more than `most` shapes.
         """
         waiting = list(layers)
         rest = [(layer.number, layer.datatype) for layer in others if layer not in layers]
@@ -174,7 +180,9 @@ class GdstkReader:
                 wanted = {(layer.number, layer.datatype) for layer in group}
                 wanted.update(rest)
                 rest = []
-                yield from self._read(gdstk.read_gds(str(plain), unit=UM, filter=wanted), group)
+                yield from self._read(
+                    gdstk.read_gds(str(plain), unit=UM, filter=wanted), group, Tally(str(path), {"shapes": most})
+                )
 
     def oasis(self, path: str | Path, layers: Iterable[Layer], most: int = 10**8) -> Iterator[LayerReading]:
         """Read an OASIS file, known to be whole, and unfold its repetitions; yield a reading per layer and cell.
@@ -190,15 +198,26 @@ class GdstkReader:
             tally.add("placed copies", _unfold_to(cell.references))
             tally.add("shapes", _unfold_to(cell.polygons))
             tally.add("polygons that are no rectangles", _unfold_to(one for one in cell.polygons if one.size != 4))
-        yield from self._read(library, list(layers))
+        yield from self._read(library, list(layers), tally)
 
-    def _read(self, library: Any, group: list[Layer]) -> Iterator[LayerReading]:
+    def _unfold(self, library: Any, tally: Tally) -> None:
+        """Have the library draw into the cells of the DOE what they repeat (`fab.layout.arrays`)."""
+        for doe in [cell for cell in library.cells if cell.name in self.does and cell.references]:
+            one, *others = {reference.cell_name: reference.cell for reference in doe.references}.values()
+            if others or one.name != cell_name(doe.name) or one.references:
+                continue
+            tally.add("shapes", _unfold_to(doe.references) * _unfold_to(one.polygons))
+            doe.flatten()
+            library.remove(one)
+
+    def _read(self, library: Any, group: list[Layer], tally: Tally) -> Iterator[LayerReading]:
         if abs(library.precision / self.edges.dbu_m - 1) > 1e-6:
             units = [f"{value / NM:.9g} nm" for value in (library.precision, self.edges.dbu_m)]
             self.problems.append(f"the database unit is {units[0]} instead of {units[1]}")
         # What a coordinate means is compared, whatever the unit it was written in.
         library.precision = self.edges.dbu_m
         odd = {cell.name for cell in library.cells if cell.labels or cell.paths}
+        self._unfold(library, tally)
         found: dict[tuple[str, Layer], _Taken] = {(name, layer): ([], []) for layer in group for name in self.does}
         for cell in _cells(library, self.scratch):
             if cell.name in odd or cell.others:

@@ -1,8 +1,9 @@
 """Drawings of the photomasks, in integer database units.
 
-geometry      Layer, Shapes, Cell, Layout; pixel edges, names, circles
-polygons      bitmap <-> rectangles (numba), circles as annulus sectors
+geometry      Layer, Shapes, Cell, Layout; pixel edges, names, chrome
+polygons      bitmap <-> rectangles (numba), chrome as sectors of an annulus
 compensation  planes grown or shrunk against a line-width bias
+arrays        a relief that repeats, as arrays of one cell
 doe           the cell of a DOE: its planes as they are drawn, and its chrome
 split         DieSplit: dies that draw the DOE differently on purpose
 part          Part: things drawn about their own origin, and the photomasks they are drawn for

@@ -116,8 +116,26 @@ class _Raster(NamedTuple):
         return 1 - out[1:-1, 1:-1] if self.shrinks else out
 
 
+class MovedPlane(NamedTuple):
+    """A plane as it is drawn: `cells` ``[y, x]``, 1 where etched, between lines x and y, and how far edges moved."""
+
+    cells: NDArray[np.uint8]
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
+    move_units: int
+
+    def shapes(self) -> Shapes:
+        """Draw it with rectangles."""
+        return Shapes(rectangles(self.cells, self.x, self.y))
+
+
 def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shapes:
-    """Draw a plane ``[y, x]`` of 0 and 1 (1 where etched), its edges moved outward by database units, inward if < 0.
+    """Draw what is `moved`."""
+    return moved(plane, edges, move_units).shapes()
+
+
+def moved(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> MovedPlane:
+    """Return a plane ``[y, x]`` of 0 and 1 (1 where etched), its edges moved outward by database units, inward if < 0.
 
     Raises:
         InputError: moving the edges back would not give the plane, because a line or a space is not wider than twice
@@ -125,7 +143,7 @@ def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shape
     """
     plane = np.ascontiguousarray(plane, dtype=np.uint8)
     if move_units == 0:
-        return Shapes(rectangles(plane, edges.x, edges.y))
+        return MovedPlane(plane, edges.x, edges.y, 0)
     raster = _Raster.of(edges, move_units)
     cells = raster.cells(plane)
     if not np.array_equal(raster.pixels(cells), plane):
@@ -134,8 +152,7 @@ def grown(plane: NDArray[np.uint8], edges: PixelEdges, move_units: int) -> Shape
         finest = "" if pixels is None else f", where the narrowest {what} has {pixels} pixels"
         rule = "edges must move by less than half the narrowest line and space"
         raise InputError("edge move", rule, f"{_text(move_units, edges)}{finest}", "Choose a smaller one.")
-    x, y = (lines.astype(np.int32) for lines in (raster.x, raster.y))
-    return Shapes(rectangles(cells, x, y))
+    return MovedPlane(cells, raster.x.astype(np.int32), raster.y.astype(np.int32), move_units)
 
 
 def read_back(shapes: Shapes, edges: PixelEdges, move_units: int) -> NDArray[np.uint8]:

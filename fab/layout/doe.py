@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from fab.layout.compensation import grown
+from fab.layout.arrays import arrayed, period_of
+from fab.layout.compensation import MovedPlane, moved
 from fab.layout.geometry import Cell, Chrome, Layout, chrome_layer, chrome_shapes, etch_layer, pixel_edges, require_name
 from fab.level_map import LevelMap
 
@@ -17,6 +18,8 @@ def mask_layout(
 ) -> Layout:
     """Draw planes and chrome of one DOE as one cell, centred on the aperture: a layer per etch mask, the chrome last.
 
+    A relief that repeats is drawn as arrays of a second cell, which comes before that of the DOE (`fab.layout.arrays`).
+
     `edge_moves` says per mask how far every edge of an etched area is moved outward, database units
     (`fab.layout.compensation`), `bits` which plane each mask draws, its own by default (`fab.layout.split`).
     """
@@ -25,7 +28,11 @@ def mask_layout(
     drawn = level_map.planes()[list(bits)] if bits else level_map.planes()
     # The kernel lets go of the interpreter lock, so the planes share the cores.
     with ThreadPoolExecutor() as pool:
-        found = pool.map(lambda plane, move: grown(plane, edges, move), drawn, moves)
-        shapes = {etch_layer(mask, levels): rectangles for mask, rectangles in enumerate(found)}
-    shapes[chrome_layer(levels)] = chrome_shapes(level_map, edges.dbu_m, chrome or Chrome())
-    return Layout(edges.dbu_m, (Cell(require_name(cell), shapes),))
+        found = list(pool.map(lambda plane, move: moved(plane, edges, move), drawn, moves))
+        planes = {etch_layer(mask, levels): plane for mask, plane in enumerate(found)}
+        shapes = dict(zip(planes, pool.map(MovedPlane.shapes, found), strict=True))
+    chromed = {chrome_layer(levels): chrome_shapes(level_map, edges.dbu_m, chrome or Chrome())}
+    whole = Cell(require_name(cell), shapes | chromed)
+    period = period_of(level_map.level)
+    *one, doe = (arrayed(whole, planes, edges, period) if period else None) or [whole]
+    return Layout(edges.dbu_m, (*one, doe))

@@ -4,6 +4,7 @@ The writer writes what is drawn here; `fab.order.verify` draws it again from the
 """
 
 import platform
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ from importlib.metadata import version
 from typing import Any, TypeVar
 
 from fab.files import canonical_json, sha256_bytes
+from fab.layout.arrays import unfolded
 from fab.layout.doe import mask_layout
 from fab.layout.frame import Frame, draw_frame
 from fab.layout.geometry import Cell, Layer, Layout, chrome_layer, merged, pixel_edges
@@ -38,6 +40,13 @@ class DrawnOrder:
     order: Order
     layout: Layout
     frame: Frame
+
+    @cached_property
+    def does(self) -> tuple[Cell, ...]:
+        """The cells of the DOE, one for each split, with all that they draw, even where it is an array of one cell."""
+        names = [f"{self.order.stem}_{split.code}" for split in self.order.splits]
+        cells = unfolded(self.layout, names, sys.maxsize).cells
+        return cells[: len(names)]
 
     def plate(self, photomask: Photomask) -> Layout:
         """Return the drawing of one photomask."""
@@ -79,7 +88,7 @@ def draw(order: Order) -> DrawnOrder:
     """Draw the DOE as its dies hold it, and everything around it."""
     level_map = order.level_map
     does = [
-        mask_layout(level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits).top
+        mask_layout(level_map, f"{order.stem}_{split.code}", order.chrome, split.moves, split.bits)
         for split in order.splits
     ]
 
@@ -91,18 +100,19 @@ def draw(order: Order) -> DrawnOrder:
             splits=order.splits,
             job=order.job,
             minimum_line_m=order.process.minimum_line_m,
-            chrome=does[0].shapes[chrome_layer(level_map.levels)],
+            chrome=does[0].top.shapes[chrome_layer(level_map.levels)],
             dbu_m=order.dbu_m,
         )
 
     frame = _kept(order, "frame", around)
-    return DrawnOrder(order, Layout(order.dbu_m, (*does, *frame.cells)), frame)
+    cells = [cell for doe in does for cell in doe.cells]
+    return DrawnOrder(order, Layout(order.dbu_m, (*cells, *frame.cells)), frame)
 
 
-def _mask_file(name: str, kind: str, layout: Layout, layers: Iterable[Layer], does: int) -> FileEntry:
-    """Return the entry of a mask file but for its bytes; the first cells of the layout are those of the DOE."""
-    around = [cell_entry(cell, layout.dbu_m) for cell in layout.cells[does:]]
-    return FileEntry(name, kind, 0, "", layout.top.name, [str(layer) for layer in layers], around)
+def _mask_file(name: str, kind: str, layout: Layout, layers: Iterable[Layer], around: int) -> FileEntry:
+    """Return the entry of a mask file but for its bytes; the last cells of the layout are those around the DOE."""
+    entries = [cell_entry(cell, layout.dbu_m) for cell in layout.cells[-around:]]
+    return FileEntry(name, kind, 0, "", layout.top.name, [str(layer) for layer in layers], entries)
 
 
 def _paper_names(order: Order) -> Sequence[str]:
@@ -113,15 +123,15 @@ def _paper_names(order: Order) -> Sequence[str]:
 
 def file_entries(drawing: DrawnOrder, models: Sequence[ModelEntry]) -> list[FileEntry]:
     """Return the entries of all files of an order, their sizes and digests still missing."""
-    order, layout, does = drawing.order, drawing.layout, len(drawing.order.splits)
-    drawn = list(layout.cells[0].shapes)
+    order, layout, around = drawing.order, drawing.layout, len(drawing.frame.cells)
+    drawn = list(drawing.does[0].shapes)
     plates = [(drawing.plate(photomask), {Layer(photomask.layer)} & {*drawn}) for photomask in order.photomasks]
     others = [model.file for model in models]
     others += [f"{order.stem}_{ending}" for ending in (*_paper_names(order), "LEVELS.npy")]
     return [
-        *(_mask_file(name, "GDSII", layout, drawn, does) for name in [order.combined_gds] if name),
-        *(_mask_file(order.plate_file(plate.top.name), "GDSII", plate, layers, does) for plate, layers in plates),
-        _mask_file(f"{order.stem}_ALL.oas", "OASIS", layout, drawn, does),
+        *(_mask_file(name, "GDSII", layout, drawn, around) for name in [order.combined_gds] if name),
+        *(_mask_file(order.plate_file(plate.top.name), "GDSII", plate, layers, around) for plate, layers in plates),
+        _mask_file(f"{order.stem}_ALL.oas", "OASIS", layout, drawn, around),
         *(FileEntry(name, name.rpartition(".")[2].upper(), 0, "", None, [], []) for name in others),
     ]
 
@@ -138,7 +148,6 @@ def manifest_of(
     order, layout, frame = drawing.order, drawing.layout, drawing.frame
     level_map, stem = order.level_map, order.stem
     levels, grid = level_map.levels, level_map.grid
-    does = Layout(layout.dbu_m, layout.cells[: len(order.splits)])
     return Manifest(
         format=FORMAT,
         name=level_map.name,
@@ -158,13 +167,13 @@ def manifest_of(
         combined_gds=order.combined_gds,
         combined_oasis=f"{stem}_ALL.oas",
         preview=f"{stem}_PREVIEW.png",
-        doe_cell=layout.cells[0].name,
+        doe_cell=drawing.does[0].name,
         plates=[photomask_entry(order, photomask) for photomask in order.photomasks],
         wafer=wafer_entry(order, frame),
         rules=order.rules.as_record(),
-        masks=[mask_entry(order, layout, bit, plane) for bit, plane in enumerate(level_map.planes())],
-        splits=split_entries(order, does, frame),
-        chrome=chrome_entry(order, layout),
+        masks=[mask_entry(order, drawing.does[0], bit, plane) for bit, plane in enumerate(level_map.planes())],
+        splits=split_entries(order, drawing.does, frame),
+        chrome=chrome_entry(order, drawing.does[0]),
         models=list(models),
         files=list(files),
         tools=dict(made_by),

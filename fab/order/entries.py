@@ -1,10 +1,12 @@
 """Entries of the manifest of an order: its masks, its chrome, its photomasks, its wafer and its splits."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fab.layout.frame import Frame
-from fab.layout.geometry import Cell, Layout, PixelEdges, chrome_layer, etch_layer, on_units
+from fab.layout.geometry import Cell, PixelEdges, chrome_layer, etch_layer, on_units
 from fab.layout.part import Photomask
 from fab.layout.polygons import smallest_runs
 from fab.layout.split import DieSplit
@@ -23,8 +25,8 @@ from fab.order.order import Order
 from fab.units import MM, NM, UM, format_length
 
 
-def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
-    """Return the manifest's entry of an etch mask, from the drawing and from its plane before the edges moved."""
+def mask_entry(order: Order, doe: Cell, bit: int, plane: NDArray[np.uint8]) -> MaskEntry:
+    """Return the manifest's entry of an etch mask, from the DOE's cell and from its plane before the edges moved."""
     levels, pitch_m = order.level_map.levels, order.level_map.grid.pitch_m
     layer = etch_layer(bit, levels)
     width_um, space_um = (None if run is None else round(run * pitch_m / UM, 6) for run in smallest_runs(plane))
@@ -37,20 +39,20 @@ def mask_entry(order: Order, layout: Layout, bit: int, plane: NDArray[np.uint8])
         file=order.plate_file(stem),
         cell=stem,
         depth_nm=round(levels.etch_depth_m(bit) / NM, 9),
-        edge_move_nm=round(order.edge_moves()[bit] * layout.dbu_m / NM, 9),
+        edge_move_nm=round(order.edge_moves()[bit] * order.dbu_m / NM, 9),
         polygon_means=CONVENTIONS["etch layers"],
         smallest_width_um=width_um,
         smallest_space_um=space_um,
         plane_sha256=plane_digest(plane),
-        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
+        **geometry(doe.shapes[layer], order.dbu_m),  # type: ignore[arg-type]
     )
 
 
-def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
+def chrome_entry(order: Order, doe: Cell) -> ChromeEntry:
     """Return the manifest's entry of the chrome around the clear aperture."""
     layer = chrome_layer(order.level_map.levels)
-    opening = on_units(order.chrome.opening(order.level_map.relief), layout.dbu_m)
-    outer = round(order.chrome.rim_m(order.level_map) / layout.dbu_m)
+    opening = on_units(order.chrome.opening(order.level_map.relief), order.dbu_m)
+    outer = round(order.chrome.rim_m(order.level_map) / order.dbu_m)
     return ChromeEntry(
         layer=layer.number,
         datatype=layer.datatype,
@@ -58,11 +60,11 @@ def chrome_entry(order: Order, layout: Layout) -> ChromeEntry:
         cell=f"{order.stem}_CHROME",
         polygon_means=CONVENTIONS["chrome layer"],
         opening_diameter_mm=opening.record(MM, 9),
-        outer_diameter_mm=round(2 * outer * layout.dbu_m / MM, 9),
+        outer_diameter_mm=round(2 * outer * order.dbu_m / MM, 9),
         overlap_um=round(order.chrome.overlap_m / UM, 9),
         chord_error_nm=round(order.chrome.chord_error_m / NM, 9),
-        shapes_sha256=shapes_digest(layout.cells[0].shapes[layer]),
-        **geometry(layout.cells[0].shapes[layer], layout.dbu_m),  # type: ignore[arg-type]
+        shapes_sha256=shapes_digest(doe.shapes[layer]),
+        **geometry(doe.shapes[layer], order.dbu_m),  # type: ignore[arg-type]
     )
 
 
@@ -100,8 +102,8 @@ def wafer_entry(order: Order, frame: Frame) -> WaferEntry:
     )
 
 
-def split_entries(order: Order, drawn: Layout, frame: Frame) -> list[SplitEntry]:
-    """Return the manifest's entries of the dies that draw the DOE differently, as the cells of `drawn` do."""
+def split_entries(order: Order, does: Sequence[Cell], frame: Frame) -> list[SplitEntry]:
+    """Return the manifest's entries of the dies that draw the DOE differently, as the cells of `does` say."""
     return [
         SplitEntry(
             cell.name,
@@ -109,7 +111,7 @@ def split_entries(order: Order, drawn: Layout, frame: Frame) -> list[SplitEntry]
             [n for n, die in enumerate(frame.splits, 1) if die == number],
             _drawn_entries(order, split, cell),
         )
-        for number, (split, cell) in enumerate(zip(order.splits, drawn.cells, strict=True))
+        for number, (split, cell) in enumerate(zip(order.splits, does, strict=True))
         if number
     ]
 

@@ -30,6 +30,7 @@ from fab.files import MANIFEST_NAME, read_npy, scratch_folder, sha256_file
 from fab.gds.gdstk_reader import GdstkReader
 from fab.gds.reader import read_gds
 from fab.gds.writer import oasis_to_gds
+from fab.layout.arrays import unfolded
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Layer, PixelEdges, pixel_edges
 from fab.layout.limits import MOST_AROUND
@@ -103,7 +104,8 @@ def _paint_cell(
     path: str | Path, cell: str, edges: PixelEdges, moves: Sequence[int], etched: NDArray[np.uint8]
 ) -> None:
     """Set the bits ``[y, x]`` of the etch layers that a cell of a file holds."""
-    drawn = read_gds(path).cell(cell)
+    # A rectangle covers a pixel at least, and one whose edges were moved a part of one in nine.
+    drawn = unfolded(read_gds(path), [cell], 9 * len(moves) * etched.size).cell(cell)
     if drawn is None:
         raise InputError(str(path), f"must hold the cell {cell}", "none of that name", "Write the order again.")
     for bit, move in enumerate(moves):
@@ -151,12 +153,13 @@ def _own_check(path: Path, entry: FileEntry, expected: Expected) -> tuple[Check,
     question = "own reader, every pixel"
     try:
         layout = read_gds(path)
+        whole = unfolded(layout, expected.manifest.drawn(), _most_shapes(entry, expected))
     except InputError as error:
         problem = f"it cannot be read: {error.rule}, but got {error.got}"
         return Check(entry.file, question, (problem,)), False
     fit = abs(layout.dbu_m / expected.edges.dbu_m - 1) < 1e-9
     blank_m = expected.manifest.wafer.blank_mm * MM
-    problems = layout_problems(layout, entry, expected) + drawing_problems(layout, blank_m)
+    problems = layout_problems(whole, entry, expected) + drawing_problems(layout, blank_m)
     return Check(entry.file, question, tuple(problems)), fit
 
 
@@ -199,7 +202,7 @@ def _library_check(path: Path, entry: FileEntry, expected: Expected, scratch: Pa
     if entry.format == _OASIS:
         readings = again.oasis(path, layers, _most_shapes(entry, expected))
     else:
-        readings = again.gds(path, layers, others)
+        readings = again.gds(path, layers, others, _most_shapes(entry, expected))
     question = "gdstk, every pixel"
     try:
         problems = [problem for reading in readings for problem in reading_problems(reading, entry, expected)]

@@ -25,7 +25,7 @@ from tests.campaign import bombs
 
 SAYS = {
     "nested_arrays": "at most 100000 placed copies",
-    "doublings": "at most 10000000 copies through all levels",
+    "doublings": "at most 100000000 copies through all levels",
     "chain": "at most 32 cells placed one within another",
     "many_cells": "at most 2000 cells",
     "many_polygons": "at most 20000 polygons that are no rectangles",
