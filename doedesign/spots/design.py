@@ -80,6 +80,9 @@ class SpotTask:
         if spec.spots.period_m is not None:
             grid = unit_cell(spec.spots, camera)
             coverage = np.ones(grid.shape, np.float32)
+            # The first cell begins where the DOE does.
+            y_m, x_m = ((own - whole) / 2 * grid.pitch_m for own, whole in zip(grid.shape, spec.doe.shape, strict=True))
+            spots = spots.about((y_m, x_m))
         return cls(spec, spec.spots, camera, levels, SpotProblem.on(grid, coverage, spots, staircase))
 
     @property
@@ -88,8 +91,11 @@ class SpotTask:
         return self.table.period_m is not None
 
     def initial_state(self) -> SpotState:
-        """The most promising of the phases that a search finds, tried with levels on all cells."""
+        """The most promising of the phases that a search finds, tried with levels on all cells, or the given ones."""
         problem, table = self.problem, self.table
+        if problem.spots.phases is not None:
+            waves = WaveSet(np.sqrt(problem.spots.shares), problem.spots.phases)
+            return SpotState(waves, waves, -np.inf, 0)
         few = problem.staircase if self.levels.count <= _FEW_LEVELS else None
         points = search_points(problem.spots, self.spec.optimize.seed, problem.grid.extent_m)
         found = search_phases(
@@ -111,6 +117,8 @@ class SpotTask:
     @property
     def begins(self) -> str:
         """How a design begins, in words."""
+        if self.problem.spots.phases is not None:
+            return f"starting from the phases of {self.problem.spots.count} spots"
         return f"searching phases of {self.problem.spots.count} spots, {self.table.starts} starts"
 
     def _after(self, state: SpotState, steps: int) -> SpotState:
@@ -209,20 +217,21 @@ def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:
     """Spots of a table, for the first wavelength of a camera; from the direction in which light arrives."""
     wavelength = camera.lines[0].wavelength_m
     shares = shares_of(table.weights, table.spot_count)
+    phases = np.array(table.phases_rad) if table.phases_rad else None
     if table.period_m is not None:
         assert table.count is not None
         orders, step = grid_orders(table.count), 1 / table.period_m
-        return Spots(orders * step, shares, orders, (step, step))
+        return Spots(orders * step, shares, orders, (step, step), phases)
     places = _places_m(table)
     middle = np.array(table.offset_m[::-1])
     sines = np.stack(camera.sines_of(*(places + middle).T), axis=1) - np.array(camera.moved_sines())
     if table.arrangement != "grid" or middle.any() or not camera.images_alike:
-        return Spots(sines / wavelength, shares)
+        return Spots(sines / wavelength, shares, phases=phases)
     assert table.spacing_m is not None
     # An even count has no middle: its spots are the odd ones of a lattice twice as fine.
     spacing = table.spacing_m / (2 if any(n % 2 == 0 for n in table.count or ()) else 1)
     step = spacing / camera.sensor_distance_m / wavelength
-    return Spots(sines / wavelength, shares, np.rint(places / spacing).astype(int), (step, step))
+    return Spots(sines / wavelength, shares, np.rint(places / spacing).astype(int), (step, step), phases)
 
 
 def _places_m(table: SpotsSpec) -> Float[np.ndarray, "m 2"]:

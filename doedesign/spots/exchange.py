@@ -25,14 +25,16 @@ def exchange(
     """Change cells of a level map one by one for efficiency less `uniformity` times how unequal spots are.
 
     That is the fourth root of the mean fourth power of their relative deviations, times 1.4: about as large as the
-    uniformity error (max - min) / (max + min), and smoother.
+    uniformity error (max - min) / (max + min), and smoother. Where the phases of spots are given, the efficiency is that
+    of the wave that they make together.
 
     Simulated annealing (S. Kirkpatrick et al., Science 220, 671, 1983): a change that costs merit is taken with the
     probability exp(-cost / heat), and heat falls to zero over the first sweeps. A sweep offers every cell the level of
     a neighbour, which moves a border between levels, or now and then another, most often the next. The best map that
     was met is returned; by this measure it is never worse than the one given.
     """
-    sums, shares = problem.sums, problem.spots.shares
+    sums, spots, shares = problem.sums, problem.spots, problem.spots.shares
+    wanted = np.zeros(0, complex) if spots.phases is None else np.sqrt(shares) * np.exp(-1j * spots.phases)
     waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(len(shares), -1).T.astype(np.complex128)
     waves = waves / float(np.sum(problem.coverage, dtype=np.float64)) * problem.coverage.reshape(-1, 1)
     rng = np.random.default_rng((seed, 0xE8C4))
@@ -46,18 +48,21 @@ def exchange(
         others = np.where(rng.random(own.size) < 0.5, others, rng.integers(1, max(count, 2), own.size))
         others = np.where(rng.random(own.size) < (_ANY_OF_TWO if count == 2 else _ANY), others, 0)
         sides = rng.integers(0, 4, own.size)
-        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, level.shape, order, chance,
-               others, sides, heat * warm**2, uniformity)  # fmt: skip
+        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, wanted, level.shape, order,
+               chance, others, sides, heat * warm**2, uniformity)  # fmt: skip
     return best.reshape(level.shape)
 
 
 @njit(cache=True, nogil=True)
-def _merit(light: Any, shares: Any, uniformity: float) -> float:
+def _merit(light: Any, shares: Any, wanted: Any, uniformity: float) -> float:
     total, over = 0.0, 0.0
     for k in range(len(light)):
         power = light[k].real ** 2 + light[k].imag ** 2
         total += power
         over += power / shares[k]
+    if len(wanted):
+        wave = np.sum(wanted * light)
+        total = wave.real**2 + wave.imag**2
     mean, spread = max(over / len(light), 1e-300), 0.0
     for k in range(len(light)):
         off = (light[k].real ** 2 + light[k].imag ** 2) / shares[k] / mean - 1.0
@@ -72,6 +77,7 @@ def _sweep(
     waves: NDArray[np.complex128],
     light_of: NDArray[np.complex128],
     shares: NDArray[np.float64],
+    wanted: NDArray[np.complex128],
     shape: tuple[int, int],
     order: Any,
     chance: Any,
@@ -85,7 +91,7 @@ def _sweep(
     for cell in range(len(own)):
         light += light_of[own[cell]] * waves[cell]
         kept += light_of[best[cell]] * waves[cell]
-    merit, highest = _merit(light, shares, uniformity), _merit(kept, shares, uniformity)
+    merit, highest = _merit(light, shares, wanted, uniformity), _merit(kept, shares, wanted, uniformity)
     ny, nx = shape
     for cell, throw, other, side in zip(order, chance, others, sides):  # noqa: B905 - numba knows no strict
         y, x = cell // nx, cell % nx
@@ -103,7 +109,7 @@ def _sweep(
         if level == own[cell]:
             continue
         tried = light + (light_of[level] - light_of[own[cell]]) * waves[cell]
-        found = _merit(tried, shares, uniformity)
+        found = _merit(tried, shares, wanted, uniformity)
         if found >= merit or (heat > 0 and throw < np.exp((found - merit) / heat)):
             own[cell], light, merit = level, tried, found
             if merit > highest:

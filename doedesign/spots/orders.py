@@ -16,7 +16,7 @@ from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
 from sim.optic import CellOptic
-from sim.propagation.directions import efficiencies
+from sim.propagation.directions import peak_amplitudes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,6 +81,8 @@ class OrderTable:
         ceiling: what light allows.
         light: "scalar" or "edges", as the DOE was looked at.
         unit: in which places are told.
+        phase_errors: `[spot]` phases less those that are given, radians, after the best common one; None where free.
+        in_wave: share of the light in the wave of the given phases; None where they are free.
     """
 
     spots: Spots
@@ -92,6 +94,8 @@ class OrderTable:
     ceiling: Ceiling
     light: str = "scalar"
     unit: PlaceUnit = MILLIMETRES
+    phase_errors: Float[np.ndarray, " m"] | None = None
+    in_wave: float | None = None
 
     @property
     def total(self) -> float:
@@ -118,9 +122,15 @@ class OrderTable:
         """Name of its files and of its entry among metrics."""
         return "orders"
 
+    @property
+    def phase_rmse(self) -> float | None:
+        """Root mean square of the phase errors, radians; None where phases are free."""
+        return None if self.phase_errors is None else float(np.sqrt(np.mean(self.phase_errors**2)))
+
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
-        return {
+        given = {} if self.in_wave is None else {"in_wave": self.in_wave, "phase_rmse_rad": self.phase_rmse}
+        return given | {
             "efficiency": self.total,
             "uniformity_error": self.uniformity_error,
             "rmse": self.rmse,
@@ -141,23 +151,32 @@ class OrderTable:
     def describe(self) -> str:
         """One line."""
         bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
+        phases = ""
+        if self.phase_rmse is not None and self.in_wave is not None:
+            off = f"phases off by {np.degrees(self.phase_rmse):.2g} deg"
+            phases = f", {off}, {100 * self.in_wave:.2f} % in the wave of the given phases"
         return (
             f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
-            f"{100 * self.uniformity_error:.2f} %, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
+            f"{100 * self.uniformity_error:.2f} %{phases}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
             f"{100 * (1 - self.fresnel):.1f} % apart"
         )
 
     def to_csv(self) -> str:
-        """The table: order, place in millimetres or degrees, efficiency, and its share over the wanted one."""
+        """The table: order, place in millimetres or degrees, efficiency, its share over the wanted one, phase error."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         unit = self.unit.suffix
-        writer.writerow(["order_x", "order_y", f"x_{unit}", f"y_{unit}", "efficiency", "over_wanted"])
+        given = self.phase_errors is not None
+        head = ["order_x", "order_y", f"x_{unit}", f"y_{unit}", "efficiency", "over_wanted"]
+        writer.writerow([*head, "phase_error_deg"] if given else head)
         orders = self.spots.orders if self.spots.orders is not None else np.full((self.spots.count, 2), -1)
         over = self.efficiency / self.spots.shares / self.total
-        for order, place, one, share in zip(orders, self.unit.of(self.places_m), self.efficiency, over, strict=True):
+        off = np.zeros(self.spots.count) if self.phase_errors is None else np.degrees(self.phase_errors)
+        places = self.unit.of(self.places_m)
+        for order, place, one, share, angle in zip(orders, places, self.efficiency, over, off, strict=True):
             names = ["", ""] if self.spots.orders is None else [int(order[1]), int(order[0])]
-            writer.writerow([*names, f"{place[1]:.9g}", f"{place[0]:.9g}", f"{one:.9g}", f"{share:.9g}"])
+            numbers = [f"{number:.9g}" for number in (place[1], place[0], one, share, angle)]
+            writer.writerow([*names, *(numbers if given else numbers[:-1])])
         return out.getvalue()
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
@@ -198,10 +217,12 @@ def order_table(
     if camera.beam is not None and period_m is None:  # a spot is what has the shape of the beam's own far field
         light = camera.irradiance(line.wavelength_m)
         field, coverage = field * light, coverage * light
+    middle_m = (0.0, 0.0)
     if period_m is not None:
-        field, coverage, grid = _whole_periods(field, coverage, camera, period_m)
+        field, coverage, grid, middle_m = _whole_periods(field, coverage, camera, period_m)
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
-    found = efficiencies(field, coverage, grid, np.concatenate(asked))
+    light = peak_amplitudes(field, coverage, grid, np.concatenate(asked))
+    found, own_light, given = np.abs(light) ** 2, light[: spots.count], spots.about(middle_m)
     own, zeroth, rest = np.split(found, [spots.count, spots.count + 1])
     equal = bool(np.ptp(spots.shares) < 1e-9)
     return OrderTable(
@@ -214,13 +235,15 @@ def order_table(
         ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
         camera.light,
         camera.told_in(MILLIMETRES),
+        None if spots.phases is None else given.phase_errors(own_light),
+        None if spots.phases is None else given.in_wave(own_light),
     )
 
 
 def _whole_periods(
     field: Complex[np.ndarray, "y x"], coverage: Float[np.ndarray, "y x"], camera: Camera, period_m: float
-) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid]:
-    """Field, open share and grid of as many whole periods as fit into the opening, or the square within a round one."""
+) -> tuple[Complex[np.ndarray, "v u"], Float[np.ndarray, "v u"], Grid, tuple[float, float]]:
+    """Field, open share, grid and middle of the whole periods that fit into the opening, or a square in a round one."""
     grid = camera.grid
     period, within = round(period_m / grid.pitch_m), 1.0
     if isinstance(camera.opening, RoundAperture):
@@ -229,7 +252,10 @@ def _whole_periods(
     height, width = (period * max(1, int(count / within) // period) for count in open_)
     first = [(n - side) // 2 for n, side in zip(grid.shape, (height, width), strict=True)]
     block = tuple(slice(at, at + side) for at, side in zip(first, (height, width), strict=True))
-    return field[block], coverage[block], Grid((height, width), grid.pitch_m)
+    y_m, x_m = (
+        (at + side / 2 - n / 2) * grid.pitch_m for at, side, n in zip(first, (height, width), grid.shape, strict=True)
+    )
+    return field[block], coverage[block], Grid((height, width), grid.pitch_m), (y_m, x_m)
 
 
 def _stray(spots: Spots) -> Float[np.ndarray, "n 2"]:

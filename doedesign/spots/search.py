@@ -46,7 +46,7 @@ def search_phases(
     staircase: Staircase | None = None,
     keep: int = 4,
 ) -> FoundPhases:
-    """Search the plane waves whose sum is nearest to a phase alone.
+    """Search the plane waves whose sum is nearest to a phase alone, where the phases of spots are free.
 
     Args:
         spots: where light should go.
@@ -66,7 +66,7 @@ def search_phases(
         sets = WaveSet(np.tile(np.sqrt(spots.shares), (count, 1)), rng.uniform(0, 2 * np.pi, (count, spots.count)))
         light = _light(sets, waves, staircase)
         for _ in range(_STEPS):
-            sets = sets.improved(light, spots.shares)
+            sets = sets.improved(light, spots)
             light = _light(sets, waves, staircase)
         for weights, phases, one in zip(*sets, light, strict=True):
             result = spot_light(np.abs(one) ** 2, spots.shares)

@@ -1,10 +1,10 @@
-"""Where spots lie and how much light each should have."""
+"""Where spots lie, how much light each should have, and in which phase if that is given."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,17 +16,46 @@ class Spots:
         shares: `[spot]` light of every spot over that of all, summing to 1.
         orders: `[spot, (y, x)]` whole numbers of every spot on a lattice of directions, or None where there is none.
         lattice_per_m: distance (y, x) of that lattice, waves per metre, or None.
+        phases: `[spot]` phase that each plane wave should have in the middle of the DOE, radians, but for one that all
+            have in common; None where phases are free.
     """
 
     waves_per_m: Float[np.ndarray, "m 2"]
     shares: Float[np.ndarray, " m"]
     orders: Int[np.ndarray, "m 2"] | None = None
     lattice_per_m: tuple[float, float] | None = None
+    phases: Float[np.ndarray, " m"] | None = None
 
     @property
     def count(self) -> int:
         """Number of spots."""
         return len(self.shares)
+
+    def about(self, place_m: tuple[float, float]) -> "Spots":
+        """The same spots with phases as they are at a place (y, x) instead of the middle of the DOE."""
+        if self.phases is None:
+            return self
+        return replace(self, phases=self.phases + 2 * np.pi * self.waves_per_m @ np.asarray(place_m))
+
+    def phase_errors(self, light: Complex[np.ndarray, "*start m"]) -> Float[np.ndarray, "*start m"]:
+        """Phases of amplitudes less those that are given, radians, after the common phase that fits best.
+
+        Brighter spots count more in that, as they do in `in_wave`. ValueError where phases are free.
+        """
+        if self.phases is None:
+            raise ValueError("the phases of these spots are free")
+        off = light * np.exp(-1j * self.phases)
+        common = np.sum(np.sqrt(self.shares) * off, axis=-1, keepdims=True)
+        return np.angle(off * common.conj())
+
+    def in_wave(self, light: Complex[np.ndarray, " m"]) -> float:
+        """Share of the incident light in the wave whose amplitudes and phases are given, from the spots' amplitudes.
+
+        It is that of all spots where both are as wanted. ValueError where phases are free.
+        """
+        if self.phases is None:
+            raise ValueError("the phases of these spots are free")
+        return float(np.abs(np.sum(np.sqrt(self.shares) * np.exp(-1j * self.phases) * light)) ** 2)
 
 
 def grid_orders(count: tuple[int, int]) -> Int[np.ndarray, "m 2"]:

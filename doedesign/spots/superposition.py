@@ -4,7 +4,8 @@ A DOE that sends light into M directions is the phase of a sum of M plane waves 
 Soc. Am. A 24, 2280, 2007): all that is free are their M amplitudes and phases. A step takes the phase of that sum,
 rounds it to the nearest level that the process makes, looks at the light of every spot, takes over the phases that came
 out, and gives more weight to spots that are too dark (R. Di Leonardo et al., Opt. Express 15, 1913, 2007). Because the
-rounded plate is what is looked at, its errors are made up for, too.
+rounded plate is what is looked at, its errors are made up for, too. Where the phases of spots are given, those of the
+plane waves go on against what is missing.
 """
 
 from dataclasses import dataclass
@@ -19,13 +20,15 @@ from fab.levels import nearest_around
 from sim.propagation.directions import DirectionSum
 
 GAIN = 0.7  # of a weight, per relative error of its spot's amplitude
+# The same, and of a phase per error of its spot's, where phases are given: faster, weights and phases disturb each other.
+GAIN_OF_GIVEN = 0.1
 
 
 class SpotLight(NamedTuple):
     """Light of spots: its sum, and how unequal it is.
 
     Attributes:
-        efficiency: share of the light on all spots.
+        efficiency: share of the light on all spots; where their phases are given, in the wave that they make together.
         uniformity_error: (max - min) / (max + min) of their light over their shares.
     """
 
@@ -43,6 +46,12 @@ def spot_light(efficiencies: Float[np.ndarray, " m"], shares: Float[np.ndarray, 
     return SpotLight(float(efficiencies.sum()), float((over.max() - over.min()) / max(over.max() + over.min(), 1e-300)))
 
 
+def judged(light: Complex[np.ndarray, " m"], spots: Spots) -> SpotLight:
+    """Light of spots of these amplitudes, whose squares are efficiencies."""
+    found = spot_light(np.abs(light) ** 2, spots.shares)
+    return found if spots.phases is None else found._replace(efficiency=spots.in_wave(light))
+
+
 class WaveSet(NamedTuple):
     """Plane waves whose sum has the phase of a DOE: weights and phases (radians) of their amplitudes `[..., spot]`."""
 
@@ -54,14 +63,14 @@ class WaveSet(NamedTuple):
         """Complex amplitudes."""
         return self.weights * np.exp(1j * self.phases)
 
-    def improved(
-        self, light: Complex[np.ndarray, "*start m"], shares: Float[np.ndarray, " m"], gain: float = GAIN
-    ) -> "WaveSet":
+    def improved(self, light: Complex[np.ndarray, "*start m"], spots: Spots) -> "WaveSet":
         """The next weights and phases, from the amplitudes of the spots that these ones gave."""
+        shares, gain = spots.shares, GAIN if spots.phases is None else GAIN_OF_GIVEN
         size = np.abs(light)
         size = np.maximum(size, 1e-9 * size.max(axis=-1, keepdims=True))
         weights = self.weights * (np.sqrt(shares * np.sum(size**2, axis=-1, keepdims=True)) / size) ** gain
-        return WaveSet(weights / np.linalg.norm(weights, axis=-1, keepdims=True), np.angle(light))
+        phases = np.angle(light) if spots.phases is None else self.phases - gain * spots.phase_errors(light)
+        return WaveSet(weights / np.linalg.norm(weights, axis=-1, keepdims=True), phases)
 
 
 class Staircase(NamedTuple):
@@ -120,7 +129,7 @@ class SpotProblem:
 
     def light(self, level: UInt8[np.ndarray, "y x"]) -> SpotLight:
         """Sum and uniformity error of the spots' light."""
-        return spot_light(np.abs(self.amplitudes(level)) ** 2, self.spots.shares)
+        return judged(self.amplitudes(level), self.spots)
 
     def level(self, waves: WaveSet) -> UInt8[np.ndarray, "y x"]:
         """Level map of a sum of plane waves."""
@@ -134,4 +143,4 @@ class SpotProblem:
     def step(self, waves: WaveSet) -> tuple[WaveSet, SpotLight]:
         """The next plane waves, and the light of these."""
         light = self.amplitudes(self.level(waves))
-        return waves.improved(light, self.spots.shares), spot_light(np.abs(light) ** 2, self.spots.shares)
+        return waves.improved(light, self.spots), judged(light, self.spots)

@@ -48,6 +48,8 @@ def efficiencies(
 ) -> Float[np.ndarray, " m"]:
     """Share of the light on the aperture that reaches each direction's diffraction peak, Fresnel loss left out.
 
+    It is the square of what `peak_amplitudes` returns, and takes the same.
+
     Args:
         field: `[y, x]` field behind the DOE, of unit amplitude where it is open.
         coverage: `[y, x]` open share of every cell.
@@ -57,5 +59,15 @@ def efficiencies(
     A peak in the direction u is |sum t exp(-2 pi i u x)|² / (open area)², 1 for a plane wave that goes there as a
     whole. For a plate of many equal periods it is the efficiency of an order.
     """
+    return np.abs(peak_amplitudes(field, coverage, grid, waves_per_m)) ** 2
+
+
+def peak_amplitudes(
+    field: Complex[np.ndarray, "y x"],
+    coverage: Float[np.ndarray, "y x"],
+    grid: Grid,
+    waves_per_m: Float[np.ndarray, "m 2"],
+) -> Complex[np.ndarray, " m"]:
+    """Amplitudes whose squares are `efficiencies`; their phases are those of the plane waves in the grid's middle."""
     light = DirectionSum(grid, waves_per_m).amplitudes(field)
-    return np.abs(light / float(np.sum(coverage, dtype=np.float64))) ** 2
+    return light / float(np.sum(coverage, dtype=np.float64))

@@ -8,6 +8,7 @@ import pytest
 
 import doedesign.optimization as optimization
 import doedesign.runs.fabricated
+from doedesign.design.design import Design
 from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
 from doedesign.prediction import on_target
@@ -96,6 +97,55 @@ def test_a_design_of_orders_repeats_its_cell(tmp_path: Path):
     assert design.history[-1]["names"] == ["efficiency", "uniformity_error"]
     # Of 0.940 x 0.950: nine beams of 24 cells.
     assert design.history[-1]["terms"][0] > 0.85
+
+
+def waves_of(design: Design, waves_per_m: np.ndarray) -> np.ndarray:
+    """Amplitudes of plane waves in the middle of a DOE, cell by cell in double precision, over its open area."""
+    y, x = (design.camera.grid.axis_m(axis) for axis in "yx")
+    rate = design.camera.waves_per_metre(532e-9)
+    field = np.exp(2j * np.pi * rate * design.levels.heights_m()[design.level_map.level])
+    field *= np.hypot(y[:, None], x) < 96e-6
+    found = [np.sum(field * np.exp(-2j * np.pi * (v * y[:, None] + u * x))) for v, u in waves_per_m]
+    return np.array(found) / np.count_nonzero(field)
+
+
+# The aperture of 192 um is four periods of 48 um: a cell that begins elsewhere has other phases.
+@pytest.mark.parametrize("cells", [24, 32])
+def test_orders_have_the_phases_that_are_given(tmp_path: Path, cells: int):
+    given = np.array([0, 90, 0, 180, 30, -60, 0, -120, 45.0])
+    phases = f"spots.phases={[f'{one:g} deg' for one in given]}".replace("'", '"')
+    spec = spec_of(tmp_path, phases, f"spots.period={2 * cells} um", "optimize.steps=60")
+    design = optimize(spec)
+    table = on_target(design, HeightOptic.of(design.camera, design.nominal_height_m))
+    assert isinstance(table, OrderTable)
+    # Levels of 45 degrees leave a few; orders of a round aperture of few periods reach over into each other.
+    assert table.phase_rmse is not None
+    assert np.degrees(table.phase_rmse) < 3
+    light = waves_of(design, table.spots.waves_per_m)
+    off = np.angle(light * np.exp(-1j * np.radians(given)))
+    off = np.degrees(np.angle(np.exp(1j * (off - np.angle(np.sum(np.exp(1j * off)))))))
+    assert np.abs(off).max() < 8
+    # These phases cost light: free ones take 93.9 % of it at best.
+    assert table.in_wave is not None
+    assert 0.55 < table.in_wave <= table.total * (1 + 1e-9) < 0.88
+    assert table.uniformity_error < 0.06
+    assert table.summary()["in_wave"] == table.in_wave
+    assert "phases off by" in table.describe()
+    assert table.to_csv().splitlines()[0].endswith("over_wanted,phase_error_deg")
+
+
+def test_spots_on_a_sensor_have_the_phases_that_are_given(free: Path):
+    """Two spots draw fringes on the DOE; which of them its middle lies on is their difference of phases."""
+    for shift in (0, 90, 180):
+        one = load_spec(free, ["spots.count=[2, 1]", "spots.spacing=0.5 mm", f'spots.phases=["0 deg", "{shift} deg"]'])
+        design = optimize(one)
+        table = on_target(design, HeightOptic.of(design.camera, design.nominal_height_m))
+        assert isinstance(table, OrderTable)
+        light = waves_of(design, table.spots.waves_per_m)
+        assert np.degrees(np.angle(light[1] / light[0] * np.exp(-1j * np.radians(shift)))) == pytest.approx(0, abs=2)
+        assert table.in_wave == pytest.approx(table.total, rel=2e-3)
+        # A sum of two waves is real but for a phase: its sign alone sends 8 / pi^2 into both.
+        assert table.total == pytest.approx(8 / np.pi**2, abs=0.02)
 
 
 def test_a_run_holds_its_table_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -210,6 +260,7 @@ def test_the_table_of_spots_is_written_as_it_was_read(tmp_path: Path):
         (["spots.arrangement=ring"], "spots.number", 'arrangement "ring" needs it'),
         (["spots.rings=2"], "spots.rings", 'arrangement "grid" takes: count, period'),
         (['spots.offset=["1 um", "0 um"]'], "spots.offset", "cannot be moved"),
+        (['spots.phases=["1 deg", "0 deg"]'], "spots.phases", "one per spot, 9"),
         (['scene.far=["5 m"]'], "scene.far", "collimated beam"),
         (["sensor.defocus=1 mm"], "sensor.defocus", "focal plane"),
         (["optimize.start=random"], "optimize.start", "starts and levels of their own"),

@@ -1,12 +1,13 @@
 """The table [spots]: where a DOE should send its light, spot by spot; its rules, and what may stand beside it."""
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
 from doedesign.spec.targets.beside import beside_problems, in_focus
-from doedesign.spec.values import PLACE, Count, NotNegative, Positive, broken, length, place
+from doedesign.spec.values import PLACE, Count, NotNegative, Positive, bounded, broken, length, place
 from doedesign.spec.values.table import SpecTable, optional, toml_key
 from fab.errors import InputError
 from fab.units import MICROMETRES, MM, UM, format_length
@@ -39,9 +40,11 @@ class SpotsSpec(SpecTable, frozen=True):
             diffraction orders, wavelength / period apart in direction sine.
         offset_m: [x, y] by which all spots are moved on the sensor, as far as they are not orders of a unit cell.
         weights: light of every spot over that of the others, equal if left out; a grid goes row by row from the lowest.
+        phases_rad: phase of every spot's plane wave in the middle of the DOE, but for a common one; free if left out. A
+            lens whose front focal plane is the DOE shows them in the spots.
         uniformity: how much of the efficiency a uniformity error (max - min) / (max + min) is worth; 0 is for light
             alone.
-        starts: random starts of the search for the spots' phases.
+        starts: random starts of the search for the spots' phases, where these are free.
     """
 
     angles: ClassVar = dict.fromkeys(("spacing_m", "radius_m", "places_m", "offset_m"), PLACE)
@@ -56,6 +59,7 @@ class SpotsSpec(SpecTable, frozen=True):
     period_m: Annotated[float, length(0.02 * UM, 100 * MM)] | None = optional()
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
     weights: tuple[Positive, ...] = optional(())
+    phases_rad: tuple[Annotated[float, bounded("rad", -2 * math.pi, 2 * math.pi)], ...] = optional(())
     uniformity: NotNegative = optional(1.0)
     starts: Annotated[int, Field(strict=True, ge=1, le=100_000)] = optional(200)
 
@@ -127,6 +131,9 @@ def _reach(spec: "Spec") -> Iterator[InputError]:
     weights, count = len(spots.weights), spots.spot_count
     if weights not in (0, count):
         yield InputError("spots.weights", f"must be one per spot, {count}", f"{weights}", "Add or remove weights.")
+    if len(spots.phases_rad) not in (0, count):
+        got = f"{len(spots.phases_rad)}"
+        yield InputError("spots.phases", f"must be one per spot, {count}", got, "Add or remove phases.")
     wavelength, pitch = spec.optics.colours[0].wavelengths_m[0], spec.doe.pitch_m
     most = wavelength / (2 * pitch)  # the direction sine at which a grating of two cells sends light
     if spots.period_m is not None:
