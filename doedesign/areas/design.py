@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from doedesign.areas.problem import AreaLight, AreaProblem, AreaSet
 from doedesign.areas.target import AreaTarget, camera_for
@@ -87,7 +87,7 @@ class AreaTask:
                 raise InputError(where, rule, got, cure)
             own = seen.lines[0].wavelength_m
             turn = 1.0 if own == first else float(camera.waves_per_metre(own) / camera.waves_per_metre(first))
-            targets.append(AreaTarget.of(area, seen, files.get(f"{key}.picture")))
+            targets.append(AreaTarget.of(area, seen, files.get(f"{key}.picture"), files.get(f"{key}.phase")))
             problems.append(AreaProblem.of(targets[-1], seen, turn))
         one_colour = all(problem.turn == 1 for problem in problems)
         span = None if one_colour else float(2 * np.pi * camera.waves_per_metre(first) * levels.period_m)
@@ -114,9 +114,16 @@ class AreaTask:
         return self.spec.areas[0].start == "random"
 
     def _carrying(self, index: int) -> Float[np.ndarray, "y x"]:
-        """The phase that carries the beam to an area as rays would, of the wavelength that lights it."""
+        """The phase that carries the beam to an area as rays would, or that of the wave which is asked for there.
+
+        It is of the wavelength that lights the area.
+        """
         area, target, grid = self.spec.areas[index], self.targets[index], self.camera.grid
-        amplitudes = np.asarray(self.problem.problems[index].amplitudes)
+        problem = self.problem.problems[index]
+        amplitudes = np.asarray(problem.amplitudes)
+        if (wave := target.wave) is not None:
+            back = np.asarray(problem.along_y).conj().T @ wave @ np.asarray(problem.along_x).conj()
+            return self._diluted(back) - np.angle(amplitudes[0])
         light: Any = np.sum(np.abs(amplitudes) ** 2, axis=0, dtype=np.float64)
         wavelength = camera_for(area, self.camera).lines[0].wavelength_m
         moved_y, moved_x = self.camera.moved_sines()
@@ -124,6 +131,16 @@ class AreaTask:
         phase = transport_phase(light, (grid.axis_m("y"), grid.axis_m("x")), target.value, directions)
         # The wave has a phase already, that of the lowest mode and of a sensor out of focus.
         return phase - np.angle(amplitudes[0])
+
+    def _diluted(self, wave: Complex[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+        """Phase of a wave, turned ahead or back at random where it is weak, by as much as makes it so on the average.
+
+        Light of neighbours that differ goes far out, beyond the area (J. M. Cohn and M. Liang, Appl. Opt. 35, 2488,
+        1996). The phase alone would be a start from which no gradient leads to a wave that is even or odd.
+        """
+        strength: Any = np.minimum(1, np.abs(wave) / max(np.abs(wave).mean(), 1e-30))
+        sides = np.random.default_rng(self.spec.optimize.seed).choice([-1, 1], wave.shape)
+        return np.angle(wave) + sides * np.arccos(strength)
 
     def _begun(self, phase: Array, free: Array, step: int) -> AreaState:
         return AreaState(phase, free, lbfgs_memory(phase, _MEMORY), step)
@@ -146,7 +163,10 @@ class AreaTask:
     @property
     def begins(self) -> str:
         """How a design begins, in words."""
-        return "starting from random phases" if self._random else "carrying the beam to the area by optimal transport"
+        if self._random:
+            return "starting from random phases"
+        given = any(target.phase is not None for target in self.targets)
+        return "starting from the wave of the area" if given else "carrying the beam to the area by optimal transport"
 
     def steps(self, state: AreaState) -> Iterator[tuple[AreaState, dict[str, Any]]]:
         """Do the remaining steps one by one; yields the state, and the line of the history."""

@@ -27,9 +27,11 @@ class AreaLight(NamedTuple):
     """Light of an area.
 
     Attributes:
-        efficiency: share of the incident light on it, Fresnel loss left out.
+        efficiency: share of the incident light on it, Fresnel loss left out; where its phase is given, share of the
+            incident light in the wave that is asked for.
         contrast: root of the mean square of light over the light wanted less 1, where it should be flat; of a picture,
-            of the difference from what is wanted, over its mean.
+            of the difference from what is wanted, over its mean. Where the phase is given, root of the light on the
+            area that is not in the wave over the light that is.
         misplaced: root of the mean square by which the light on the border is not half of that inside, and of what
             edges differ from the wanted ones beyond a leeway.
     """
@@ -48,6 +50,7 @@ class AreaScore(eqx.Module):
         even: `[v, u]` weights of squared differences in the contrast.
         edge: `[v, u]` weights of squared differences beyond the leeway on edges.
         border: `[place, v]` and `[place, u]` weights for the light at places on the border.
+        wave: `[v, u]` field wanted, of unit power; None where its phase is free.
     """
 
     wanted: Float[Array, "v u"]
@@ -55,17 +58,19 @@ class AreaScore(eqx.Module):
     even: Float[Array, "v u"]
     edge: Float[Array, "v u"]
     border: tuple[Float[Array, "n v"], Float[Array, "n u"]]
+    wave: Complex[Array, "v u"] | None = None
 
     @classmethod
     def of(cls, target: AreaTarget) -> "AreaScore":
         """The score of a target."""
-        flat, even = target.flat, target.flat | target.dark
+        flat, even, wave = target.flat, target.flat | target.dark, target.wave
         return cls(
             jnp.asarray(target.wanted / target.wanted[flat].mean(), jnp.float32),
             jnp.asarray(target.lit),
             jnp.asarray(even / flat.sum(), jnp.float32),
             jnp.asarray((target.lit & ~even) / flat.sum(), jnp.float32),
             (jnp.asarray(target.border[0], jnp.float32), jnp.asarray(target.border[1], jnp.float32)),
+            None if wave is None else jnp.asarray(wave, jnp.complex64),
         )
 
     def inside(self, light: Float[Array, "v u"]) -> Float[Array, ""]:
@@ -82,6 +87,14 @@ class AreaScore(eqx.Module):
         misplaced = jnp.sum((jnp.sum(rows @ over * columns, axis=1) - 0.5) ** 2) / max(1, len(rows))
         misplaced += jnp.sum(self.edge * jnp.maximum(jnp.abs(over - self.wanted) - _LEEWAY, 0.0) ** 2)
         return AreaLight(efficiency, jnp.sqrt(missed + 1e-12), jnp.sqrt(misplaced + 1e-12))
+
+    def judge_field(self, field: Complex[Array, "v u"]) -> AreaLight:
+        """The same of a field whose phase is given; ValueError where it is free."""
+        if self.wave is None:
+            raise ValueError("the phase of this area is free")
+        inside = _power(jnp.sum(self.wave.conj() * field))
+        rest = jnp.sum(jnp.where(self.lit, _power(field), 0.0)) - inside
+        return AreaLight(inside, jnp.sqrt(jnp.maximum(rest, 0.0) / (inside + 1e-30) + 1e-12), jnp.zeros(()))
 
 
 class AreaProblem(eqx.Module):
@@ -111,22 +124,31 @@ class AreaProblem(eqx.Module):
 
     def light(self, phase: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """Share of the incident light on every sample of the lattice; `phase` is that of the first wavelength."""
-        wave = jnp.exp(1j * phase if self.turn == 1 else 1j * self.turn * phase)
+        turned = self._turned(phase)
+        return jnp.sum(jax.lax.map(lambda one: _power(self._field(one * turned)), self.amplitudes), axis=0)
 
-        def of_mode(amplitude: Array) -> Array:
-            field = self.along_y @ (amplitude * wave) @ self.along_x.T
-            return field.real**2 + field.imag**2
+    def _turned(self, phase: Float[Array, "y x"]) -> Complex[Array, "y x"]:
+        """Factor of the field for a phase of the first wavelength."""
+        return jnp.exp(1j * phase if self.turn == 1 else 1j * self.turn * phase)
 
-        return jnp.sum(jax.lax.map(of_mode, self.amplitudes), axis=0)
+    def _field(self, behind: Complex[Array, "y x"]) -> Complex[Array, "v u"]:
+        """Field on the lattice of one behind the DOE."""
+        return self.along_y @ behind @ self.along_x.T
 
     def judge(self, phase: Float[Array, "y x"]) -> AreaLight:
         """Efficiency, contrast and misplaced light of a phase."""
-        return self.score.judge(self.light(phase))
+        if self.score.wave is None:
+            return self.score.judge(self.light(phase))
+        return self.score.judge_field(self._field(self.amplitudes[0] * self._turned(phase)))
 
     def loss(self, phase: Float[Array, "y x"], uniformity: float | Float[Array, ""]) -> Float[Array, ""]:
         """One less the merit."""
         light = self.judge(phase)
         return 1.0 - light.efficiency + uniformity * jnp.sqrt(light.contrast**2 + light.misplaced**2)
+
+
+def _power(field: Array) -> Array:
+    return field.real**2 + field.imag**2
 
 
 class AreaSet(eqx.Module):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
 from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, colour_number, in_plane
@@ -108,6 +108,10 @@ class AreaTable:
         fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
         along_x: profile along x; None for a picture.
         along_y: profile along y; None for a picture.
+        in_wave: share of the incident light in the wave of the given phase; None where it is free.
+        phase_rmse: root mean square of the phase less the given one where light should be flat, radians, weighted by
+            the light wanted, after the best common phase; None where it is free.
+        wave_ceiling: the largest `in_wave` of a DOE of any phase: all of it in step (triangle inequality).
     """
 
     target: AreaTarget
@@ -121,6 +125,9 @@ class AreaTable:
     fresnel: float
     along_x: Profile | None
     along_y: Profile | None
+    in_wave: float | None = None
+    phase_rmse: float | None = None
+    wave_ceiling: float | None = None
 
     @property
     def name(self) -> str:
@@ -139,7 +146,8 @@ class AreaTable:
         profiles, unit = (("x", self.along_x), ("y", self.along_y)), "rad" if self.camera.in_angles else "m"
         sizes = {f"size_{name}_{unit}": p and p.size_m for name, p in profiles}
         edges = {f"edge_{name}_{unit}": p and p.edge_m for name, p in profiles}
-        return {
+        given = {"in_wave": self.in_wave, "in_wave_ceiling": self.wave_ceiling, "phase_rmse_rad": self.phase_rmse}
+        return (given if self.in_wave is not None else {}) | {
             "efficiency": self.efficiency,
             "contrast": self.contrast,
             "pixel_contrast": self.pixel_contrast,
@@ -167,9 +175,16 @@ class AreaTable:
         pixels = "" if self.pixel_contrast is None else f" ({100 * self.pixel_contrast:.2f} % on pixels)"
         return (
             f"{self.target.shape}: {100 * self.efficiency:.2f} % of the light (ceiling: none known), contrast "
-            f"{100 * self.contrast:.2f} %{pixels}{size}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
-            f"{100 * (1 - self.fresnel):.1f} % apart"
+            f"{100 * self.contrast:.2f} %{pixels}{size}{self.describe_wave()}, "
+            f"0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of {100 * (1 - self.fresnel):.1f} % apart"
         )
+
+    def describe_wave(self) -> str:
+        """How much light is in the wave of the given phase, and how far that is off; nothing where it is free."""
+        if self.phase_rmse is None or self.in_wave is None or self.wave_ceiling is None:
+            return ""
+        share = f"{100 * self.in_wave:.2f} % (ceiling: {100 * self.wave_ceiling:.2f} %)"
+        return f", {share} in the wave of the given phase, which is off by {np.degrees(self.phase_rmse):.2g} deg"
 
     def to_csv(self) -> str:
         """Both profiles: axis, place in millimetres or degrees, light and light wanted."""
@@ -243,9 +258,10 @@ def areas_of_design(design: Design, doe: CellOptic) -> tuple[AreaTable, ...]:
     spec, tables = design.spec, []
     assert spec is not None
     for index, area in enumerate(spec.areas):
-        key = f"{spec.area_key(index)}.picture"
-        picture = input_files(spec, key)[key] if area.picture else None
-        target = AreaTarget.of(area, camera_for(area, design.camera), picture, _SAMPLES)
+        key = spec.area_key(index)
+        picture = input_files(spec, f"{key}.picture")[f"{key}.picture"] if area.picture else None
+        phase = input_files(spec, f"{key}.phase")[f"{key}.phase"] if area.phase_picture else None
+        target = AreaTarget.of(area, camera_for(area, design.camera), picture, phase, samples=_SAMPLES)
         seen = doe if area.distance_m is None else doe.with_camera(in_plane(area, doe.camera))
         tables.append(area_table(seen, target, colour_number(area, doe.camera)))
     return tuple(tables)
@@ -260,7 +276,8 @@ def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable
         colour: number of the colour.
     """
     camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
-    light, score = light_on(doe, target, colour), AreaScore.of(target)
+    fields, score = _fields_on(doe, target, colour), AreaScore.of(target)
+    light, wave = _light_of(fields), target.wave
     shares = jnp.asarray(light, jnp.float32)
     over, judged = light / max(float(score.inside(shares)), 1e-30), score.judge(shares)
     picture = target.shape == "picture"
@@ -276,18 +293,44 @@ def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable
         camera.transmission(camera.lines[0].wavelength_m),
         None if picture else _profile(over, target, camera, 1),
         None if picture else _profile(over, target, camera, 0),
+        *((None, None, None) if wave is None else _in_wave(doe, target, wave, fields[0], camera, colour)),
     )
 
 
 def light_on(doe: CellOptic, target: AreaTarget, colour: int = 0) -> Float[np.ndarray, "v u"]:
     """Share of the incident light of a colour's first wavelength on each sample of a lattice, Fresnel loss left out."""
+    return _light_of(_fields_on(doe, target, colour))
+
+
+def _fields_on(doe: CellOptic, target: AreaTarget, colour: int) -> list[Complex[np.ndarray, "v u"]]:
+    """Field of every mode on the samples of a lattice; the squares are shares of the incident light."""
     camera = replace(doe.camera, colours=(doe.camera.colours[colour],))
     rows, columns = (part.astype(np.complex64) for part in lattice_factors(target, camera))
-    light = np.zeros(target.value.shape)
-    for mode in mode_fields(doe, colour):
-        field = rows @ mode @ columns.T
-        light += field.real**2 + field.imag**2
+    return [rows @ mode @ columns.T for mode in mode_fields(doe, colour)]
+
+
+def _light_of(fields: list[Complex[np.ndarray, "v u"]]) -> Float[np.ndarray, "v u"]:
+    light = np.zeros(fields[0].shape)
+    for field in fields:
+        light += np.real(field) ** 2 + np.imag(field) ** 2
     return light
+
+
+def _in_wave(
+    doe: CellOptic,
+    target: AreaTarget,
+    wave: Complex[np.ndarray, "v u"],
+    field: Complex[np.ndarray, "v u"],
+    camera: Camera,
+    colour: int,
+) -> tuple[float, float, float]:
+    """Share of the light in a wave, root mean square of the phase over that of the wave, and the largest such share."""
+    over, weight = (field * wave.conj())[target.flat], np.abs(wave[target.flat]) ** 2
+    off = np.angle(over * over.sum().conj())
+    rows, columns = lattice_factors(target, camera)
+    in_step = np.sum(np.abs(rows.conj().T @ wave @ columns.conj()) * np.abs(mode_fields(doe, colour)[0]))
+    rmse = np.sqrt(np.sum(weight * off**2) / weight.sum())
+    return float(np.abs(np.vdot(wave, field)) ** 2), float(rmse), float(in_step**2)
 
 
 def _places(target: AreaTarget, camera: Camera, axis: int) -> Float[np.ndarray, " n"]:

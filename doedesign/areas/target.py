@@ -4,12 +4,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 from scipy.ndimage import map_coordinates
 
 from doedesign.design.patterns import picture_light
 from doedesign.spec.targets.areas import AreaSpec
 from fab.errors import InputError
+from fab.pictures import read_pixels
 from fab.units import DEGREES, format_length
 from sim.camera import Camera
 from sim.illumination import GaussianBeam
@@ -61,6 +62,7 @@ class AreaTarget:
         shape: its kind.
         border: `[place, y]` and `[place, x]` weights of rows and columns for the light at places on the border, where
             it should be half of that inside.
+        phase: `[y, x]` phase of the light wanted, radians, but for a common one; None where it is free.
     """
 
     sines_y: Float[np.ndarray, " v"]
@@ -72,6 +74,7 @@ class AreaTarget:
     edge_m: float
     shape: str
     border: tuple[Float[np.ndarray, "n v"], Float[np.ndarray, "n u"]]
+    phase: Float[np.ndarray, "v u"] | None = None
 
     @property
     def lit(self) -> Bool[np.ndarray, "v u"]:
@@ -88,13 +91,29 @@ class AreaTarget:
         """Light wanted where it should be flat: 1, but for pictures and across lines; elsewhere the value."""
         return self.value if self.shape in ("picture", "line") else np.where(self.flat, 1.0, self.value)
 
+    @property
+    def wave(self) -> Complex[np.ndarray, "v u"] | None:
+        """Field wanted where light counts as that of the area, of unit power; None where its phase is free."""
+        if self.phase is None:
+            return None
+        field = np.where(self.lit, np.sqrt(self.wanted), 0.0) * np.exp(1j * self.phase)
+        return field / np.linalg.norm(field)
+
     @classmethod
-    def of(cls, table: AreaSpec, camera: Camera, picture: Path | None, samples: float = _SAMPLES) -> "AreaTarget":
+    def of(
+        cls,
+        table: AreaSpec,
+        camera: Camera,
+        picture: Path | None = None,
+        phase: Path | None = None,
+        *,
+        samples: float = _SAMPLES,
+    ) -> "AreaTarget":
         """The area of a spec for the first wavelength of a camera, so many samples per lambda d / D apart.
 
         Raises:
-            InputError: a picture that cannot be read, is dark, or reaches beyond what cells can light, or an area with
-                too much detail or too small to have a flat part.
+            InputError: a picture that cannot be read, is dark, or reaches beyond what cells can light, a phase that is
+                not grey, or an area with too much detail or too small to have a flat part.
         """
         light = None if picture is None else _picture_light(picture)
         size_m = table.size_m if light is None else (table.size_m[1] * light.shape[0] / light.shape[1], table.size_m[1])
@@ -124,7 +143,10 @@ class AreaTarget:
         sines = camera.sines_of(*(_border(table) + middle).T)
         rows, columns = (_between(axis, at) for axis, at in zip(axes, sines, strict=True))
         sines_y, sines_x = axes
-        target = cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns))
+        turned = None
+        if table.phase is not None:
+            turned = np.zeros(value.shape) if phase is None else _draw_phase(phase, at, size_m)
+        target = cls(sines_y, sines_x, value, dark, middle, size_m, edge, table.shape, (rows, columns), turned)
         if not target.flat.any():
             sizes = edge, _LEAST * edge, min(filter(None, size_m))
             falls, least, got = (_size_text(camera, size) for size in sizes)
@@ -228,5 +250,29 @@ def _draw_picture(
     steps_m = [float(np.ptp(at)) / (n - 1) for at, n in zip(at_m, at_m[0].shape, strict=True)]
     shape = [min(n, int(np.ceil(size / step))) for n, size, step in zip(light.shape, size_m, steps_m, strict=True)]
     light = np.asarray(resize(light, shape, anti_aliasing=True))
-    places = [at / size * n + (n - 1) / 2 for at, size, n in zip(at_m, size_m, light.shape, strict=True)]
-    return map_coordinates(light, np.stack(np.broadcast_arrays(*places)), order=1, mode="constant")
+    return map_coordinates(light, _in_pixels(light.shape, at_m, size_m), order=1, mode="constant")
+
+
+def _in_pixels(
+    shape: tuple[int, ...],
+    at_m: tuple[Float[np.ndarray, "_v _u"], Float[np.ndarray, "_v _u"]],
+    size_m: tuple[float, float],
+) -> Float[np.ndarray, "2 v u"]:
+    """Places (y, x) from the middle of a picture of some pixels and of that size, in these pixels."""
+    places = [at / size * n + (n - 1) / 2 for at, size, n in zip(at_m, size_m, shape, strict=True)]
+    return np.stack(np.broadcast_arrays(*places))
+
+
+def _draw_phase(
+    path: Path, at_m: tuple[Float[np.ndarray, "v u"], Float[np.ndarray, "v u"]], size_m: tuple[float, float]
+) -> Float[np.ndarray, "v u"]:
+    """Phase of a grey picture of that size, radians, at places (y, x) from its middle; that of its edge around it."""
+    values = read_pixels(path)
+    if values.ndim != 2 or values.dtype.kind not in "ui":
+        rule, got = "a picture of a phase must be grey, with whole numbers", f"{values.dtype} {values.shape}"
+        raise InputError(str(path), rule, got, "Save it as a grey PNG or TIFF of 8 or 16 bits.")
+    wave = np.exp(2j * np.pi * values / (np.iinfo(values.dtype).max + 1.0))
+    places = _in_pixels(values.shape, at_m, size_m)
+    # Between pixels light turns the short way, past the end of a turn, too.
+    real, imag = (map_coordinates(part, places, order=1, mode="nearest") for part in (np.real(wave), np.imag(wave)))
+    return np.arctan2(imag, real)

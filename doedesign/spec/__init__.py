@@ -202,7 +202,9 @@ def input_files(spec: Spec, only: str | None = None) -> dict[str, Path]:
 def _pictures(spec: Spec) -> dict[str, str]:
     """Pictures that more than the optimisation looks at, by dotted key."""
     tables = {spec.area_key(i): area for i, area in enumerate(spec.areas)} | {"illumination": spec.illumination}
-    return {f"{name}.picture": table.picture for name, table in tables.items() if table and table.picture}
+    found = {f"{name}.picture": table.picture for name, table in tables.items() if table and table.picture}
+    phases = {f"{spec.area_key(i)}.phase": area.phase_picture for i, area in enumerate(spec.areas)}
+    return found | {key: name for key, name in phases.items() if name}
 
 
 def kept_pictures(spec: Spec) -> dict[str, str]:

@@ -25,8 +25,8 @@ def exchange(
     """Change cells of a level map one by one for efficiency less `uniformity` times how unequal spots are.
 
     That is the fourth root of the mean fourth power of their relative deviations, times 1.4: about as large as the
-    uniformity error (max - min) / (max + min), and smoother. Where the phases of spots are given, the efficiency is that
-    of the wave that they make together.
+    uniformity error (max - min) / (max + min), and smoother. Where phases of spots are given, the efficiency is that of
+    the wave that they make together.
 
     Simulated annealing (S. Kirkpatrick et al., Science 220, 671, 1983): a change that costs merit is taken with the
     probability exp(-cost / heat), and heat falls to zero over the first sweeps. A sweep offers every cell the level of
@@ -34,7 +34,7 @@ def exchange(
     was met is returned; by this measure it is never worse than the one given.
     """
     sums, spots, shares = problem.sums, problem.spots, problem.spots.shares
-    wanted = np.zeros(0, complex) if spots.phases is None else np.sqrt(shares) * np.exp(-1j * spots.phases)
+    wanted = np.zeros(0, complex) if spots.phases is None else spots.wave.conj()
     waves = (sums.along_y[:, :, None] * sums.along_x[:, None, :]).reshape(len(shares), -1).T.astype(np.complex128)
     waves = waves / float(np.sum(problem.coverage, dtype=np.float64)) * problem.coverage.reshape(-1, 1)
     rng = np.random.default_rng((seed, 0xE8C4))

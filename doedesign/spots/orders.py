@@ -16,7 +16,7 @@ from fab.grid import Grid
 from fab.units import MILLIMETRES, PlaceUnit
 from sim.camera import Camera
 from sim.optic import CellOptic
-from sim.propagation.directions import peak_amplitudes
+from sim.propagation.directions import DirectionSum, peak_amplitudes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,6 +83,7 @@ class OrderTable:
         unit: in which places are told.
         phase_errors: `[spot]` phases less those that are given, radians, after the best common one; None where free.
         in_wave: share of the light in the wave of the given phases; None where they are free.
+        wave_ceiling: the largest `in_wave` of a DOE of any phase: all of it in step (triangle inequality).
     """
 
     spots: Spots
@@ -96,6 +97,7 @@ class OrderTable:
     unit: PlaceUnit = MILLIMETRES
     phase_errors: Float[np.ndarray, " m"] | None = None
     in_wave: float | None = None
+    wave_ceiling: float | None = None
 
     @property
     def total(self) -> float:
@@ -129,8 +131,8 @@ class OrderTable:
 
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
-        given = {} if self.in_wave is None else {"in_wave": self.in_wave, "phase_rmse_rad": self.phase_rmse}
-        return given | {
+        given = {"in_wave": self.in_wave, "in_wave_ceiling": self.wave_ceiling, "phase_rmse_rad": self.phase_rmse}
+        return (given if self.in_wave is not None else {}) | {
             "efficiency": self.total,
             "uniformity_error": self.uniformity_error,
             "rmse": self.rmse,
@@ -152,9 +154,11 @@ class OrderTable:
         """One line."""
         bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
         phases = ""
-        if self.phase_rmse is not None and self.in_wave is not None:
-            off = f"phases off by {np.degrees(self.phase_rmse):.2g} deg"
-            phases = f", {off}, {100 * self.in_wave:.2f} % in the wave of the given phases"
+        if self.phase_rmse is not None and self.in_wave is not None and self.wave_ceiling is not None:
+            share = f"{100 * self.in_wave:.2f} % (ceiling: {100 * self.wave_ceiling:.2f} %)"
+            phases = (
+                f", {share} in the wave of the given phases, which are off by {np.degrees(self.phase_rmse):.2g} deg"
+            )
         return (
             f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
             f"{100 * self.uniformity_error:.2f} %{phases}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
@@ -235,9 +239,17 @@ def order_table(
         ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
         camera.light,
         camera.told_in(MILLIMETRES),
-        None if spots.phases is None else given.phase_errors(own_light),
-        None if spots.phases is None else given.in_wave(own_light),
+        *((None, None, None) if given.phases is None else _in_wave(given, own_light, coverage, grid)),
     )
+
+
+def _in_wave(
+    spots: Spots, light: Complex[np.ndarray, " m"], coverage: Float[np.ndarray, "y x"], grid: Grid
+) -> tuple[Float[np.ndarray, " m"], float, float]:
+    """Phase errors of spots of given phases, the share of the light in their wave, and the largest such share."""
+    wave = DirectionSum(grid, spots.waves_per_m).superposition(spots.wave)
+    in_step = np.sum(np.abs(wave) * coverage, dtype=np.float64) / np.sum(coverage, dtype=np.float64)
+    return spots.phase_errors(light), spots.in_wave(light), float(in_step**2)
 
 
 def _whole_periods(

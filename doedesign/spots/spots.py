@@ -37,25 +37,27 @@ class Spots:
             return self
         return replace(self, phases=self.phases + 2 * np.pi * self.waves_per_m @ np.asarray(place_m))
 
+    @property
+    def wave(self) -> Complex[np.ndarray, " m"]:
+        """Amplitudes of unit power together, in the phases that are given. ValueError where these are free."""
+        if self.phases is None:
+            raise ValueError("the phases of these spots are free")
+        return np.sqrt(self.shares) * np.exp(1j * self.phases)
+
     def phase_errors(self, light: Complex[np.ndarray, "*start m"]) -> Float[np.ndarray, "*start m"]:
         """Phases of amplitudes less those that are given, radians, after the common phase that fits best.
 
         Brighter spots count more in that, as they do in `in_wave`. ValueError where phases are free.
         """
-        if self.phases is None:
-            raise ValueError("the phases of these spots are free")
-        off = light * np.exp(-1j * self.phases)
-        common = np.sum(np.sqrt(self.shares) * off, axis=-1, keepdims=True)
-        return np.angle(off * common.conj())
+        off = light * self.wave.conj()
+        return np.angle(off * off.sum(axis=-1, keepdims=True).conj())
 
     def in_wave(self, light: Complex[np.ndarray, " m"]) -> float:
         """Share of the incident light in the wave whose amplitudes and phases are given, from the spots' amplitudes.
 
         It is that of all spots where both are as wanted. ValueError where phases are free.
         """
-        if self.phases is None:
-            raise ValueError("the phases of these spots are free")
-        return float(np.abs(np.sum(np.sqrt(self.shares) * np.exp(-1j * self.phases) * light)) ** 2)
+        return float(np.abs(np.vdot(self.wave, light)) ** 2)
 
 
 def grid_orders(count: tuple[int, int]) -> Int[np.ndarray, "m 2"]:

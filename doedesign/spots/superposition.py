@@ -20,7 +20,7 @@ from fab.levels import nearest_around
 from sim.propagation.directions import DirectionSum
 
 GAIN = 0.7  # of a weight, per relative error of its spot's amplitude
-# The same, and of a phase per error of its spot's, where phases are given: faster, weights and phases disturb each other.
+# The same, and of a phase per error of its spot's, where phases are given: more, and both disturb each other.
 GAIN_OF_GIVEN = 0.1
 
 

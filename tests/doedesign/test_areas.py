@@ -17,10 +17,12 @@ from doedesign.areas.shape import AreaTable, Profile, area_table, areas_of_desig
 from doedesign.areas.target import AreaTarget
 from doedesign.areas.transport import transport_phase
 from doedesign.build import camera_from_spec
+from doedesign.design.design import Design
 from doedesign.lab.order import write_masks
 from doedesign.optimization import optimize
 from doedesign.prediction import predict
 from doedesign.runs.fabricated import fabricated
+from doedesign.runs.level_maps import open_design
 from doedesign.spec import (
     Spec,
     kept_pictures,
@@ -114,7 +116,7 @@ def test_light_on_the_lattice_is_that_of_the_sensor(tmp_path: Path, beam: str):
     spec = load_spec(path, ["optimize.steps=4"])
     design = optimize(spec)
     assert spec.areas
-    target = AreaTarget.of(spec.areas[0], design.camera, None, 4.0)
+    target = AreaTarget.of(spec.areas[0], design.camera, samples=4.0)
     light = light_on(design.as_optic(), target)
     bank, camera = psf(design), design.camera
     image = np.asarray(bank.energy[0, 0]) / camera.transmission(532e-9)
@@ -124,6 +126,75 @@ def test_light_on_the_lattice_is_that_of_the_sensor(tmp_path: Path, beam: str):
     theirs = image[np.ix_(np.abs(axis) < 80e-6, np.abs(axis) < 120e-6)].sum()
     assert ours == pytest.approx(theirs, rel=0.04)  # a row of samples or pixels on the border
     assert light.sum() == pytest.approx(image[np.ix_(np.abs(axis) < y[-1], np.abs(axis) < x[-1])].sum(), rel=0.02)
+
+
+def field_at(design: Design, y_m: np.ndarray, x_m: np.ndarray) -> np.ndarray:
+    """Field `[y, x]` in the focus of a lens one focal length behind the DOE, cell by cell in double precision."""
+    y, x = design.camera.grid.axis_m("y"), design.camera.grid.axis_m("x")
+    turns = design.camera.waves_per_metre(532e-9) * design.levels.heights_m()[design.level_map.level]
+    behind = np.exp(2j * np.pi * turns) * (np.hypot(y[:, None], x) < design.camera.opening.reach_m)
+    rows, columns = (np.exp(-2j * np.pi * np.outer(to / 20e-3 / 532e-9, at)) for to, at in ((y_m, y), (x_m, x)))
+    return rows @ behind @ columns.T
+
+
+def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
+    """Away from its edges all of it is one wave; where the phase is free, it is bent by turns."""
+    spread, y, x = {}, np.linspace(-60e-6, 60e-6, 31), np.linspace(-110e-6, 110e-6, 41)
+    tables = {}
+    for asked in ("free", "flat"):
+        spec = spec_of(tmp_path, "optimize.steps=120", *([] if asked == "free" else ["area.phase=flat"]))
+        design = optimize(spec)
+        field = field_at(design, y, x)
+        off = np.angle(field * field.sum().conj())
+        spread[asked] = np.sqrt(np.mean(off**2))
+        (tables[asked],) = areas_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+    assert spread["free"] > 1.0
+    assert spread["flat"] < 0.05
+    flat, free = tables["flat"], tables["free"]
+    assert free.in_wave is None
+    assert "in_wave" not in free.summary()
+    assert flat.in_wave is not None
+    assert flat.phase_rmse == pytest.approx(spread["flat"], abs=0.05)
+    # Nearly all light on the area is in the wave. It is less than if all cells were in step, when the area is uneven.
+    assert 0.95 * flat.efficiency < flat.in_wave <= flat.efficiency * (1 + 1e-6)
+    assert flat.wave_ceiling is not None
+    assert 0.4 * flat.wave_ceiling < flat.in_wave < flat.wave_ceiling
+    # Summed in double precision: a cell of 4 um is a point for light that stays within 200 um of the axis.
+    target, y, x = flat.target, design.camera.grid.axis_m("y"), design.camera.grid.axis_m("x")
+    rows, columns = (
+        np.exp(2j * np.pi * np.outer(at, sines) / 532e-9) for at, sines in ((y, target.sines_y), (x, target.sines_x))
+    )
+    steps = np.ptp(target.sines_y[:2]) * np.ptp(target.sines_x[:2]) / 532e-9**2
+    sent = np.abs(rows @ target.wave @ columns.T) * (np.hypot(y[:, None], x) < design.camera.opening.reach_m)
+    share = np.sum(sent) ** 2 * steps * 4e-6**4 / design.camera.opening.area_m2
+    assert flat.wave_ceiling == pytest.approx(share, rel=0.02)
+    assert "in the wave of the given phase" in flat.describe()
+
+
+def test_a_ring_has_the_vortex_of_a_picture(tmp_path: Path):
+    """A picture whose grey turns once around the middle: so does the phase of the light."""
+    at = np.arange(64) - 31.5
+    turns = np.arctan2(at[:, None], at) / (2 * np.pi) % 1.0
+    write_pixels(tmp_path / "turn.png", (turns * 65535).astype(np.uint16))
+    text = SPEC.replace('"rectangle"', '"ring"').replace('height = "200 um"', 'inner = "120 um"\nphase = "turn.png"')
+    path = tmp_path / "ring.toml"
+    path.write_text(text)
+    spec = load_spec(path, ["optimize.steps=80", "area.uniformity=0.3"])
+    design = optimize(spec, tmp_path / "run")
+    angle = 2 * np.pi * np.arange(90) / 90
+    field = np.array(
+        [field_at(design, *(np.array([one * 110e-6]) for one in (np.sin(a), np.cos(a))))[0, 0] for a in angle]
+    )
+    off = np.angle(field * np.exp(-1j * angle) * np.sum(field * np.exp(-1j * angle)).conj())
+    assert np.sqrt(np.mean(off**2)) < 0.3
+    # The run has a copy of its own.
+    (tmp_path / "turn.png").unlink()
+    (table,) = areas_of_design(open_design(tmp_path / "run", masks=False), design.as_optic())
+    assert table.phase_rmse is not None
+    assert table.phase_rmse < 0.4
+    write_pixels(tmp_path / "turn.png", np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(InputError, match="a picture of a phase must be grey"):
+        optimize(spec)
 
 
 def test_the_problem_sees_the_light_of_the_optic(tmp_path: Path):

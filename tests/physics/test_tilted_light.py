@@ -106,7 +106,7 @@ def test_light_of_areas_counts_from_where_it_arrives():
     """The lattice of an area holds what the pixels there receive."""
     camera = replace(lens_of(48), beam=EvenBeam(APERTURE, tilt_rad=(0.0, np.radians(1.5))))
     optic = HeightOptic.of(camera, random_heights())
-    target = AreaTarget.of(AreaSpec(shape="rectangle", width_m=0.6e-3, offset_m=(0.3e-3, 0.0)), camera, None)
+    target = AreaTarget.of(AreaSpec(shape="rectangle", width_m=0.6e-3, offset_m=(0.3e-3, 0.0)), camera)
     light = light_on(optic, target)
     y, x = (camera.image_m(*pair)[k] for k, pair in enumerate(((target.sines_y, 0.0), (0.0, target.sines_x))))
     axis = camera.axis_m()

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 Place = Annotated[float, place(-1.0, 1.0)]
 Size = Annotated[float, place(0.1 * UM, 1.0, SIZE)]
+FLAT_PHASE = "flat"
 Shape = Literal["rectangle", "ellipse", "ring", "line", "picture"]
 
 
 class AreaSpec(SpecTable, frozen=True):
-    """An area to be lit, instead of objectives. Its phase is free. There may be several, as [[area]].
+    """An area to be lit, instead of objectives. There may be several, as [[area]].
 
     Places and sizes are lengths on the sensor; without one, with `sensor.pixel_angle`, they are angles, and held as
     direction sines: `width_m`, `height_m` and `inner_m` as twice the sine of half the angle, the others as its sine.
@@ -35,13 +36,18 @@ class AreaSpec(SpecTable, frozen=True):
         edge_m: distance over which light should fall from 90 to 13.5 % of its value inside; by default the radius of
             the focus of a Gaussian beam, 2 wavelength x focal length / aperture for other light.
         picture: a file with the light to be drawn, relative to the spec file: PNG, TIFF or JPEG, in the usual sRGB.
+        phase: of the light of the area, free if left out: "flat", or a file with a grey picture of it over the area,
+            black for 0 and white for one turn less a step of its greys, relative to the spec file: PNG or TIFF. It is
+            that of the plane waves which draw the area, in the middle of the DOE and but for a common phase; a lens
+            whose front focal plane is the DOE shows it on the area.
         offset_m: [x, y] by which the area is moved on the sensor.
         dark_m: width of a frame around the area in which light counts against evenness, too.
         uniformity: how much of the efficiency evenness is worth: the share of light on the area less so many times
             its contrast, standard deviation over mean, is made as large as it can be. 0 is for light alone.
         start: "transport" carries the beam to the area as rays would: without speckle, for the beam that is described
             and where it is aimed at the DOE. "random" mixes the light of all its parts: with speckle, for any beam.
-            Areas in several planes keep their shapes better from "random".
+            Areas in several planes keep their shapes better from "random". A given phase tells the first one, unless
+            "random" is asked for.
         colour: the colour channel that should light it, by name; the first if left out.
         distance_m: where it lies, from the lens, or from the DOE without one; on the sensor if left out.
     """
@@ -57,6 +63,7 @@ class AreaSpec(SpecTable, frozen=True):
     inner_m: Size | None = optional()
     edge_m: Annotated[float, place(0.1 * UM, 1.0)] | None = optional()
     picture: str | None = optional()
+    phase: Annotated[str, Field(min_length=1)] | None = optional()
     offset_m: tuple[Place, Place] = optional((0.0, 0.0))
     dark_m: Annotated[float, place(0.0, 1.0)] = optional(0.0)
     uniformity: NotNegative = optional(1.0)
@@ -71,6 +78,11 @@ class AreaSpec(SpecTable, frozen=True):
         if self.shape == "line":
             return height, width
         return height or width, width
+
+    @property
+    def phase_picture(self) -> str | None:
+        """The file with the phase; None without one."""
+        return None if self.phase in (None, FLAT_PHASE) else self.phase
 
 
 _SHAPING = ("width_m", "height_m", "inner_m", "picture")
@@ -126,6 +138,9 @@ def _problems(spec: "Spec", area: Any, key: str) -> Iterator[InputError]:
     elif complete:
         first = spec.optics.colours[0].name
         yield from _reach(spec, area, key, colours[area.colour or first])
+    if area.phase is not None and spec.illumination is not None and any(m != 1 for m in spec.illumination.m_squared):
+        rule, cure = "light of several modes has no phase", "Leave it out, or leave out illumination.m_squared."
+        yield InputError(f"{key}.phase", rule, f'"{area.phase}"', cure)
     focal = spec.optics.focal_length_m
     if area.distance_m is not None and spec.sensor.in_angles:
         rule, cure = "light by its direction lies in no plane", "Leave it out, or give a lens or sensor.distance."
