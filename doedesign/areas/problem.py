@@ -31,7 +31,7 @@ class AreaLight(NamedTuple):
             incident light in the wave that is asked for.
         contrast: root of the mean square of light over the light wanted less 1, where it should be flat; of a picture,
             of the difference from what is wanted, over its mean. Where the phase is given, root of the light on the
-            area that is not in the wave over the light that is.
+            area, and on a frame that should be dark, that is not in the wave over the light that is.
         misplaced: root of the mean square by which the light on the border is not half of that inside, and of what
             edges differ from the wanted ones beyond a leeway.
     """
@@ -93,7 +93,8 @@ class AreaScore(eqx.Module):
         if self.wave is None:
             raise ValueError("the phase of this area is free")
         inside = _power(jnp.sum(self.wave.conj() * field))
-        rest = jnp.sum(jnp.where(self.lit, _power(field), 0.0)) - inside
+        counts = self.lit | (self.even > 0)  # and a frame that should be dark
+        rest = jnp.sum(jnp.where(counts, _power(field), 0.0)) - inside
         return AreaLight(inside, jnp.sqrt(jnp.maximum(rest, 0.0) / (inside + 1e-30) + 1e-12), jnp.zeros(()))
 
 

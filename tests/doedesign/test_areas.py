@@ -171,6 +171,16 @@ def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
     assert "in the wave of the given phase" in flat.describe()
 
 
+def test_a_frame_around_a_wave_is_dark_if_that_is_asked_for(tmp_path: Path):
+    spec = spec_of(tmp_path, "optimize.steps=120", "area.phase=flat", "area.dark=60 um")
+    design = optimize(spec)
+    (table,) = areas_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+    assert table.phase_rmse is not None
+    assert table.phase_rmse < 0.05
+    assert table.light[table.target.dark].max() < 0.2
+    assert table.light[~(table.target.dark | table.target.lit)].max() > 5  # what is left is right beyond the frame
+
+
 def test_a_ring_has_the_vortex_of_a_picture(tmp_path: Path):
     """A picture whose grey turns once around the middle: so does the phase of the light."""
     at = np.arange(64) - 31.5
