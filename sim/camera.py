@@ -211,6 +211,10 @@ class Camera:
         y, x = direction_sines(_sum(chief_rad, self.beam.tilt_rad)) - direction_sines(chief_rad)
         return float(y), float(x)
 
+    def beam_curvature_per_m(self, wavelength_m: float) -> float:
+        """Curvature of the beam's wavefront at the DOE, beside that of a source; 0 without a beam."""
+        return 0.0 if self.beam is None else self.beam.curvature_per_m(wavelength_m)
+
     def incident(self, line: SpectralLine) -> Complex[np.ndarray, "y x"] | None:
         """Amplitude of a mode of the beam on the cells, whose square is 1 for plane light; None without a beam."""
         if self.beam is None:

@@ -234,21 +234,19 @@ def energy_budget(
     scale = camera.opening.area_in(camera.grid.pitch_m, cells)
     reach = camera.grid.pitch_m / (pitch_m or camera.grid.pitch_m) / 2
     entered = passed = band = 0.0
-    lensed = camera.curvature_per_m(1 / depth_m)
+    curvature = camera.curvature_per_m(1 / depth_m) if camera.distance_m is None else 1 / depth_m
     for line in replace(camera, colours=(colour,)).lines:
-        curvature = lensed
         field = np.asarray(optic.field(line, depth_m))
         wavelength, open_ = line.wavelength_m, 1.0
         if camera.distance_m is not None:  # the band is one of directions behind the DOE, not of places
             field = field * np.exp(-2j * np.pi * source_path_m(camera, np.inf) / wavelength).astype(np.complex64)
-            curvature = 0.0 if np.isinf(depth_m) else 1 / depth_m
-        if camera.beam is not None and (light := camera.incident(line)) is not None:
-            curvature += camera.beam.curvature_per_m(wavelength)
+        if (light := camera.incident(line)) is not None:
             open_ = float(np.sum(np.abs(light) ** 2 * np.asarray(optic.coverage), dtype=np.float64))
             open_ *= cells / scale
+        slope = (curvature + camera.beam_curvature_per_m(wavelength)) * camera.grid.pitch_m**2 / wavelength
         entered += line.factor / camera.transmission(wavelength) * open_
         passed += line.factor * open_
-        band += line.factor * _band_energy(field, curvature * camera.grid.pitch_m**2 / wavelength, reach) / scale
+        band += line.factor * _band_energy(field, slope, reach) / scale
     energy, spot = float(total(psf)), float(far_spot(psf, camera, colour))
     lost = 0.0 if camera.beam is None else 1 - entered
     return EnergyBudget(lost, entered - passed, spot, energy - spot, band - energy, passed - band)

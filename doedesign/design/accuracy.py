@@ -97,8 +97,8 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     waves = [((np.arange(_SIDE) + rng.random(_SIDE)) / _SIDE - 0.5) * extent for _ in "yx"]
     waves = [one - moved / wavelength for one, moved in zip(waves, camera.moved_sines(), strict=True)]
     axis_y, axis_x = camera.grid.axis_m("y"), camera.grid.axis_m("x")
-    bend = 0.0 if np.isinf(depth_m) else 1 / depth_m
-    bend += 0.0 if camera.in_angles else 1 / camera.sensor_distance_m - 1 / camera.focal_length_m
+    beam = camera.beam_curvature_per_m(wavelength)
+    bend = 1 / depth_m + camera.curvature_per_m() + beam
 
     def kernel(seen: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Far field of the cells of a row in some directions; cells farther from the axis are lit more obliquely."""
@@ -114,6 +114,7 @@ def rim_error(optic: HeightOptic | EdgeOptic, line: SpectralLine, depth_m: float
     at_x = np.broadcast_to(axis_x[x][:, None, None] + inside[None, :] * pitch, at_y.shape)
     open_ = camera.opening.contains(at_y, at_x)
     path = path_at_m(camera, at_y, at_x, depth_m) - path_at_m(camera, axis_y[y], axis_x[x], depth_m)[:, None, None]
+    path += beam / 2 * (at_y**2 + at_x**2 - (axis_y[y] ** 2 + axis_x[x] ** 2)[:, None, None])
     # Within a cell the field has its source's phase.
     passed = (field[y, x] / coverage[y, x])[:, None, None] * np.exp(2j * np.pi * path / wavelength)
     more = (open_ - coverage[y, x][:, None, None]) * passed / _PARTS**2

@@ -158,8 +158,7 @@ def plan_far_field(
     else:
         pixels, miscounted = plan_mapped_pixels(places, camera.window, camera.fill, cutoff, factor, room, is_round)
     if not bare:
-        curvature = camera.curvature_per_m(1 / depth_m)
-        curvature += 0.0 if camera.beam is None else camera.beam.curvature_per_m(wavelength_m)
+        curvature = camera.curvature_per_m(1 / depth_m) + camera.beam_curvature_per_m(wavelength_m)
         slope = curvature * pitch**2 / wavelength_m if cell else None
         refine, missed = field_weights(positions / spacing + kept // 2, kept, length, aperture / pitch, slope, is_round)
     return FarField(

@@ -31,7 +31,7 @@ def oblique_waves(camera: Camera, wavelength_m: float, depths_m: Sequence[float]
     """Wave numbers of sources at some depths (metres, `inf` allowed) and of the window."""
     seen = float(camera.sines_of(0.0, (camera.window / 2 + 1) * camera.pixel_m)[1])
     seen += max(map(abs, camera.moved_sines()))
-    defocus = camera.curvature_per_m()
-    lit = [camera.opening.widest_m / 2 * (1 / depth_m + defocus) for depth_m in depths_m]
+    common = camera.curvature_per_m() + camera.beam_curvature_per_m(wavelength_m)
+    lit = [camera.opening.widest_m / 2 * (1 / depth_m + common) for depth_m in depths_m]
     cells = camera.grid.pitch_m / wavelength_m
     return ObliqueWaves(seen * cells, min(lit) * cells, max(lit) * cells)

@@ -7,15 +7,20 @@ import pytest
 
 from doedesign.areas.shape import light_on
 from doedesign.areas.target import AreaTarget
+from doedesign.design.accuracy import rim_error
 from doedesign.spec.targets.areas import AreaSpec
 from fab.errors import InputError
 from fab.grid import Grid
+from fab.levels import Levels
+from fab.process import Process, Variation
 from sim.camera import Camera, direction_sines
 from sim.illumination import EvenBeam, GaussianBeam
 from sim.metrics import energy_budget
 from sim.optic import HeightOptic
 from sim.propagation.fresnel import plan_direct
 from sim.psf_bank import psf
+from sim.rigorous.edge_optic import with_edges
+from sim.surface import as_fabricated
 from tests.physics.test_angles import CELLS, PITCH, PIXEL, WAVELENGTH, camera_of, summed
 
 APERTURE, FOCAL = CELLS * PITCH, 20e-3
@@ -79,6 +84,34 @@ def test_a_point_is_a_source_at_its_depth():
         source = psf(HeightOptic.of(camera, random_heights()), depths=8e-3).energy[0, 0]
         point = psf(HeightOptic.of(replace(camera, beam=EvenBeam(APERTURE, 8e-3)), random_heights())).energy[0, 0]
         assert np.linalg.norm(point - source) < 1e-4 * np.linalg.norm(source)
+
+
+def _of_point(camera: Camera) -> tuple[tuple[Camera, float], tuple[Camera, float]]:
+    """A source 3 mm before a DOE, as a depth and as a beam."""
+    return (camera, 3e-3), (replace(camera, beam=EvenBeam(APERTURE, 3e-3)), np.inf)
+
+
+def test_plates_as_fabricated_and_walls_are_seen_from_a_point_as_from_its_depth():
+    levels = Levels(4, 290e-9)
+    level = np.random.default_rng(3).integers(0, 4, (CELLS, CELLS)).astype(np.uint8)
+    moved = Variation(overlay_x_m=(0.4e-6, -0.3e-6), overlay_y_m=(0.2e-6, 0.5e-6))
+    pair = _of_point(lens_of(48))
+    plates = [as_fabricated(level, one, Process(levels), moved, depths_m=(depth,)) for one, depth in pair]
+    walls = [with_edges(random_heights(), replace(one, light="edges"), depths_m=(depth,)) for one, depth in pair]
+    for optics in (plates, walls):
+        source, point = (psf(doe, depths=depth).energy[0, 0] for doe, (_, depth) in zip(optics, pair, strict=True))
+        assert np.linalg.norm(point - source) < 1e-4 * np.linalg.norm(source)
+
+
+def test_the_rim_is_as_far_off_for_the_same_light():
+    """A DOE 5 mm before a lens sees the sensor as one on a lens of other focal length, 1/f = 1/B - A/B of its rays."""
+    camera = replace(lens_of(48), doe_distance_m=5e-3, defocus_m=15e-3)
+    distance = camera.sensor_distance_m
+    focal = FOCAL * distance / (FOCAL + 15e-3)
+    on_lens = replace(camera, doe_distance_m=0.0, focal_length_m=focal, defocus_m=distance - focal)
+    for pair in (_of_point(lens_of(48)), ((camera, np.inf), (on_lens, np.inf))):
+        source, point = (rim_error(HeightOptic.of(one, random_heights()), one.lines[0], depth) for one, depth in pair)
+        assert point == pytest.approx(source, rel=1e-3)  # amplitudes of beams have single precision
 
 
 def test_a_point_is_sharp_where_its_image_lies():
