@@ -13,7 +13,7 @@ from sim.rigorous.certificate import (
 from sim.rigorous.comparison import RowComparison, compare_row, thin_amplitudes
 from sim.rigorous.crossed import CrossedOrders, crossed_orders
 from sim.rigorous.edge_widths import edge_widths
-from sim.rigorous.mirrored import MirroredGradient, MirroredLayer, MirroredOrders
+from sim.rigorous.mirrored import MirroredLayer
 from sim.rigorous.pieces import PieceComparison, compare_piece, thin_piece_amplitudes
 from sim.rigorous.rows import Orders, Slab, orders_of, row_slabs
 
@@ -21,9 +21,7 @@ __all__ = [
     "CertifiedPiece",
     "CertifiedRow",
     "CrossedOrders",
-    "MirroredGradient",
     "MirroredLayer",
-    "MirroredOrders",
     "Orders",
     "Piece",
     "PieceComparison",

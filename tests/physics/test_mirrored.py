@@ -99,6 +99,50 @@ def test_other_layers_are_refused(permittivity: np.ndarray):
         layer(20).solve(permittivity, DEPTH_M, NO_WALLS, 1)
 
 
+def test_orders_near_the_limits_are_as_right_as_is_said():
+    """100 terms grow by a factor of e^7 over 0.7 um, and light turns by 10 rad."""
+    fmmax = pytest.importorskip("fmmax")
+    permittivity, depth_m = relief(), 2.1 * DEPTH_M
+    layers = [np.array([[GLASS**2]]), permittivity, np.array([[1.0]])]
+    wanted = layered_orders(layers, [0, depth_m, 0], (PERIOD_M, PERIOD_M), WAVELENGTH_M, 100, fmmax.Formulation.FFT)
+    found = layer(100).solve(permittivity, depth_m, NO_WALLS, 2)
+    assert found.orders == pytest.approx(wanted.within(2, 2)[1], abs=1e-4)
+    assert found.transmitted == pytest.approx(wanted.transmitted[1].sum(), abs=1e-4)
+
+
+def test_layers_too_deep_for_single_precision_are_refused():
+    for own, permittivity, depth_m in (
+        (layer(100), relief(), 2.2 * DEPTH_M),
+        (layer(6), np.full((PIXELS, PIXELS), 4.0), 1.6e-6),  # 32 rad
+        (layer(6), relief(), np.nan),
+        (layer(6), relief(), -1e-7),
+    ):
+        with pytest.raises(InputError, match="depth_m: .*single precision"):
+            own.solve(permittivity, depth_m, NO_WALLS, 1)
+    layer(6).gradients(relief(), DEPTH_M, NO_WALLS, 1, lambda orders: orders[None])
+    own = layer(100)
+    own.solve(relief(), 1.5 * DEPTH_M, NO_WALLS, 2)
+    with pytest.raises(InputError, match="depth_m: .*single precision"):
+        own.gradients(relief(), 1.5 * DEPTH_M, NO_WALLS, 2, lambda orders: orders[None])
+
+
+def test_the_gradient_by_the_depth_is_right_to_its_limit():
+    permittivity, own, depth_m = relief(), layer(100), 1.33 * DEPTH_M
+    weights = np.random.default_rng(1).normal(size=(6, 5, 5))
+    _, found = own.gradients(permittivity, depth_m, NO_WALLS, 2, lambda _: weights)
+    ends = [own.solve(permittivity, depth_m + step_m, NO_WALLS, 2).orders for step_m in (4e-9, -4e-9)]
+    wanted = ((ends[0] - ends[1]) / 8e-9 * weights).sum((1, 2))
+    assert np.linalg.norm([one.depth for one in found] - wanted) < 0.05 * np.linalg.norm(wanted)
+
+
+def test_orders_at_grazing_and_rasters_too_coarse_are_refused():
+    with pytest.raises(InputError, match="period_m: .*grazing"):
+        MirroredLayer(PIXELS, 4 * WAVELENGTH_M, WAVELENGTH_M, (GLASS, 1.0), 100)
+    with pytest.raises(InputError, match="pixels: .*20"):
+        MirroredLayer(20, PERIOD_M, WAVELENGTH_M, (GLASS, 1.0), 100)
+    MirroredLayer(21, 4.001 * WAVELENGTH_M, WAVELENGTH_M, (GLASS, 1.0), 100)
+
+
 def test_layers_of_another_size_are_refused():
     with pytest.raises(InputError, match="60 x 60"):
         layer(20).solve(np.ones((10, 10)), DEPTH_M, np.zeros((3, 10, 10)), 1)

@@ -13,6 +13,6 @@ The gradient is that of the adjoint field: one more solution of the same system,
     waves       cosines and sines of matrices, and fields that they carry
 """
 
-from sim.rigorous.mirrored.layer import MirroredGradient, MirroredLayer, MirroredOrders
+from sim.rigorous.mirrored.layer import MirroredLayer
 
-__all__ = ["MirroredGradient", "MirroredLayer", "MirroredOrders"]
+__all__ = ["MirroredLayer"]

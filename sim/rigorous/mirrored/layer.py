@@ -1,6 +1,7 @@
 """A layer that is its own mirror image, between two half-spaces: its orders, and how they change with the layer.
 
-Matrices are in single precision: 1e-6 of the incident light.
+Matrices are in single precision, and fields of the highest orders grow through a layer: orders are right to 1e-5 of the
+incident light where they grow by less than exp(12), and to 1e-4 at the limits.
 """
 
 from collections.abc import Callable
@@ -18,6 +19,13 @@ from sim.rigorous.mirrored.sectors import Product, Sector
 from sim.rigorous.mirrored.waves import cosine_and_sine, fields_before, real_columns, times_columns, times_sparse
 
 _NODES = 24  # of the depth, for the integral of the gradient
+_MARGIN = 0.3  # for eigenvalues of G B beyond those of an even layer, over its highest
+# Largest exponents to which fields may grow or turn through the layer. Measured against fmmax and the closed form of a
+# plate: orders are off by 1e-4 there, by 1e-3 at 18 or 38, and nonsense at 21 or 50.
+_MOST_GROWTH, _MOST_TURN = 15.0, 30.0
+# The largest growth with the margin, for gradients: the derivative by the depth is off by up to 5 % there.
+_MOST_ADJOINT = 12.0
+_GRAZING = 1e-12  # squared wave number across the layer, over that of light; at 2e-10 orders are right to 1e-6
 
 
 class MirroredOrders(NamedTuple):
@@ -75,13 +83,20 @@ class MirroredLayer:
     Rasters are `[y, x]` and their mirror maps column i to column -i, modulo their number. Light comes through the first
     half-space at normal incidence.
 
+    How deep a layer may be: with k the highest transverse wave number of an order, g² = k² - (2 pi / wavelength)² times
+    the least permittivity and p² = (2 pi / wavelength)² times the highest, a depth d must have g d <= 15 and p d <= 30,
+    and for gradients sqrt(g² + 0.3 p²) d <= 12.
+
     Args:
-        pixels: of a raster, along either axis; odd or even.
+        pixels: of a raster, along either axis; odd or even, and more than four times the number of the highest order.
         period_m: of the cell.
         wavelength_m: vacuum wavelength.
         indices: refractive indices before and behind the layer.
         terms: orders that are kept, about, as in `crossed_orders`.
         along_x: light whose electric field is along x, instead of along y.
+
+    Raises:
+        InputError: too few pixels for the terms, or an order at grazing in one of the half-spaces.
     """
 
     def __init__(
@@ -98,46 +113,47 @@ class MirroredLayer:
         reach = int(np.ceil(np.sqrt(terms / np.pi)))
         n, m = (each.ravel() for each in np.mgrid[-reach : reach + 1, -reach : reach + 1])
         inside = m**2 + n**2 < terms / np.pi
-        self._all = m[inside], n[inside]
+        self._all, highest = (m[inside], n[inside]), int(m[inside].max())
+        if pixels <= 4 * highest:
+            rule = f"{terms} terms have orders to {highest}, and so ask for more than {4 * highest} pixels"
+            raise InputError("pixels", rule, pixels, "Draw a finer raster, or keep fewer terms.")
         sectors = [Sector(m[k], n[k], even) for even, k in ((True, inside & (m >= 0)), (False, inside & (m > 0)))]
         first, second = sectors[::-1] if along_x else sectors
         self._first, self._sectors = len(first.m), (first, second)
         self._products = [[Product(row, column, self._shape) for column in (first, second)] for row in (first, second)]
-        self._curl = sparse.hstack([self._slope(first, first), -self._slope_x(second, first)]).tocsr()
-        divergence = sparse.hstack([self._slope_x(first, second), self._slope(second, second)])
+        self._curl = sparse.hstack([self._slope(first, first), -self._slope_x(first, second)]).tocsr()
+        divergence = sparse.hstack([self._slope_x(second, first), self._slope(second, second)])
         self._divergences = (divergence.T @ divergence).tocsr()
         self._k2 = self._step**2 * np.concatenate([each.m**2 + each.n**2 for each in (first, second)])
         # e = admittance h of light that goes on, h = impedance e.
-        self._admittance = self._faces(indices[1])[0]
-        face = self._faces(indices[0])
-        self._impedance = face[1]
+        before, behind = (np.sqrt((index * self._omega) ** 2 - self._k2 + 0j) for index in indices)
+        if min(abs(before).min(), abs(behind).min()) ** 2 <= _GRAZING * self._omega**2:
+            rule, got = "no order may leave at grazing", f"a period of {period_m / wavelength_m:.12g} wavelengths"
+            raise InputError("period_m", rule, got, "Change the period or the wavelength by a millionth.")
+        one, curls = sparse.eye_array(len(self._k2)), self._curl.T @ self._curl
+        self._admittance = (sparse.diags_array(1 / behind) @ (self._omega**2 * one - curls / indices[1] ** 2)).tocsr()
+        long = self._divergences / self._omega**2
+        self._impedance = (sparse.diags_array(1 / before) @ (indices[0] ** 2 * one - long)).tocsr()
         lit = 1 if along_x else 0
         at = np.flatnonzero((self._sectors[lit].m == 0) & (self._sectors[lit].n == 0))[0] + lit * self._first
         self._light = np.zeros(len(self._k2), complex)
-        self._light[at] = 1 / np.sqrt(face[0][at, at].real)
+        self._light[at] = 1 / np.sqrt((1 / before[at] * self._omega**2).real)
 
     def _slope(self, rows: Sector, columns: Sector) -> sparse.csr_array:
         """Derivative along y."""
         return self._joined(rows, columns, -1, -self._step * columns.n)
 
-    def _slope_x(self, columns: Sector, rows: Sector) -> sparse.csr_array:
+    def _slope_x(self, rows: Sector, columns: Sector) -> sparse.csr_array:
         """Derivative along x, which makes odd functions of even ones."""
         return self._joined(rows, columns, 1, (-1 if columns.even else 1) * self._step * columns.m)
 
     @staticmethod
     def _joined(rows: Sector, columns: Sector, turn: int, value: np.ndarray) -> sparse.csr_array:
-        place = {key: i for i, key in enumerate(zip(rows.m.tolist(), rows.n.tolist(), strict=True))}
+        place = rows.places()
         found = [place.get(key, -1) for key in zip(columns.m.tolist(), (turn * columns.n).tolist(), strict=True)]
         row, kept = np.array(found), np.array(found) >= 0
         column = np.arange(len(columns.m))[kept]
         return sparse.csr_array((value[kept], (row[kept], column)), (len(rows.m), len(columns.m)))
-
-    def _faces(self, index: float) -> tuple[sparse.csr_array, sparse.csr_array]:
-        q = np.sqrt((index * self._omega) ** 2 - self._k2 + 0j)
-        one = sparse.eye_array(len(q))
-        admittance = sparse.diags_array(1 / q) @ (self._omega**2 * one - self._curl.T @ self._curl / index**2)
-        impedance = sparse.diags_array(1 / q) @ (index**2 * one - self._divergences / self._omega**2)
-        return admittance.tocsr(), impedance.tocsr()
 
     def solve(
         self, permittivity: Float[np.ndarray, "y x"], depth_m: float, walls: Float[np.ndarray, "3 y x"], reach: int
@@ -151,9 +167,10 @@ class MirroredLayer:
             reach: orders from -reach to reach are told.
 
         Raises:
-            InputError: the permittivity has another size, is not positive or not its own mirror image.
+            InputError: the permittivity has another size, is not positive or not its own mirror image, or the layer is
+                too deep.
         """
-        self._require(permittivity)
+        self._require(permittivity, depth_m)
         with threadpool_limits(1):
             solution = self._solve(self._media(permittivity, walls), depth_m)
             return self._orders(solution[1], reach)
@@ -181,7 +198,8 @@ class MirroredLayer:
         Raises:
             InputError: as in `solve`.
         """
-        self._require(permittivity)
+        self._require(permittivity, depth_m)
+        self._require_shallow(depth_m, -self._bounds(permittivity)[0], _MOST_ADJOINT)
         with threadpool_limits(1):
             media = self._media(permittivity, walls)
             factors, h = self._solve(media, depth_m)
@@ -198,11 +216,27 @@ class MirroredLayer:
                 found.append(self._gradient(media, permittivity, depth_m, (h, e), adjoint))
             return orders, found
 
-    def _require(self, permittivity: np.ndarray) -> None:
+    def _bounds(self, permittivity: np.ndarray, margin: float = _MARGIN) -> tuple[float, float]:
+        """The least and the largest eigenvalue that G B may have."""
+        highest = self._omega**2 * permittivity.max()
+        least = self._omega**2 * permittivity.min() - self._k2.max()
+        return least - margin * highest, (1 + margin) * highest
+
+    def _require(self, permittivity: np.ndarray, depth_m: float) -> None:
         fits = permittivity.shape == self._shape and permittivity.min() > 0
         if not fits or not np.allclose(permittivity, np.roll(permittivity[:, ::-1], 1, 1), rtol=1e-6, atol=0):
             rule = f"a layer has {self._shape[0]} x {self._shape[1]} positive permittivities, and a mirror at column 0"
             raise InputError("permittivity", rule, f"shape {permittivity.shape}", "Give such an array.")
+        least, most = self._bounds(permittivity, 0.0)
+        self._require_shallow(depth_m, -least, _MOST_GROWTH)
+        self._require_shallow(depth_m, most, _MOST_TURN)
+
+    def _require_shallow(self, depth_m: float, square: float, most: float) -> None:
+        """Refuse a layer through which a wave number of that square grows or turns too much."""
+        exponent = depth_m / self._unit_m * np.sqrt(max(square, 0.0))
+        if not 0 <= exponent <= most:
+            rule = f"in single precision, fields may change through a layer by an exponent of at most {most:g}"
+            raise InputError("depth_m", rule, f"{exponent:.3g}", "Keep fewer terms, or give a shallower layer.")
 
     def _media(self, permittivity: np.ndarray, walls: np.ndarray) -> _Media:
         (first, _), (_, second) = self._products
@@ -238,7 +272,7 @@ class MirroredLayer:
         """Matrix to the orders (component, n from -reach to reach, m from 0) in exponentials."""
         blocks = []
         for sector in self._sectors:
-            place = {key: i for i, key in enumerate(zip(sector.m.tolist(), sector.n.tolist(), strict=True))}
+            place = sector.places()
             rows, columns, values = [], [], []
             for at, (n, m) in enumerate((n, m) for n in range(-reach, reach + 1) for m in range(reach + 1)):
                 half = np.sqrt(0.5) if m else 1.0
@@ -267,8 +301,7 @@ class MirroredLayer:
         depth = depth_m / self._unit_m
         nodes, share = np.polynomial.legendre.leggauss(_NODES)
         place, share = depth * (1 + nodes) / 2, depth * share / 2
-        highest = self._omega**2 * permittivity.max()
-        bounds = (self._omega**2 * permittivity.min() - self._k2.max()) - 0.3 * highest, 1.3 * highest
+        bounds = self._bounds(permittivity)
         before = adjoint, self._impedance.T @ adjoint
         squared = media.g @ media.b
         h, e = fields_before(media.g, media.b, squared, behind, np.append(depth - place, depth), bounds)

@@ -13,6 +13,10 @@ class Sector(NamedTuple):
     n: Int[np.ndarray, " function"]
     even: bool
 
+    def places(self) -> dict[tuple[int, int], int]:
+        """Number of every function by its (m, n)."""
+        return {key: i for i, key in enumerate(zip(self.m.tolist(), self.n.tolist(), strict=True))}
+
 
 class Product:
     """Matrix of multiplication by a raster, from functions of one sector to those of another."""
