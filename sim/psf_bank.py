@@ -48,6 +48,7 @@ class PsfBank(eqx.Module):
             is at the centre of the window.
         field_rad: field angles (y, x).
         camera: the camera they were computed for, if it is known.
+        sines: whether `pixel_m` is a direction sine, where no camera tells.
     """
 
     energy: Energies
@@ -56,6 +57,12 @@ class PsfBank(eqx.Module):
     pixel_m: float = eqx.field(static=True)
     field_rad: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.0))
     camera: Camera | None = eqx.field(static=True, default=None)
+    sines: bool = eqx.field(static=True, default=False)
+
+    @property
+    def in_angles(self) -> bool:
+        """Whether pixels are directions of light (`Camera.in_angles`)."""
+        return self.sines if self.camera is None else self.camera.in_angles
 
     def with_camera(self, camera: Camera) -> "PsfBank":
         """The same PSFs with the camera they were computed for or measured with, which metrics and pictures need."""
@@ -116,12 +123,13 @@ class PsfBank(eqx.Module):
     def _repr_html_(self) -> str:
         """Table and picture for notebooks."""
         from fab.figure import html_of, length_text
+        from sim.plots.places import size_text
 
         y, x = self.energy.shape[-2:]
         rows = {
             "colours": ", ".join(self.colours),
             "depths": ", ".join(length_text(z) for z in self.depths_m),
-            "pixels": f"{x} x {y} of {length_text(self.pixel_m) if self.camera is None else self._pixel_text}",
+            "pixels": f"{x} x {y} of {size_text(self.in_angles, self.pixel_m)}",
         }
         if self.camera is None:
             return html_of("PSFs", rows)
@@ -130,12 +138,6 @@ class PsfBank(eqx.Module):
             values = self.metric(name)
             rows[METRICS[name].label] = f"{np.nanmin(values):.3g} to {np.nanmax(values):.3g}"
         return html_of("PSFs", rows, self.plot())
-
-    @property
-    def _pixel_text(self) -> str:
-        from sim.plots.places import size_text
-
-        return size_text(self.metric_inputs().camera, self.pixel_m)
 
     def as_optic(self) -> "BankOptic":
         """An optic that mixes these PSFs linearly in 1/z."""

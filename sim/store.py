@@ -2,9 +2,10 @@
 
 * The first scan line is the highest y, so a viewer shows +y up; arrays here have row 0 at the lowest y.
 * Channels are float32: `height` in metres; for a bank one channel per depth and colour, `z50mm.red`, in energy per
-  pixel per unit power incident on the clear aperture.
-* Lengths and angles are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because EXR's own
-  number attributes are float32.
+  pixel per unit power incident on the clear aperture, or in the beam. Pixels of a bank have a pitch, `pixel_m`, or where
+  there is no sensor a direction sine, `pixel_sine`.
+* Lengths, angles and sines are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because EXR's
+  own number attributes are float32.
 * A digest of pixels and lengths rides along as the text `sha256` and is checked on reading (EXR itself leaves
   incompressible blocks unguarded). Files without one are taken as they are.
 * The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`);
@@ -125,7 +126,7 @@ def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[st
 
 def _pixel_key(bank: "sim.psf_bank.PsfBank") -> str:
     """Name of the pitch of a bank's pixels: they have a length, or only a direction."""
-    return "pixel_sine" if bank.camera is not None and bank.camera.in_angles else "pixel_m"
+    return "pixel_sine" if bank.in_angles else "pixel_m"
 
 
 def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = np.inf) -> "sim.psf_bank.PsfBank":
@@ -157,7 +158,10 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         stored = _length(path, "pixel pitch", pixel_m)
         energy = np.stack([channels[c] for c in colours])[:, None]
         return PsfBank(energy, colours, (float(depth_m),), stored)
-    colours, depths, stored, field = _bank_description(path, texts[_BANK])
+    colours, depths, stored, field, sines = _bank_description(path, texts[_BANK])
+    if pixel_m is not None and sines:
+        rule = "pixels of a bank of directions have a sine in place of a pitch"
+        raise InputError(str(path), rule, f"a pitch of {pixel_m:.9g} m", "Give PSFs on a sensor, or leave it out.")
     if pixel_m is not None and not np.isclose(pixel_m, stored, rtol=1e-6, atol=0):
         rule = "the pixel pitch given must be that of the file"
         raise InputError(str(path), rule, f"{pixel_m:.9g} m against {stored:.9g} m", "Leave it out: the file knows it.")
@@ -167,7 +171,7 @@ def read_bank(path: str | Path, pixel_m: float | None = None, depth_m: float = n
         rule = "every PSF of the bank must be there"
         raise InputError(str(path), rule, f"no channel {missing[0]}", "Write the file again.")
     energy = np.stack([np.stack([channels[name] for name in row]) for row in names])
-    return PsfBank(energy, colours, depths, stored, field)
+    return PsfBank(energy, colours, depths, stored, field, sines=sines)
 
 
 def write_picture(path: str | Path, channels: Mapping[str, Any], extra: Mapping[str, str] | None = None) -> None:
@@ -197,21 +201,23 @@ def _channel_name(depth_m: float, colour: str) -> str:
 
 def _bank_description(
     path: str | Path, text: str
-) -> tuple[tuple[str, ...], tuple[float, ...], float, tuple[float, float]]:
+) -> tuple[tuple[str, ...], tuple[float, ...], float, tuple[float, float], bool]:
+    """Colours, depths, pitch and field angles of a bank, and whether the pitch is a sine."""
     try:
         described = json.loads(text)
         colours = tuple(str(colour) for colour in described["colours"])
         depths = tuple(float(depth) for depth in described["depths_m"])
         y, x = (float(angle) for angle in described["field_rad"])
-        key = "pixel_sine" if "pixel_sine" in described else "pixel_m"
+        sines = "pixel_sine" in described
+        key = "pixel_sine" if sines else "pixel_m"
         pixel = described[key]
     except (ValueError, KeyError, TypeError) as error:
-        rule = "must list colours, depths_m, pixel_m and field_rad"
+        rule = "must list colours, depths_m, pixel_m or pixel_sine, and field_rad"
         raise InputError(f"{path}: {_BANK}", rule, f'"{error!r}"', "Write the file again.") from error
     if not colours or not all(depth > 0 for depth in depths) or not depths:
         rule = "needs at least one colour and depths above 0"
         raise InputError(f"{path}: {_BANK}", rule, f"{colours} and {depths}", "Write the file again.")
-    return colours, depths, _length(path, f"{_BANK}.{key}", pixel), (y, x)
+    return colours, depths, _length(path, f"{_BANK}.{key}", pixel), (y, x), sines
 
 
 def _measured_colours(path: str | Path, channels: Mapping[str, Any]) -> tuple[str, ...]:

@@ -48,7 +48,8 @@ def _title(table: "AreaTable") -> str:
     """Efficiency and contrast of an area."""
     title = f"{100 * table.efficiency:.1f} % of the light, contrast {100 * table.contrast:.2g} %"
     if table.pixel_contrast is not None:
-        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {size_text(table.camera, table.camera.pixel_m)})"
+        pixels = size_text(table.camera.in_angles, table.camera.pixel_m)
+        title += f" ({100 * table.pixel_contrast:.2g} % on pixels of {pixels})"
     return title
 
 

@@ -135,7 +135,7 @@ def certify(
     if pieces and side > min(height.shape):
         cure = "Ask for smaller squares, or for 0."
         raise InputError("side", f"squares must fit into the design of {min(height.shape)} cells", side, cure)
-    rows = cut_rows(height, camera.grid, camera.opening, min(cells, height.shape[0]))
+    rows = cut_rows(height, camera.grid, camera.opening, cells)
     if not rows:
         cure = "Certify a design with relief."
         raise InputError(design.name, "must not be flat where rows are cut out", "a flat plate", cure)

@@ -43,9 +43,9 @@ def _degree_locator() -> Any:
     return lambda: DegreeLocator(nbins=5, steps=[1, 2, 5, 10])
 
 
-def size_text(camera: Camera, size_m: float) -> str:
-    """A size about the axis in words."""
-    return f"{DEGREES.size(size_m):.4g}°" if camera.in_angles else length_text(size_m)
+def size_text(in_angles: bool, size_m: float) -> str:
+    """A size about the axis in words: a length, or the degrees that a sine spans."""
+    return f"{DEGREES.size(size_m):.4g}°" if in_angles else length_text(size_m)
 
 
 def place_bar(axes: "Axes", camera: Camera, size_m: float) -> None:
@@ -54,7 +54,7 @@ def place_bar(axes: "Axes", camera: Camera, size_m: float) -> None:
         scale_bar(axes, size_m)
         return
     bare(axes)
-    axes.set_xlabel(f"{size_text(camera, size_m)} wide")
+    axes.set_xlabel(f"{size_text(camera.in_angles, size_m)} wide")
 
 
 def unit_of(camera: Camera) -> PlaceUnit:

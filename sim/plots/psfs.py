@@ -206,7 +206,7 @@ def _notes(camera: Camera, bank: "Bank", shown: dict[str, list[int]]) -> str:
         words.append("dashed: geometric defocus disc")
     if "far" in shown:
         width = 2 * _inset_pixels(camera, bank) + bank.energy.shape[-1] % 2
-        words.append(f"inset: central {size_text(camera, width * bank.pixel_m)}")
+        words.append(f"inset: central {size_text(camera.in_angles, width * bank.pixel_m)}")
         words.append("dotted: far spot (first dark ring + 1 pixel)")
     if len(camera.colours) == 3:
         words.append("together: all three as red, green, blue")

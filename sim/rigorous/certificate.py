@@ -92,18 +92,19 @@ def cut_rows(
     """Cut rows of `cells` cells: along x on the x axis, along y on the y axis, and along x on the diagonal.
 
     On the axes of a design of rings they cross the rings, where walls stand closest. Rows without relief are left out,
-    and parts of rows beyond the aperture.
+    and parts of rows beyond the aperture; rows are at most as long as the plate.
     """
     found = []
     for axis, centre_m in _places(shares, aperture):
         row, column = _cell_at(grid, centre_m)
         line, middle = (height_m[row], column) if axis == "x" else (height_m[:, column], row)
         across_m = grid.axis_m("y")[row] if axis == "x" else grid.axis_m("x")[column]
-        start = int(np.clip(middle - cells // 2, 0, len(line) - cells))
-        along_m = grid.axis_m(axis)[start : start + cells]
+        count = min(cells, len(line))
+        start = int(np.clip(middle - count // 2, 0, len(line) - count))
+        along_m = grid.axis_m(axis)[start : start + count]
         at_m = (np.full(1, across_m), along_m) if axis == "x" else (along_m, np.full(1, across_m))
         inside = aperture.contains(*at_m)
-        part = np.asarray(line[start : start + cells], np.float64)[inside]
+        part = np.asarray(line[start : start + count], np.float64)[inside]
         if len(part) > 1 and np.ptp(part) > 0:
             own, other = float(along_m[inside].mean()), float(across_m)
             found.append(Row(axis, (own, other) if axis == "y" else (other, own), part))

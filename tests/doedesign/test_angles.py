@@ -143,12 +143,18 @@ def test_what_is_said_of_light_knows_no_lens(tmp_path: Path):
     write_bank(tmp_path / "bank.exr", bank)
     assert b"pixel_sine" in (tmp_path / "bank.exr").read_bytes()
     assert b"pixel_m" not in (tmp_path / "bank.exr").read_bytes()
-    assert read_bank(tmp_path / "bank.exr").pixel_m == bank.pixel_m
+    again = read_bank(tmp_path / "bank.exr")
+    assert (again.pixel_m, again.in_angles) == (bank.pixel_m, True)
+    assert "of 0.2°" in again._repr_html_()
+    write_bank(tmp_path / "again.exr", again)
+    assert (tmp_path / "again.exr").read_bytes() == (tmp_path / "bank.exr").read_bytes()
+    with pytest.raises(InputError, match="directions"):
+        read_bank(tmp_path / "bank.exr", pixel_m=bank.pixel_m)
 
 
 def test_pictures_have_round_degrees_on_an_axis_of_sines(tmp_path: Path):
     camera = camera_from_spec(spec_of(tmp_path, GRID))
-    assert size_text(camera, 1.0) == "60°"  # 30 to either side
+    assert size_text(camera.in_angles, 1.0) == "60°"  # 30 to either side
     assert camera.told_in(MILLIMETRES) is DEGREES
     with single(None, (4, 4)) as axes:
         axes.set(xlim=(-0.8, 0.8), ylim=(-0.1, 0.1))

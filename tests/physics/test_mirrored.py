@@ -117,12 +117,12 @@ def test_layers_too_deep_for_single_precision_are_refused():
         (layer(6), relief(), np.nan),
         (layer(6), relief(), -1e-7),
     ):
-        with pytest.raises(InputError, match="depth_m: .*single precision"):
+        with pytest.raises(InputError, match=r"depth_m: .*single precision"):
             own.solve(permittivity, depth_m, NO_WALLS, 1)
     layer(6).gradients(relief(), DEPTH_M, NO_WALLS, 1, lambda orders: orders[None])
     own = layer(100)
     own.solve(relief(), 1.5 * DEPTH_M, NO_WALLS, 2)
-    with pytest.raises(InputError, match="depth_m: .*single precision"):
+    with pytest.raises(InputError, match=r"depth_m: .*single precision"):
         own.gradients(relief(), 1.5 * DEPTH_M, NO_WALLS, 2, lambda orders: orders[None])
 
 
@@ -136,9 +136,9 @@ def test_the_gradient_by_the_depth_is_right_to_its_limit():
 
 
 def test_orders_at_grazing_and_rasters_too_coarse_are_refused():
-    with pytest.raises(InputError, match="period_m: .*grazing"):
+    with pytest.raises(InputError, match=r"period_m: .*grazing"):
         MirroredLayer(PIXELS, 4 * WAVELENGTH_M, WAVELENGTH_M, (GLASS, 1.0), 100)
-    with pytest.raises(InputError, match="pixels: .*20"):
+    with pytest.raises(InputError, match=r"pixels: .*20"):
         MirroredLayer(20, PERIOD_M, WAVELENGTH_M, (GLASS, 1.0), 100)
     MirroredLayer(21, 4.001 * WAVELENGTH_M, WAVELENGTH_M, (GLASS, 1.0), 100)
 
