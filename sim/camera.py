@@ -204,6 +204,11 @@ class Camera:
         """Whether pixels lie evenly among the sines about the chief ray, whatever its angle."""
         return self.is_sine and not self.is_tilted
 
+    @property
+    def sees_field(self) -> bool:
+        """Whether the pixels of a window depend on its chief ray otherwise than by lying about it."""
+        return self.in_angles or not self.images_alike
+
     def moved_sines(self, chief_rad: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
         """Direction sines (y, x) by which a tilted beam moves images, for the angles of the window's chief ray."""
         if self.beam is None or not self.is_tilted:

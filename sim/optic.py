@@ -147,7 +147,7 @@ class CellOptic(CameraOptic):
                 line.wavelength_m,
                 depth_m=depth_m,
                 sampling=sampling,
-                field_rad=ON_AXIS if self.camera.images_alike else self.camera.chief_rad(field_rad),
+                field_rad=self.camera.chief_rad(field_rad) if self.camera.sees_field else ON_AXIS,
             )
         return plan_direct(self.camera, line.wavelength_m, propagation)
 

@@ -43,7 +43,9 @@ from jaxtyping import Array, Complex, Float, PyTree
 from scipy.fft import next_fast_len
 
 from fab.aperture import RoundAperture
-from sim.camera import Camera
+from fab.grid import Grid
+from sim.aperture import circle_coverage
+from sim.camera import Camera, direction_sines
 from sim.propagation.field_weights import FIELD_TAPS, field_weights
 from sim.propagation.mapped import MappedPixels, plan_mapped_pixels
 from sim.propagation.pixel import Banded, PixelWeights, pixel_weights, sampling_for
@@ -68,6 +70,8 @@ class FarField(eqx.Module):
     coarsen: Banded | None
     # Phase ramps (y, x) over the pupil that displace the image, or None (see `displaced`)
     tilt: tuple[Complex[Array, " cell"], Complex[Array, " cell"]] | None
+    # Share of every pixel that is a direction of light (y, x), or None where all of them are
+    visible: Float[Array, "v u"] | None
     cells: tuple[int, int] = eqx.field(static=True)  # DOE cells (y, x)
     length: int = eqx.field(static=True)  # transform length per axis
     kept: int = eqx.field(static=True)  # samples of the field kept around the axis
@@ -92,7 +96,8 @@ class FarField(eqx.Module):
             rows: pytree of arrays whose first axis is the grid's y; `pupil` receives blocks of them.
             shared: pytree passed to every block unchanged. The result is differentiable in it, `rows` and `pixels`.
         """
-        return _pixel_energy((rows, shared, self.pixels), pupil, _with_pixels(self, None))
+        energy = _pixel_energy((rows, shared, self.pixels), pupil, _with_pixels(self, None))
+        return energy if self.visible is None else energy * self.visible
 
 
 @lru_cache(maxsize=32)
@@ -117,7 +122,7 @@ def plan_far_field(
             1; by default as many as predict an error of `TOLERANCE`.
         cell: include the sinc² of a square DOE cell; False treats cells as points.
         field_rad: field angles (y, x); without influence if the lens has the mapping "sine" and no distortion, and no
-            beam is tilted.
+            beam is tilted. Without a sensor they say which pixels lie beyond a sine of 1, where there is no light.
         room: by how much `bent` may turn, shear or stretch the image, a share; 0 is for a sensor that is perfect.
     """
     ny, nx = camera.grid.shape
@@ -168,6 +173,7 @@ def plan_far_field(
         refine=None if refine is None else banded(refine),
         coarsen=None if refine is None else banded(refine.T),
         tilt=None,
+        visible=_visible(camera, field_rad),
         cells=(ny, nx),
         length=length,
         kept=kept,
@@ -176,6 +182,15 @@ def plan_far_field(
         sample_m=fine,
         expected_error=np.hypot(miscounted, 2 * np.sqrt(2) * missed),
     )
+
+
+def _visible(camera: Camera, field_rad: tuple[float, float]) -> Array | None:
+    """Share of every pixel within a sine of 1, or None where all lie there."""
+    chief, half = direction_sines(field_rad), camera.window * camera.pixel_m / 2
+    if not camera.in_angles or np.hypot(*(np.abs(chief) + half)) <= 1:
+        return None
+    y, x = (float(-sine) for sine in chief)
+    return jnp.asarray(circle_coverage(Grid((camera.window, camera.window), camera.pixel_m), 2.0, (y, x)))
 
 
 @lru_cache(maxsize=32)

@@ -110,6 +110,8 @@ def _pixel_areas(camera: Camera, fine_m: float) -> tuple[np.ndarray, np.ndarray,
     offsets = Grid((_POINTS, _POINTS), camera.pixel_m * camera.fill / _POINTS).axis_m("x")
     place_m = np.hypot(far[:, None, None] + offsets[:, None], near[:, None, None] + offsets).reshape(len(keys), -1)
     radius_m, share = _sine_radius_m(camera, place_m)
+    if camera.in_angles:  # there is no light beyond a sine of 1
+        share = share * (radius_m <= 1)
     radius = radius_m / fine_m
     index = np.floor(radius).astype(np.int64)
     first = index.min(axis=1)

@@ -6,7 +6,8 @@ import pytest
 
 from fab.grid import Grid
 from sim.camera import Camera, Colour
-from sim.optic import HeightOptic
+from sim.optic import HeightOptic, RingOptic
+from sim.propagation.hankel import ring_count
 from sim.psf_bank import psf
 
 WAVELENGTH, CELLS, PITCH = 532e-9, 96, 2e-6
@@ -67,6 +68,32 @@ def test_a_square_opening_has_a_sinc_squared_in_the_sine():
     # The first dark place of 80 um at 532 nm is 0.381 degrees away.
     dark = np.degrees(np.arcsin((np.argmin(image[20, 20:32])) * camera.pixel_m))
     assert dark == pytest.approx(np.degrees(np.arcsin(WAVELENGTH / 80e-6)), abs=0.026)
+
+
+def test_there_is_no_light_beyond_a_sine_of_one():
+    """A window whose corners lie at 1.41, looked at straight and from an axis 20 degrees aslant."""
+    camera, tilt = camera_of(40, 0.05), float(np.radians(20))
+    height, open_ = np.zeros((2, CELLS, CELLS), np.float32)
+    height[40:56, 40:56] = np.random.default_rng(0).uniform(0, 1.1e-6, (16, 16))
+    open_[40:56, 40:56] = 1.0
+    optic = HeightOptic(camera, jnp.asarray(open_), jnp.asarray(height))
+    parts = (np.arange(40 * 50) + 0.5) / 1000 - 1
+    straight = np.asarray(psf(optic).energy[0, 0])
+    shares = (np.hypot(parts[:, None], parts) < 1).reshape(40, 50, 40, 50).mean((1, 3))
+    assert np.all(straight[shares == 0] == 0)
+    assert np.count_nonzero(shares == 0) > 100
+    phase = 2j * np.pi * camera.waves_per_metre(WAVELENGTH) * height.astype(float)
+    expected = summed(open_ * np.exp(phase), camera) * shares
+    assert straight == pytest.approx(expected, rel=0.02, abs=3e-3 * expected.max())
+    edge = (shares > 0.2) & (shares < 0.8)
+    assert straight[edge].sum() == pytest.approx(expected[edge].sum(), rel=0.05)
+    rings = psf(RingOptic(camera, jnp.zeros(ring_count(camera)))).energy[0, 0]
+    assert np.array_equal(np.asarray(rings) == 0, shares == 0)
+    aslant = np.asarray(psf(optic, field_rad=(0.0, tilt)).energy[0, 0])
+    beyond = np.hypot(parts[:, None], parts + np.sin(tilt)).reshape(40, 50, 40, 50).min((1, 3)) > 1
+    assert np.all(aslant[beyond] == 0)
+    assert np.count_nonzero(beyond) > 300
+    assert np.all(aslant[~beyond & (shares > 0.1)] > 0)
 
 
 def test_a_source_at_a_depth_is_spread_over_the_sine_of_the_aperture():
