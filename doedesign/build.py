@@ -69,7 +69,7 @@ def beam_from_spec(spec: Spec) -> Beam | None:
     centre_m, aslant = _yx(light.centre_m), (_yx(light.angles_rad), _yx(light.tilt_rad))
     if light.kind in ("plane", "point"):
         distance_m = np.inf if light.distance_m is None else light.distance_m
-        return EvenBeam(spec.doe.relief.shrunk(spec.process.chrome_overlap_m).disc_m, distance_m, *aslant)
+        return EvenBeam(distance_m, *aslant)
     if light.picture is None:
         y, x = _yx(light.diameters_m)
         return GaussianBeam((y / 2, x / 2), light.waist_distance_m, _yx(light.m_squared), centre_m, *aslant)

@@ -76,7 +76,9 @@ class GaussianBeam:
         """Curvature of its wavefront at the DOE, the mean of both axes."""
         return sum(self._at_doe(axis, wavelength_m)[1] for axis in (0, 1)) / 2
 
-    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+    def amplitude_per_m(
+        self, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
+    ) -> Complex[np.ndarray, "y x"]:
         """Amplitude `[y, x]` of a mode in the middle of every cell; its square times area sums to 1 over the plane."""
         parts = []
         for axis, name, number in ((0, "y", self._modes[mode][1]), (1, "x", self._modes[mode][2])):
@@ -128,7 +130,9 @@ class MeasuredBeam:
         """None."""
         return 0.0
 
-    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+    def amplitude_per_m(
+        self, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
+    ) -> Complex[np.ndarray, "y x"]:
         """Root of the intensity between its pixels, in the middle of every cell; dark beyond the picture."""
         places = [
             (grid.axis_m(name) - centre) / self.pixel_m + (count - 1) / 2
@@ -144,13 +148,11 @@ class EvenBeam:
     """Light that is as bright all over the aperture, of whose power energies are shares.
 
     Attributes:
-        aperture_m: diameter of the clear aperture, or of a disc as large as one that is not round.
         distance_m: distance of the point before the DOE that it comes from; infinite for a plane wave.
         angle_rad: angles (y, x) of its chief ray, which the sensor's window follows.
         tilt_rad: the same, added to it; the window stays.
     """
 
-    aperture_m: float
     distance_m: float = np.inf
     angle_rad: Pair = (0.0, 0.0)
     tilt_rad: Pair = (0.0, 0.0)
@@ -168,13 +170,15 @@ class EvenBeam:
         """Curvature of its wavefront about the chief ray."""
         return float(1 / self.distance_m / np.sqrt(1 + np.sum(np.tan(self._chief_rad) ** 2)))
 
-    def amplitude_per_m(self, grid: Grid, wavelength_m: float, mode: int) -> Complex[np.ndarray, "y x"]:
+    def amplitude_per_m(
+        self, grid: Grid, aperture: Aperture, wavelength_m: float, mode: int
+    ) -> Complex[np.ndarray, "y x"]:
         """Amplitude in the middle of every cell, its phase less that along the chief ray, as for every beam."""
         waves = np.zeros(grid.shape)
         if np.isfinite(self.distance_m):
             y, x = grid.axis_m("y")[:, None], grid.axis_m("x")
             waves = path_from_point_m(y, x, self.distance_m, self._chief_rad) / wavelength_m
-        return 2 / (np.sqrt(np.pi) * self.aperture_m) * np.exp(2j * np.pi * (waves - np.rint(waves)))
+        return 2 / (np.sqrt(np.pi) * aperture.disc_m) * np.exp(2j * np.pi * (waves - np.rint(waves)))
 
 
 def path_from_point_m(
@@ -215,7 +219,7 @@ def beam_amplitude(
     Its mean square over that clear aperture would be 1 if the beam were to end at its rim: plane light
     has the amplitude 1, and PSFs count energies over the power of the beam.
     """
-    found = beam.amplitude_per_m(grid, wavelength_m, mode) * np.sqrt(np.pi) * aperture.disc_m / 2
+    found = beam.amplitude_per_m(grid, aperture, wavelength_m, mode) * np.sqrt(np.pi) * aperture.disc_m / 2
     found = found.astype(np.complex64)
     found.setflags(write=False)
     return found

@@ -2,10 +2,10 @@
 
 * The first scan line is the highest y, so a viewer shows +y up; arrays here have row 0 at the lowest y.
 * Channels are float32: `height` in metres; for a bank one channel per depth and colour, `z50mm.red`, in energy per
-  pixel per unit power incident on the clear aperture, or in the beam. Pixels of a bank have a pitch, `pixel_m`, or where
-  there is no sensor a direction sine, `pixel_sine`.
-* Lengths, angles and sines are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because EXR's
-  own number attributes are float32.
+  pixel per unit power incident on the clear aperture, or in the beam. Pixels of a bank have a pitch, `pixel_m`, or
+  where there is no sensor a direction sine, `pixel_sine`.
+* Lengths, angles and sines are text attributes with all the digits of a float64 (`pitch_m = "1.85e-06"`), because
+  EXR's own number attributes are float32.
 * A digest of pixels and lengths rides along as the text `sha256` and is checked on reading (EXR itself leaves
   incompressible blocks unguarded). Files without one are taken as they are.
 * The same values give the same bytes. A file appears whole or not at all (`fab.files.write_atomic`);

@@ -17,6 +17,7 @@ between TE and TM, which is left out, is 0.1 % of a PSF at most.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import permutations
 from typing import Any, Literal
 
 import equinox as eqx
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Inexact
 
+from fab.aperture import Aperture, RoundAperture
 from fab.grid import Grid
 from sim.aperture import open_cells
 from sim.camera import Camera
@@ -137,7 +139,7 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
         wavelength = view.wavelength_m
         index = refractive_index(camera.material, wavelength)
         highest = highest_wall(two_waves(wavelength, index) if is_traced(height) else float(jnp.ptp(height)))
-        taps, _ = line_weights(*oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m)))
+        taps, _ = line_weights(*oblique_waves(camera, wavelength, (view.nearest_m, view.farthest_m)), camera.opening)
         walls = []
         for axis in ("y", "x"):
             series = width_series(highest, wavelength, index, camera.polarisation, axis)
@@ -149,7 +151,8 @@ def with_edges(height_m: Any, camera: Camera, *, depths_m: Sequence[float] = (np
 
 def _is_seen(camera: Camera, wavelength_m: float, depths_m: Sequence[float], parts: int) -> bool:
     """Whether weights on parts of cells do for the light of walls, from all these depths alike."""
-    return line_weights(*oblique_waves(camera, wavelength_m, depths_m).over(parts))[1] <= _WORST
+    waves = oblique_waves(camera, wavelength_m, depths_m).over(parts)
+    return line_weights(*waves, camera.opening)[1] <= _WORST
 
 
 def _views(camera: Camera, wavelength_m: float, depths_m: tuple[float, float], parts: int) -> list[View]:
@@ -178,7 +181,9 @@ def optic_as_drawn(
 
 
 @lru_cache(maxsize=64)
-def line_weights(seen: float, low: float, high: float) -> tuple[Inexact[np.ndarray, "node tap"], float]:
+def line_weights(
+    seen: float, low: float, high: float, aperture: Aperture
+) -> tuple[Inexact[np.ndarray, "node tap"], float]:
     """Weights on the cells to either side of a line whose far field is that of the line.
 
     A cell's far field is sinc(u). The sum of weights on cells at k + 1/2 from the line, times exp(-2 pi i u (k + 1/2)),
@@ -190,13 +195,15 @@ def line_weights(seen: float, low: float, high: float) -> tuple[Inexact[np.ndarr
         seen: highest wave number of a pixel, waves per cell.
         low: wave number of the light of the farthest source on a cell at the rim.
         high: the same of the nearest.
+        aperture: the clear aperture, whose lines are as long as it is where they lie.
 
     Returns:
         the weights for shares from 0 to 1, and the root mean square of their error over DOE and window. As few as leave
         an error of 0.3 %, ten on either side at most. Real ones for distant sources.
     """
     share = np.linspace(0, 1, _SHARES)
-    chord = np.sqrt(1 - share**2) / np.sqrt(1 - share**2).sum()
+    chord = _lengths_at(share, aperture)
+    chord = chord / chord.sum()
     waves = np.linspace(-seen - share * high, seen - share * low, 300)  # [wave, node]
     weights, error = np.zeros((_SHARES, 2), complex), np.inf
     for reach in range(1, _MOST_TAPS + 1):
@@ -210,6 +217,14 @@ def line_weights(seen: float, low: float, high: float) -> tuple[Inexact[np.ndarr
         if error <= _GOOD:
             break
     return (np.real(weights) if low == high == 0 else weights), error
+
+
+def _lengths_at(share: Float[np.ndarray, " node"], aperture: Aperture) -> Float[np.ndarray, " node"]:
+    """How long lines along both axes are together, at shares of the way to the rim of the longer side; in any unit."""
+    if isinstance(aperture, RoundAperture):
+        return np.sqrt(1 - share**2)
+    half = share * aperture.widest_m
+    return sum((np.where(half <= side, other, 0.0) for side, other in permutations(aperture.extent_m)), np.zeros(1))
 
 
 def _at_borders(

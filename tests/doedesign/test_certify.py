@@ -9,6 +9,7 @@ import pytest
 
 from doedesign.design.design import Design
 from doedesign.runs.certificate import Certificate, certify, in_words
+from fab.aperture import RectangularAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.level_map import LevelMap
@@ -115,6 +116,15 @@ def fine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Certificate, dict]:
     level_map = LevelMap(level, Levels(4, 150 * NM), grid, camera.aperture_m, "fine")
     found = certify(Design(level_map, camera, (), (np.inf,)), cells=4, pieces=2, out=folder)
     return found, json.loads((folder / "certificate.json").read_text())
+
+
+def test_rows_along_a_wide_plate_are_as_long_as_asked_for():
+    grid, opening = Grid((6, 24), 0.5 * UM), RectangularAperture((3 * UM, 12 * UM))
+    camera = Camera(grid, opening, "fused_silica", COLOURS[:1], 1e-3, 3.7 * UM, 48)
+    level = np.random.default_rng(0).integers(0, 4, grid.shape).astype(np.uint8)
+    level_map = LevelMap(level, Levels(4, 150 * NM), grid, opening, "wide")
+    found = certify(Design(level_map, camera, (), (np.inf,)), cells=8, pieces=0)
+    assert {(one.row.axis, len(one.row.height_m)) for one in found.rows} == {("x", 8), ("y", 6)}
 
 
 def test_squares_are_recorded_beside_rows(fine: tuple[Certificate, dict]):

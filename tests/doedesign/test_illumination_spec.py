@@ -72,10 +72,11 @@ def test_light_without_a_shape_is_plane_or_comes_from_a_point(tmp_path: Path):
     plane = spec_of(tmp_path, PLANE, 'illumination.tilt=["2 deg", "-1 deg"]')
     assert isinstance(plane.doe.aperture_m, float)
     opening = plane.doe.aperture_m - 2 * plane.process.chrome_overlap_m
-    assert camera_from_spec(plane).beam == EvenBeam(opening, tilt_rad=(parse_angle("-1 deg"), parse_angle("2 deg")))
+    assert camera_from_spec(plane).aperture_m == pytest.approx(opening)
+    assert camera_from_spec(plane).beam == EvenBeam(tilt_rad=(parse_angle("-1 deg"), parse_angle("2 deg")))
     point = camera_from_spec(spec_of(tmp_path, POINT, 'illumination.angle=["0 deg", "1 deg"]')).beam
-    assert point == EvenBeam(opening, 0.05, (parse_angle("1 deg"), 0.0))
-    assert camera_from_spec(spec_of(tmp_path, POINT, 'illumination.distance="inf"')).beam == EvenBeam(opening)
+    assert point == EvenBeam(0.05, (parse_angle("1 deg"), 0.0))
+    assert camera_from_spec(spec_of(tmp_path, POINT, 'illumination.distance="inf"')).beam == EvenBeam()
 
 
 def test_a_beam_without_a_kind_is_gaussian(tmp_path: Path):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fab.aperture import Aperture, RectangularAperture, RoundAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from sim.aperture import circle_coverage
@@ -177,7 +178,7 @@ def test_gradients_are_those_of_finite_differences():
 @pytest.mark.parametrize("oblique", [False, True])
 def test_slopes_of_the_light_of_walls_are_those_of_differences(oblique: bool):
     """Cell by cell, at the rim too, where the weights of a line lie partly beyond the cells."""
-    weights, _ = line_weights(0.3, 0.0, 0.28 * oblique)
+    weights, _ = line_weights(0.3, 0.0, 0.28 * oblique, RoundAperture(1.0))
     assert np.iscomplexobj(weights) == oblique
     some = weights[4:32:4].T  # at seven borders, each with its own if light is oblique
     series = [width_series(1.2e-6, WAVELENGTH, INDEX, "x", axis) for axis in ("y", "x")]
@@ -214,7 +215,7 @@ def test_a_flat_doe_is_as_it_was():
 
 @pytest.mark.parametrize(("seen", "low", "high"), [(0.1, 0, 0), (0.4, 0, 0), (0.3, 0.28, 0.28), (0.3, 0.0, 0.28)])
 def test_weights_of_a_line_have_its_far_field(seen: float, low: float, high: float):
-    weights, error = line_weights(seen, low, high)
+    weights, error = line_weights(seen, low, high, RoundAperture(1.0))
     assert error < 0.003
     for share, taps in zip((0.0, 0.5, 1.0), weights[[0, 16, 32]], strict=True):
         waves = np.linspace(-seen - share * high, seen - share * low, 77)
@@ -224,6 +225,25 @@ def test_weights_of_a_line_have_its_far_field(seen: float, low: float, high: flo
         assert np.sqrt(np.mean(missed**2)) < 0.03
         assert missed.max() < 0.15
         assert taps.sum() == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("aperture", [RoundAperture(2.0), RectangularAperture((1.6, 2.0))])
+def test_the_error_of_a_line_is_the_mean_over_all_lines(aperture: Aperture):
+    """Random lines along both axes, each with the length of it that is open; the rim of a rectangle counts in full."""
+    seen, low, high = 0.3, 0.0, 0.55
+    weights, error = line_weights(seen, low, high, aperture)
+    at = np.random.default_rng(0).uniform(-1, 1, 1500)
+    along = (np.arange(800) + 0.5) / 400 - 1
+    nodes = np.linspace(0, 1, len(weights))
+    places = np.arange(weights.shape[1]) - (weights.shape[1] - 1) / 2
+    missed = [
+        np.mean(np.abs(np.exp(-2j * np.pi * waves[:, None] * places) @ taps * np.sinc(waves) - 1) ** 2)
+        for waves, taps in zip(np.linspace(-seen - nodes * high, seen - nodes * low, 300, axis=1), weights, strict=True)
+    ]
+    squares = np.interp(np.abs(at), nodes, missed)
+    lengths = aperture.contains(at[:, None], along).mean(1) + aperture.contains(along[:, None], at).mean(0)
+    # The node at the rim, in full on one side of it, and as many lines as there are.
+    assert error == pytest.approx(np.sqrt((squares * lengths).sum() / lengths.sum()), rel=0.1)
 
 
 def test_what_cannot_be_is_refused():
