@@ -2,7 +2,7 @@
 
 The DOE sits on a thin lens in the aperture plane (paper §3.1). For a sensor at the focal distance the lens cancels the
 quadratic term of Fresnel propagation and only the source's own path differences and the DOE remain (eq. 7); a sensor
-out of focus leaves a quadratic remainder, which is added here.
+out of focus, or one without a lens, leaves a quadratic remainder, which is added here.
 """
 
 import math
@@ -294,9 +294,9 @@ class Camera:
         return (np.sqrt(index**2 - square) - np.sqrt(1.0 - square)) / wavelength_m
 
     def defocus_radius_m(self, depth_m: float) -> float:
-        """Radius on the sensor of the geometric blur disc: D/2 · |B/z + 1 - d/f|, or D f / (2 z) in the focal plane.
+        """Radius on the sensor of the geometric blur disc: R · |B/z + 1 - d/f|, or R f / z in the focal plane.
 
-        B is `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow, and
+        R is how far the aperture reaches, B `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow, and
         without a sensor the sine that the aperture fills as seen from the source.
         """
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
@@ -397,8 +397,9 @@ def source_path_m(
 ) -> Float[np.ndarray, "y x"]:
     """Optical path from a point source to every DOE cell, relative to the chief ray, metres in float64.
 
-    Eq. 1 of the paper with the constant subtracted, plus r^2/2 (1/d - 1/f) for a sensor at distance d. The linear path
-    of field angles (y, x), the tilt that moves the image to f tan(field), is removed: the window follows the chief ray.
+    Eq. 1 of the paper with the constant subtracted, plus r^2/2 times `Camera.curvature_per_m`, which is 1/d - 1/f for a
+    sensor at distance d. The linear path of field angles (y, x), the tilt that moves the image, is removed: the window
+    follows the chief ray.
     """
     y = camera.grid.axis_m("y")[:, None]
     x = camera.grid.axis_m("x")[None, :]

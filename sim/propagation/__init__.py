@@ -10,5 +10,6 @@ field_weights  the sensor's field between its samples
 farfield    the default path (eqs. 7-9 of the paper)
 hankel      the same for rotationally symmetric pupils
 directions  the far field in single directions: spots and orders
+near_axis   light near the axis at distances behind a DOE without a lens
 fresnel     the direct path (eq. 5): reference for the other two
 """

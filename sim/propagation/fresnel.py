@@ -31,8 +31,8 @@ _UNTAPERED = 0.75  # share of the kernel's band that passes in full
 class DirectPath(eqx.Module):
     """Operators of one wavelength on the direct path."""
 
-    gather: tuple[Banded, Banded]  # samples at the DOE pitch -> pixels, along y and x
-    lens: Complex[Array, "y x"]  # `[y, x]` transmission of the thin lens, unit modulus
+    gather: tuple[Banded, Banded]  # samples, `parts` to a cell -> pixels, along y and x
+    lens: Complex[Array, "y x"]  # `[y, x]` what the source's path lacks of the thin lens, or has too much without one
     kernel: Complex[Array, "ky kx"]  # `[ky, kx]` transfer function in FFT order on the padded grid
     first: tuple[int, int] = eqx.field(static=True)  # first sample (y, x) kept on the sensor
     parts: int = eqx.field(static=True)  # samples per cell and axis

@@ -1,7 +1,8 @@
 """Integration of an intensity known at equidistant samples over square sensor pixels.
 
-Behind an aperture of diameter D the intensity holds no spatial frequency above D / (lambda f). Its integral over a
-pixel is therefore a weighted sum of samples that need not be finer than lambda f / (2D), and a short sum suffices if
+Behind an aperture of diameter or longer side D the intensity on a sensor at the distance d holds no spatial frequency
+along an axis above D / (lambda d). Its integral over a pixel is therefore a weighted sum of samples that need not be
+finer than lambda d / (2D), and a short sum suffices if
 the weights are chosen well. Point samples at the pixel pitch are not enough: behind an f/1.8 lens the speckle of a
 rough DOE is finer than a pixel, and they miss the integral by 60-90 %.
 
