@@ -296,8 +296,8 @@ class Camera:
     def defocus_radius_m(self, depth_m: float) -> float:
         """Radius on the sensor of the geometric blur disc: R · |B/z + 1 - d/f|, or R f / z in the focal plane.
 
-        R is how far the aperture reaches, B `sensor_distance_m` and d the distance from lens to sensor. Without a lens it is the aperture's shadow, and
-        without a sensor the sine that the aperture fills as seen from the source.
+        R is how far the aperture reaches, B `sensor_distance_m` and d the distance from lens to sensor. Without a lens
+        it is the aperture's shadow, and without a sensor the sine that the aperture fills as seen from the source.
         """
         inverse_depth = 0.0 if np.isinf(depth_m) else 1.0 / depth_m
         if self.in_angles:

@@ -157,6 +157,8 @@ def calibrate(
     unknowns = unknowns_of(prior, errors, design.camera.grid.pitch_m)  # refuses mistakes before files are read
     if not isinstance(measurement, Measurement):
         measurement = read_measurement(Path(measurement), design.camera)
+    if design.camera.beam is not None:
+        log.warning("the measurement's source lights the plate evenly: the beam of the design is left out")
     writing = results_folder(out, design.name, design.folder, light=design.camera.light)
     # Usually seven rounds of derivatives and a step.
     with writing as fresh, models_meter("calibration", 7 * (len(unknowns.names) + 1)) as on_model:

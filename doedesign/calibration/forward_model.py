@@ -70,7 +70,10 @@ def _energy(optic: _Optic, view: Int[Array, ""], plate: Transmission, motion: Fl
 
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
-    """A plate, drawn in levels, in front of a camera of one wavelength; images of point sources at some depths."""
+    """A plate, drawn in levels, in front of a camera of one wavelength; images of point sources at some depths.
+
+    These sources light it evenly, whatever beam the camera has for its design.
+    """
 
     level: UInt8[np.ndarray, "y x"]
     camera: Camera
@@ -78,6 +81,10 @@ class ForwardModel:
     depths_m: tuple[float, ...]
     geometry: GeometryPrior = UPRIGHT
     _optics: dict[Any, _Optic] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Leave the beam out."""
+        object.__setattr__(self, "camera", replace(self.camera, beam=None))
 
     @property
     def wavelength_m(self) -> float:

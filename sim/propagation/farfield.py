@@ -216,11 +216,13 @@ def bent(plan: FarField, camera: Camera, displacement_m: Float[Array, "2 term"])
 
     Args:
         plan: one that was made for this camera on the axis, with enough `room`; farther pixels are NaN.
-        camera: the camera.
+        camera: the camera, whose window follows no beam aslant; a ValueError otherwise.
         displacement_m: coefficients (`sim.propagation.places.cubic_places`), metres.
     """
     if plan.pixels is None:
         raise ValueError("`plan` must have been made with `room` for its pixels to move")
+    if any(camera.chief_rad((0.0, 0.0))):
+        raise ValueError(f"`camera` must look along its axis, but its beam's angle is {camera.chief_rad((0.0, 0.0))}")
     moved = plan.pixels.at(cubic_places(window_places(camera, plan.sample_m), camera, displacement_m))
     return _with_pixels(plan, moved)
 

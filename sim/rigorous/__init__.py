@@ -1,15 +1,15 @@
 """Light as Maxwell has it: rigorous solutions of rows and squares of cells, and the widths of edges taken from them.
 
-    rows          coupled waves of a row that repeats
-    crossed       Fourier modes of a square that repeats along both axes (fmmax)
-    mirrored      one layer with a mirror, and the gradient of its orders
-    edge_widths   what the wall between two heights adds to a thin element
-    width_tables  those widths by height, shipped or computed once
-    walls         the light of upright walls, with its gradient
-    edge_optic    a DOE with that light: `with_edges`
-    comparison    a row as a thin element, with edges and by Maxwell's equations
-    pieces        a square, the same three ways
-    certificate   rows and squares cut out of a design, and compared
+rows          coupled waves of a row that repeats
+crossed       Fourier modes of a square that repeats along both axes (fmmax)
+mirrored      one layer with a mirror, and the gradient of its orders
+edge_widths   what the wall between two heights adds to a thin element
+width_tables  those widths by height, shipped or computed once
+walls         the light of upright walls, with its gradient
+edge_optic    a DOE with that light: `with_edges`
+comparison    a row as a thin element, with edges and by Maxwell's equations
+pieces        a square, the same three ways
+certificate   rows and squares cut out of a design, and compared
 """
 
 from sim.rigorous.certificate import (

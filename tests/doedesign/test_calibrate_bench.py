@@ -21,6 +21,7 @@ from doedesign.calibration.unknowns import unknowns_of
 from doedesign.design.design import Design
 from fab.process import Process
 from sim.camera import Colour
+from sim.illumination import EvenBeam
 from tests.doedesign.calibration_fakes import PITCH_M, PIXEL_M, PROBE_M, photograph, plate_drawn, usual_process
 from tests.doedesign.foreign_bench import SAMPLES, Askew, foreign_light
 
@@ -89,8 +90,13 @@ def test_the_models_camera_stands_as_the_benchs():
     prior = GeometryPrior((askew.rotation, askew.scale_y, askew.scale_x, askew.distortion))
     model = ForwardModel(design.level_map.level, camera, unknowns_of(process), (NEAR_M,), prior)
     plain = replace(model, geometry=UPRIGHT, _optics={})
+    # The source of the bench lights the plate, and not the beam that it was designed for.
+    designed = replace(plain, camera=replace(camera, beam=EvenBeam(0.05, tilt_rad=(0.0, 0.01))), _optics={})
     motion = np.array([0.4, -0.3, 0.0, *askew])
-    seen, upright = (one.plate(np.zeros(4)).image(0, motion) / camera.transmission(PROBE_M) for one in (model, plain))
+    seen, upright, own = (
+        one.plate(np.zeros(4)).image(0, motion) / camera.transmission(PROBE_M) for one in (model, plain, designed)
+    )
+    assert np.array_equal(upright, own)
     # The rim is 1 % of the light of so small a plate; a camera taken for upright misses a fifth.
     assert np.linalg.norm(seen - light) < 0.02 * np.linalg.norm(light)
     assert np.linalg.norm(upright - light) > 0.1 * np.linalg.norm(light)
