@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture
+from fab.aperture import Aperture, MaskAperture
 from fab.files import write_atomic
 from fab.units import MM, format_length
 
@@ -173,8 +173,9 @@ def length_text(length_m: float) -> str:
 
 
 def aperture_text(aperture: Aperture) -> str:
-    """An aperture in words for a picture: its diameter, or "2 mm × 1 mm"."""
-    return " × ".join(map(length_text, aperture.sizes_m))
+    """An aperture in words for a picture: its diameter, "2 mm × 1 mm", or "mask of 2 mm × 1 mm"."""
+    sizes = " × ".join(map(length_text, aperture.sizes_m))
+    return f"mask of {sizes}" if isinstance(aperture, MaskAperture) else sizes
 
 
 def bare(axes: "Axes") -> None:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from fab.errors import InputError
 
+# One part in so many keeps points that are exactly on a rim inside it.
+SLACK = 1e-12
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -60,8 +63,7 @@ class Grid:
 
     def _circle(self, diameter_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return squared x of every column, and the greatest inside the circle for every row."""
-        # The slack of one part in 1e12 keeps pixels whose centre is exactly on the circle.
-        limit = (diameter_m / 2) ** 2 * (1 + 1e-12)
+        limit = (diameter_m / 2) ** 2 * (1 + SLACK)
         return self.axis_m("x") ** 2, limit - self.axis_m("y") ** 2
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, aperture_from, diameter_of
+from fab.aperture import Aperture, MaskAperture, aperture_from, diameter_of
+from fab.aperture.picture import MASK_FILES, read_mask
 from fab.errors import InputError
 from fab.files import read_npy
 from fab.grid import Grid
@@ -128,7 +129,8 @@ def read_height(
         path: ``.npy``, ``.tif``, ``.tiff`` or ``.png``.
         pitch: edge of a pixel. None of these files holds it, so it must be given.
         scale: length that one count of the file stands for. Floats are metres if it is left out; integers need it.
-        aperture: diameter of the relief, or its outline (`fab.aperture`); the shorter side of the map if left out.
+        aperture: diameter of the relief, its outline (`fab.aperture`), or the name of a picture of it
+            (`fab.aperture.picture`); the shorter side of the map if left out.
 
     Returns:
         The height map, float32 if the file holds float32 or float16, otherwise float64.
@@ -155,6 +157,8 @@ def read_height(
         height_m *= scale_m
     require_heights(height_m, str(path))
     grid = Grid((height_m.shape[0], height_m.shape[1]), metres(pitch, "pitch"))
+    if isinstance(aperture, str) and aperture.lower().endswith(MASK_FILES):
+        aperture = MaskAperture.of(read_mask(aperture, grid.shape), grid.pitch_m)
     if not isinstance(aperture, Aperture):
         aperture = min(grid.extent_m) if aperture is None else metres(aperture, "aperture")
     return HeightMap(height_m, grid, aperture)

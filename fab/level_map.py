@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, RectangularAperture, RoundAperture, aperture_from, diameter_of
+from fab.aperture import Aperture, MaskAperture, RectangularAperture, RoundAperture, aperture_from, diameter_of
 from fab.archive import read_archive, write_archive
 from fab.errors import InputError
 from fab.files import sha256_bytes
@@ -68,6 +68,10 @@ class LevelMap:
             if not isinstance(relief, RoundAperture):
                 rule = f"must lie on the raster, {RectangularAperture(self.grid.extent_m)}"
             raise InputError("aperture", rule, str(relief), "Give the diameter of the relief, or its width and height.")
+        if isinstance(relief, MaskAperture) and (relief.shape, relief.pitch_m) != (self.grid.shape, self.grid.pitch_m):
+            rule = f"a mask must have the raster's {self.grid.shape} pixels of {format_length(self.grid.pitch_m)}"
+            got = f"{relief.shape} of {format_length(relief.pitch_m)}"
+            raise InputError("aperture", rule, got, "Give a mask of the same raster.")
         blank = np.where(relief.inside(self.grid), checked, np.uint8(self.levels.count - 1))
         blank.setflags(write=False)
         object.__setattr__(self, "aperture", relief)

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fab.aperture import Aperture, aperture_from, diameter_of
+from fab.aperture import Aperture, MaskAperture, aperture_from, diameter_of
 from fab.errors import InputError
 from fab.files import canonical_json, read_bytes, write_atomic
 from fab.pictures import MOST_PER_BYTE
@@ -74,8 +74,10 @@ def write_height(
         aperture: the clear aperture; a number is the diameter of a round one, metres.
         extra: further text attributes; a ValueError for a name that is taken.
     """
-    sizes = aperture_from(aperture).sizes_m
-    texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": " x ".join(map(repr, map(float, sizes)))}
+    outline = aperture_from(aperture)
+    sizes = " x ".join(map(repr, map(float, outline.sizes_m)))
+    text = canonical_json(outline.record()).decode() if isinstance(outline, MaskAperture) else sizes
+    texts = {"pitch_m": repr(float(pitch_m)), "aperture_m": text}
     _write(Path(path), {"height": height_m}, texts, extra)
 
 
@@ -96,8 +98,22 @@ def read_height(path: str | Path) -> StoredHeight:
     pitch = _length(path, "pitch_m", texts.pop("pitch_m")) if "pitch_m" in texts else None
     aperture = None
     if "aperture_m" in texts:
-        aperture = aperture_from([_length(path, "aperture_m", size) for size in texts.pop("aperture_m").split(" x ")])
+        aperture = _aperture(path, texts.pop("aperture_m"))
     return StoredHeight(height, pitch, aperture, texts)
+
+
+def _aperture(path: str | Path, text: str) -> Aperture:
+    """Read an aperture as `write_height` writes it: lengths, or the record of a mask."""
+    where = f"{path}: aperture_m"
+    if not text.startswith("{"):
+        return aperture_from([_length(path, "aperture_m", size) for size in text.split(" x ")], where=where)
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            where, "must be the record of a mask", "text that is no JSON", "Write the file again."
+        ) from error
+    return aperture_from(record, where=where)
 
 
 def write_bank(path: str | Path, bank: "sim.psf_bank.PsfBank", extra: Mapping[str, str] | None = None) -> None:

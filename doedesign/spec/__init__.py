@@ -47,6 +47,7 @@ from doedesign.spec.text import (
 )
 from doedesign.spec.training import NetworkSpec, TrainSpec
 from doedesign.spec.values import HEIGHT_FILES, STARTS, Options
+from doedesign.spec.values.aperture import with_mask
 from doedesign.spec.values.table import toml_key
 from doedesign.spec.variation import ProcessFile, VariationFile
 from doedesign.spec.wafer import WaferFile, WaferSpec
@@ -87,7 +88,8 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
 
     Returns:
         The spec with every default filled in, and what its task says (`doedesign.spec.left_out`). Files it names are
-        not opened (see `input_files`), but for a spectral response, whose colours become part of the spec.
+        not opened (see `input_files`), but for a spectral response, whose colours become part of the spec, and the
+        picture of an aperture, whose open cells do.
 
     Raises:
         InputError: the file cannot be read, is no TOML, or breaks a rule.
@@ -99,7 +101,7 @@ def load_spec(path: str | Path, overrides: Sequence[str] = (), **values: Any) ->
     for name, value in values.items():
         keys.append(key := name.replace("__", ".") if "__" in name or name in tables else f"optimize.{name}")
         _put(raw, key, value)
-    filled = with_left_out(with_response(raw, path), str(path), keys)
+    filled = with_left_out(with_mask(with_response(raw, path), path), str(path), keys)
     spec = _checked(Spec, filled, str(path), keys)
     spec._file = path  # pyright: ignore[reportAttributeAccessIssue]
     return spec

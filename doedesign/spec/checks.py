@@ -15,6 +15,7 @@ from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
 from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
 from doedesign.spec.values.table import toml_key
+from fab.aperture import MaskAperture
 from fab.errors import InputError
 from fab.units import DEGREES, MICROMETRES, NM, format_length
 from sim.camera import check_lens, image_place
@@ -63,7 +64,7 @@ def _doe(spec: Spec) -> Iterator[InputError]:
     # As many cells per side span the longer side of a rectangle; of two numbers each spans its own.
     sides = relief.extent_m if isinstance(doe.samples, tuple) else (relief.widest_m,)
     # One part in a million of slack, for values that lie on the limit in decimal.
-    spanned = zip(sides, doe.shape, strict=False)
+    spanned = () if isinstance(relief, MaskAperture) else zip(sides, doe.shape, strict=False)
     if any(abs(side - n * doe.pitch_m) > doe.pitch_m / 2 * (1 + 1e-6) for side, n in spanned):
         spans = [format_length(n * doe.pitch_m) for n in reversed(doe.shape)][: len(sides)]
         counts: list[int] | int = [max(2, round(side / doe.pitch_m)) for side in reversed(sides)]
@@ -77,7 +78,7 @@ def _doe(spec: Spec) -> Iterator[InputError]:
     if spec.optimize.parametrization == "radial" and not isinstance(doe.aperture_m, float):
         rule, cure = "rings fill a round aperture", 'Use "freeform", or give the diameter of the aperture.'
         yield InputError("optimize.parametrization", rule, f'"radial" in {aperture}', cure)
-    if doe.relief.narrowest_m - 2 * overlap < 2 * doe.pitch_m:
+    if relief.shrunk(overlap).narrowest_m < 2 * doe.pitch_m:
         rule = f"twice the overlap must leave an opening in an aperture of {aperture}"
         yield InputError("process.chrome_overlap", rule, format_length(overlap), "Choose a smaller overlap.")
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BeforeValidator,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
@@ -48,6 +47,7 @@ from doedesign.spec.values import (
     length,
     share,
 )
+from doedesign.spec.values.aperture import ApertureSizes, MaskRows, Samples, shape_of
 from doedesign.spec.values.table import SpecTable, optional
 from doedesign.spec.wafer import WaferSpec
 from fab.aperture import Aperture, aperture_from
@@ -162,34 +162,6 @@ def _colour_name(wavelength: object, index: int) -> str:
     return f"{nanometres:.6g}nm".replace(".", "p").replace("+", "")
 
 
-_SIZE: Any = length(1 * UM, 1.0).func
-
-
-def _aperture_sizes(value: Any, info: ValidationInfo) -> Any:
-    """One length, or two of them."""
-    if not isinstance(value, list | tuple):
-        return _SIZE(value, info)
-    if len(value) != 2:
-        raise broken("must be a diameter, or [width, height]", 'For example "2 mm", or ["2 mm", "1 mm"].')
-    return tuple(_SIZE(size, info) for size in value)
-
-
-def _cell_counts(value: Any) -> Any:
-    """One whole number, or two of them."""
-    counts = value if isinstance(value, list | tuple) else [value]
-    example = "For example 2400, or [2400, 1200]."
-    if any(not isinstance(n, int) or isinstance(n, bool) for n in counts) or len(counts) != (1 + (counts is value)):
-        raise broken("must be a whole number, or two of them, [along x, along y]", example)
-    for rule, broke in (("must be at least 2", min(counts) < 2), ("must be at most 20000", max(counts) > 20000)):
-        if broke:
-            raise broken(rule, example)
-    return tuple(counts) if counts is value else value
-
-
-Samples = Annotated[int | tuple[int, int], BeforeValidator(_cell_counts)]
-ApertureSizes = Annotated[float | tuple[float, float], BeforeValidator(_aperture_sizes)]
-
-
 class DoeSpec(SpecTable, frozen=True):
     """The DOE.
 
@@ -197,7 +169,9 @@ class DoeSpec(SpecTable, frozen=True):
         samples: cells per side, or [along x, along y] of a plate that is not square.
         pitch_m: edge of a cell.
         aperture_m: diameter of the relief, or [width, height] of a rectangle. The cells must span it to within half a
-            pitch; as many per side its longer side.
+            pitch; as many per side its longer side. Or a picture (.png, .tif, .npy) beside the spec, "mask.png", whose
+            white is the relief: it covers the cells, up in it is +y, and row 0 of an array is the lowest y. The spec
+            keeps the open cells (`doedesign.spec.values.aperture`).
         material: substrate, a key of `sim.material.MATERIALS`.
     """
 
@@ -206,15 +180,27 @@ class DoeSpec(SpecTable, frozen=True):
     aperture_m: ApertureSizes = Field(examples=['"4.44 mm"'])
     material: Annotated[str, known("material", MATERIALS)] = Field(examples=['"fused_silica"'])
 
+    @field_validator("aperture_m")
+    @classmethod
+    def _on_cells(cls, aperture: ApertureSizes, info: ValidationInfo) -> ApertureSizes:
+        samples = info.data.get("samples")
+        if isinstance(aperture, MaskRows) and samples is not None:
+            shape = shape_of(samples)
+            if problem := aperture.problem(shape):
+                rule = f"rows of a mask must be those of {shape[1]} x {shape[0]} cells, not {problem}"
+                raise broken(rule, "Name the picture of the mask again.")
+        return aperture
+
     @property
     def shape(self) -> tuple[int, int]:
         """Cells (ny, nx)."""
-        nx, ny = (self.samples, self.samples) if isinstance(self.samples, int) else self.samples
-        return ny, nx
+        return shape_of(self.samples)
 
     @property
     def relief(self) -> Aperture:
         """Outline of the relief."""
+        if isinstance(self.aperture_m, MaskRows):
+            return self.aperture_m.aperture(self.shape, self.pitch_m)
         return aperture_from(self.aperture_m)
 
 

@@ -13,15 +13,16 @@ import graphlib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, RoundAperture, aperture_from
+from fab.aperture import Aperture, MaskAperture, RoundAperture, aperture_from
+from fab.aperture.mask import OpenArea
 from fab.errors import InputError
 from fab.grid import Grid
-from fab.layout.polygons import annulus_sectors, doubled_area, frame_around_box, sectors_around_square
+from fab.layout.polygons import annulus_sectors, doubled_area, frame_around_box, rectangles, sectors_around_square
 from fab.level_map import LevelMap
 from fab.levels import Levels
 from fab.units import MM, NM, UM, format_length
@@ -31,7 +32,7 @@ _FEMTO = 10**15
 _NANO_FM = 10**6
 _UNITS_FM = (1000_000, 500_000, 250_000, 200_000, 100_000)
 _LIMIT = 2**31 - 1
-# Width of the square frame around a rectangular opening.
+# Width of the square frame around an opening that is not round.
 _FRAME_M = 100 * UM
 
 # x0, y0, x1, y1
@@ -197,10 +198,14 @@ class Chrome:
 
     def opening(self, relief: Aperture) -> Aperture:
         """Return the opening for a DOE with this relief."""
-        if not 0 <= self.overlap_m < relief.narrowest_m / 2:
-            got = format_length(self.overlap_m)
-            raise InputError("chrome overlap", "must lie from 0 to the aperture's radius", got, "Choose a smaller one.")
-        return relief.shrunk(self.overlap_m)
+        opening = relief.shrunk(self.overlap_m) if self.overlap_m >= 0 else None
+        if opening is None or not opening.narrowest_m > 0:
+            rule, got = (
+                f"must be 0 or more and leave an opening in an aperture of {relief}",
+                format_length(self.overlap_m),
+            )
+            raise InputError("chrome overlap", rule, got, "Choose a smaller one.")
+        return opening
 
     def rim_m(self, level_map: LevelMap) -> float:
         """Return the outer radius for one DOE, metres."""
@@ -213,8 +218,8 @@ class Chrome:
             # Whole tenths of a millimetre, because this number stands on the order form.
             outer = (np.ceil((np.hypot(*extent_m) / 2 + 0.5 * MM) / (0.1 * MM) - 1e-9)) * 0.1 * MM
         if not reach_m < outer < float("inf"):
-            got = format_length(outer)
-            raise InputError("chrome outer radius", "must exceed the opening's radius", got, "Choose a larger one.")
+            rule, got = f"must exceed what the opening needs, {format_length(reach_m)}", format_length(outer)
+            raise InputError("chrome outer radius", rule, got, "Choose a larger one.")
         return float(outer)
 
 
@@ -288,7 +293,22 @@ def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
         return Shapes(polygons=tuple(annulus_sectors(half_x, outer, chord_error)))
     half = frame_half(opening, dbu_m)
     sectors = sectors_around_square(half, outer, chord_error)
+    if isinstance(opening, MaskAperture):
+        return Shapes(rectangles_around(opening_units(opening, pixel_edges(level_map.grid)), half), tuple(sectors))
     return Shapes(polygons=(*sectors, *frame_around_box(half_x, half_y, half)))
+
+
+def opening_units(opening: MaskAperture, edges: PixelEdges) -> OpenArea:
+    """Return the open area of a mask over the pixels of a DOE, database units."""
+    y, x = (axis.astype(np.int64) for axis in (edges.y, edges.x))
+    return opening.area_on(y, x, round(opening.inset_m / edges.dbu_m))
+
+
+def rectangles_around(area: OpenArea, half: int) -> NDArray[np.int32]:
+    """Draw what is not open within a centred square, of half its edge, around an area."""
+    closed = np.pad(~area.cells, 1, constant_values=True).view(np.uint8)
+    x, y = (np.concatenate([[-half], lines, [half]]).astype(np.int32) for lines in (area.x, area.y))
+    return rectangles(closed, x, y)
 
 
 def half_extent(aperture: Aperture, dbu_m: float) -> tuple[int, int]:
@@ -303,14 +323,20 @@ def frame_half(opening: Aperture, dbu_m: float) -> int:
 
 
 def on_units(aperture: Aperture, dbu_m: float) -> Aperture:
-    """Return an aperture as it is drawn: half of its sizes is a whole number of database units."""
+    """Return an aperture as it is drawn: half of its sizes, or the inset of a mask, is whole database units."""
+    if isinstance(aperture, MaskAperture):
+        return replace(aperture, inset_m=round(aperture.inset_m / dbu_m) * dbu_m)
     sizes = [2 * round(size_m / 2 / dbu_m) * dbu_m for size_m in aperture.sizes_m]
     return aperture_from(sizes if len(sizes) > 1 else sizes[0])
 
 
 def outline_shapes(aperture: Aperture, dbu_m: float, corners: int) -> Shapes:
     """Draw the outline of an aperture, with so many corners where it is round."""
-    points = np.rint(aperture.outline_m(corners) / dbu_m).astype(np.int32)
+    if isinstance(aperture, MaskAperture):
+        y, x, cells = aperture.area
+        lines = (np.rint(axis * aperture.pitch_m / dbu_m).astype(np.int32) for axis in (x, y))
+        return Shapes(rectangles(cells.view(np.uint8), *lines))
+    points = np.rint(aperture.outlines_m(corners)[0] / dbu_m).astype(np.int32)
     if isinstance(aperture, RoundAperture):
         return Shapes(polygons=(points,))
     return Shapes(np.concatenate([points.min(axis=0), points.max(axis=0)])[None])

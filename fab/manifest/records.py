@@ -181,7 +181,8 @@ class ModelEntry:
 class ChromeEntry:
     """The chrome aperture, a true circle drawn with the stated chord error; its digest as in `LayerEntry`.
 
-    The diameter of an opening that is a rectangle stands for its [width, height].
+    The diameter of an opening that is a rectangle stands for its [width, height], of any other for the record of its
+    mask (`fab.aperture.mask`), in millimetres.
     """
 
     layer: int
@@ -189,7 +190,7 @@ class ChromeEntry:
     file: str
     cell: str
     polygon_means: str
-    opening_diameter_mm: float | list[float]
+    opening_diameter_mm: float | list[float] | dict[str, Any]
     outer_diameter_mm: float
     overlap_um: float
     chord_error_nm: float
@@ -205,7 +206,8 @@ class Manifest:
 
     `source` says where the level map came from, in the words of who asked. All but it and the versions of the tools
     follows from `request` (`fab.order.request`) and the level numbers. `geometry_sha256` is
-    `fab.order.order.Order.geometry`. `aperture_mm` is the diameter of the relief, or [width, height] of a rectangle.
+    `fab.order.order.Order.geometry`. `aperture_mm` is the diameter of the relief, [width, height] of a
+    rectangle, or the record of a mask.
     """
 
     format: str
@@ -218,7 +220,7 @@ class Manifest:
     step_nm: float
     shape: list[int]
     pitch_um: float
-    aperture_mm: float | list[float]
+    aperture_mm: float | list[float] | dict[str, Any]
     dbu_nm: float
     pixel_edges: str
     level_map_file: str
@@ -339,5 +341,5 @@ def read_manifest(folder: str | Path) -> Manifest:
     manifest.grid()
     manifest.staircase()
     for size in (manifest.aperture_mm, manifest.chrome.opening_diameter_mm):
-        aperture_from(size)
+        aperture_from(size, where=f"{path}: aperture")
     return manifest

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from fab.aperture import Aperture, RoundAperture
@@ -56,11 +57,18 @@ def show_map(
 
 def outline_of(aperture: Aperture, at_mm: tuple[float, float] = (0.0, 0.0), **style: Any) -> "Patch":
     """Return the outline of an aperture about a place x, y, in axes with millimetres."""
-    from matplotlib.patches import Circle, Polygon
+    from matplotlib.patches import Circle, PathPatch
+    from matplotlib.path import Path
 
     if isinstance(aperture, RoundAperture):
         return Circle(at_mm, aperture.diameter_m / 2 / MM, **style)
-    return Polygon(aperture.outline_m(4) / MM + at_mm, **style)
+    loops = [loop / MM + at_mm for loop in aperture.outlines_m(4)]
+    return PathPatch(Path.make_compound_path(*(Path(loop, closed=True) for loop in map(_closed, loops))), **style)
+
+
+def _closed(loop: NDArray[Any]) -> NDArray[Any]:
+    """A loop with its first corner again at the end."""
+    return np.concatenate([loop, loop[:1]])
 
 
 def frame_window(axes: "Axes", grid: Grid, window: Window, name: str = "") -> None:

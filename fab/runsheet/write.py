@@ -259,8 +259,8 @@ def record(sheet: RunSheet) -> dict[str, Any]:
         "level_map_sha256": sheet.level_map.digest,
         "request_sha256": sheet.request_sha256,
         "levels": sheet.level_map.levels.count,
-        "aperture_mm": sheet.level_map.relief.record(MM, 9),
-        "opening_um": sheet.opening.record(UM, 6),
+        "aperture_mm": sheet.level_map.relief.sizes(MM, 9),
+        "opening_um": sheet.opening.sizes(UM, 6),
         "process": {
             "name": process.name,
             "order": [f"mask {bit + 1}" for bit in process.order],

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fab.aperture import MaskAperture
 from fab.files import scratch_folder
 from fab.manifest.records import ModelEntry
 from fab.solids.model import DoeModel, ModelKind, model_entry
@@ -53,7 +54,9 @@ def _rings(model: DoeModel) -> tuple[Rings | None, str]:
     )
 
 
-def _die_entry(path: Path, model: DoeModel) -> ModelEntry:
+def _die_entry(path: Path, model: DoeModel) -> ModelEntry | None:
+    if isinstance(model.level_map.relief, MaskAperture):
+        return None
     rings, about = _rings(model)
     return model_entry(path, about, substrate_bodies(*_die(model), rings), _RELATIVE_ERROR)
 
@@ -74,7 +77,9 @@ def _wafer(model: DoeModel) -> tuple[Substrate, ChromeRing]:
     return glass, chrome
 
 
-def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry:
+def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry | None:
+    if isinstance(model.level_map.relief, MaskAperture):
+        return None
     glass, chrome = _wafer(model)
     flat = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"
     about = (

@@ -120,7 +120,7 @@ class ChromeRing:
         """The same as a shape of the kernel."""
         low, high = 0.0, self.thickness_m
         if not isinstance(self.opening, RoundAperture):
-            return framed(self.outer_m, self.opening.outline_m(4).tolist(), high)
+            return framed(self.outer_m, self.opening.outlines_m(4)[0].tolist(), high)
         inner_m = self.opening.reach_m
         corners = [(inner_m, low), (self.outer_m, low), (self.outer_m, high), (inner_m, high)]
         return revolved(corners, closed=True)
@@ -231,7 +231,7 @@ def substrate_step(
         profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (relief.reach_m, 0.0)]
         glass = plate(surface, substrate.thickness_m, profile)
     else:
-        glass = marked_plate(surface, substrate.thickness_m, relief.outline_m(4).tolist())
+        glass = marked_plate(surface, substrate.thickness_m, relief.outlines_m(4)[0].tolist())
     parts = {"SUBSTRATE": glass, "DATUM_RELIEF": _face(relief)}
     if chrome is not None:
         parts["CHROME"] = chrome.solid()
@@ -240,7 +240,7 @@ def substrate_step(
 
 def _face(relief: Aperture) -> Any:
     """The outline of a relief, filled, as a shape of the kernel."""
-    return disc(relief.reach_m) if isinstance(relief, RoundAperture) else filled(relief.outline_m(4).tolist())
+    return disc(relief.reach_m) if isinstance(relief, RoundAperture) else filled(relief.outlines_m(4)[0].tolist())
 
 
 def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, RoundAperture, aperture_from
+from fab.aperture import Aperture, MaskAperture, RoundAperture, aperture_from
 from fab.errors import InputError
 from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
-from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes, frame_half
-from fab.layout.polygons import doubled_area, paint
+from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes, frame_half, opening_units
+from fab.layout.polygons import paint
 from fab.manifest.cells import cell_entry, shapes_digest
-from fab.manifest.records import CellEntry, ChromeEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
+from fab.manifest.records import CellEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
 from fab.units import MM, NM, UM
 
 Drawn = MaskEntry | DrawnEntry
@@ -65,11 +65,18 @@ def _count_problem(layer: Layer, count: int, what: str) -> list[str]:
     return [f"layer {layer}: {count} {what}"] if count else []
 
 
-def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: ChromeEntry, dbu_m: float) -> list[str]:
-    """Check that polygons make the stated chrome: count, opening and outer circle, chords, area, and every vertex."""
-    if len(polygons) != chrome.polygons:
-        return [f"layer {layer}: {len(polygons)} chrome polygons instead of {chrome.polygons}"]
+def _chrome_problems(layer: Layer, drawn: Shapes, expected: Expected) -> list[str]:
+    """Check that shapes make the stated chrome: count, opening and outer circle, chords, area, and every vertex."""
+    chrome, dbu_m, polygons = expected.manifest.chrome, expected.edges.dbu_m, drawn.polygons
     opening, outer = aperture_from(chrome.opening_diameter_mm, MM), chrome.outer_diameter_mm * MM / 2 / dbu_m
+    if len(drawn) != chrome.polygons:
+        return [f"layer {layer}: {len(drawn)} chrome polygons instead of {chrome.polygons}"]
+    if not isinstance(opening, MaskAperture):
+        problems = _count_problem(layer, len(drawn.rectangles), "rectangles in the chrome")
+    else:
+        problems = _mask_problems(layer, drawn.rectangles, opening, expected.edges)
+    if not polygons:
+        return [*problems, f"layer {layer}: no chrome polygons"]
     x, y = np.concatenate(polygons).astype(np.float64).T
     # A vertex is rounded by up to half a unit in x and in y.
     on_outer = np.abs(np.hypot(x, y) - outer) <= 1
@@ -77,18 +84,39 @@ def _chrome_problems(layer: Layer, polygons: list[NDArray[np.integer]], chrome: 
     on_inner, inner_edge = _on_opening(opening, x, y, chord, dbu_m)
     outline = "circle" if isinstance(opening, RoundAperture) else "outline"
     stray = int(np.count_nonzero(~(on_inner | on_outer)))
-    problems = _count_problem(layer, stray, f"chrome vertices lie on neither of the two {outline}s")
+    problems += _count_problem(layer, stray, f"chrome vertices lie on neither of the two {outline}s")
     for name, edge in (("opening", inner_edge), ("outer edge", _off_circle(outer, x[on_outer], y[on_outer], chord))):
         if edge:
             problems.append(f"layer {layer}: the {name} leaves its {outline} by {edge * dbu_m / NM:.3g} nm")
-    area = sum(abs(doubled_area(polygon)) for polygon in polygons) / 2
+    area = drawn.doubled_area / 2
     off = abs(area - (math.pi * outer**2 - opening.area_in(dbu_m)))
     if off > 2 * math.pi * (outer + opening.reach_m / dbu_m) * chord:
         problems.append(f"layer {layer}: the chrome area is off by {off * (dbu_m / UM) ** 2:.6g} um^2")
-    drawn = Shapes(polygons=tuple(polygon.astype(np.int32) for polygon in polygons))
     if shapes_digest(drawn) != chrome.shapes_sha256:
         problems.append(f"layer {layer}: the chrome has another vertex, or one elsewhere")
     return problems
+
+
+def _mask_problems(layer: Layer, boxes: NDArray[np.int32], opening: MaskAperture, edges: PixelEdges) -> list[str]:
+    """Check that rectangles fill, once, what is not open of the frame around a mask."""
+    area, half = opening_units(opening, edges), frame_half(opening, edges.dbu_m)
+    lines = [np.concatenate([[-half], axis, [half]]) for axis in (area.x, area.y)]
+    places = [np.searchsorted(axis[:-1], boxes[:, k]) for k, axis in enumerate(lines * 2)]
+    on_line = [axis[place] == boxes[:, k] for k, (place, axis) in enumerate(zip(places, lines * 2, strict=True))]
+    sound = np.logical_and.reduce(on_line)
+    # Every rectangle begins and ends at corners, between which its windings are summed.
+    windings = np.zeros((len(lines[1]), len(lines[0])), np.int32)
+    x0, y0, x1, y1 = (place[sound] for place in places)
+    for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
+        np.add.at(windings, (rows, columns), step)
+    windings = np.cumsum(np.cumsum(windings, axis=0), axis=1)[:-1, :-1]
+    open_ = np.pad(area.cells, 1)
+    counts = {
+        "rectangles in the chrome are off the edges of the opening": np.count_nonzero(~sound),
+        "cells of the opening are covered by chrome": np.count_nonzero(open_ & (windings != 0)),
+        "cells around the opening are not covered once": np.count_nonzero(~open_ & (windings != 1)),
+    }
+    return [problem for what, count in counts.items() for problem in _count_problem(layer, int(count), what)]
 
 
 def _off_circle(radius: float, x: NDArray[np.float64], y: NDArray[np.float64], chord: float) -> float:
@@ -107,12 +135,14 @@ def _on_opening(
         radius = opening.diameter_m / 2 / dbu_m
         on_rim = np.abs(np.hypot(x, y) - radius) <= 1
         return on_rim, _off_circle(radius, x[on_rim], y[on_rim], chord)
+    on_frame = np.maximum(np.abs(x), np.abs(y)) == frame_half(opening, dbu_m)
+    if isinstance(opening, MaskAperture):  # its cells are rectangles
+        return on_frame, 0.0
     # Its sides are whole units, but for the digits of the manifest.
     half_y, half_x = (side / 2 / dbu_m for side in opening.extent_m)
     on_rim = np.abs(np.maximum(np.abs(x) - half_x, np.abs(y) - half_y)) <= 0.1
     corners = [np.hypot(x[on_rim] - sx * half_x, y[on_rim] - sy * half_y) for sx in (-1, 1) for sy in (-1, 1)]
     farthest = max(float(corner.min(initial=math.inf)) for corner in corners)
-    on_frame = np.maximum(np.abs(x), np.abs(y)) == frame_half(opening, dbu_m)
     return on_rim | on_frame, farthest if farthest > 0.1 else 0.0
 
 
@@ -173,9 +203,7 @@ def _doe_problems(
     for layer, mask in etch.items():
         problems += _etch_problems(layer, doe.shapes.get(layer, Shapes()), mask, expected)
     if chrome is not None:
-        shapes = doe.shapes.get(chrome, Shapes())
-        problems += _count_problem(chrome, len(shapes.rectangles), "rectangles in the chrome")
-        problems += _chrome_problems(chrome, list(shapes.polygons), expected.manifest.chrome, expected.edges.dbu_m)
+        problems += _chrome_problems(chrome, doe.shapes.get(chrome, Shapes()), expected)
     # A split has the layers of the DOE itself, so its problems need its name.
     return problems if name == expected.manifest.doe_cell else [f"cell {name}: {problem}" for problem in problems]
 
@@ -218,14 +246,10 @@ def _reading_problems(reading: LayerReading, mask: Drawn | None, expected: Expec
     layer = reading.layer
     if mask is not None and mask.edge_move_nm:
         return _moved_problems(layer, reading.shapes, mask, expected)
+    if mask is None:
+        return _chrome_problems(layer, reading.shapes, expected)
     winding = reading.winding
     problems = _count_problem(layer, reading.strays, "shapes are no rectangles on the pixel raster")
-    if mask is None:
-        covered = int(np.count_nonzero(winding))
-        problems += _count_problem(layer, covered, "pixels are covered by rectangles in the chrome")
-        return problems + _chrome_problems(
-            layer, list(reading.polygons), expected.manifest.chrome, expected.edges.dbu_m
-        )
     problems += _count_problem(layer, len(reading.polygons), "shapes are no rectangles")
     problems += _count_problem(layer, int(np.count_nonzero(winding > 1)), "pixels are covered more than once")
     return problems + _pixel_problems(layer, (winding > 0) != expected.planes[mask.bit])

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim.aperture import BoxOutline, RoundOutline
+from sim.aperture import BoxOutline, MaskOutline, RoundOutline
 from sim.surface.cell import DEGREES, Cuts, axis_moments
 from sim.surface.pieces import PRECISION, TILE
 from sim.surface.relief import TilePlan
@@ -27,7 +27,7 @@ class Opening(NamedTuple):
 
     coverage: Float[Array, "v u"]  # open share of every part of a cell
     centre_m: Float[Array, "2"]  # (y, x)
-    outline: RoundOutline | BoxOutline
+    outline: RoundOutline | BoxOutline | MaskOutline
 
 
 def through_opening(

@@ -49,7 +49,7 @@ def test_sizes_of_both_kinds():
     assert RoundAperture(4.0).area_m2 == pytest.approx(4 * math.pi)
     assert (WIDE.widest_m, WIDE.narrowest_m, WIDE.reach_m) == (50 * UM, 30 * UM, pytest.approx(np.hypot(15, 25) * UM))
     assert WIDE.shrunk(5 * UM).extent_m == pytest.approx((20 * UM, 40 * UM))
-    corners = WIDE.outline_m(4)
+    (corners,) = WIDE.outlines_m(4)
     assert np.abs(corners).max(axis=0) == pytest.approx([25 * UM, 15 * UM])
 
 

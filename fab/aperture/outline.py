@@ -1,9 +1,4 @@
-"""Aperture: the outline of what is open, or of what has relief, about the centre of a raster; round or rectangular.
-
-The relief of a DOE fills one, and light passes another, the opening of the chrome, which is smaller by the overlap.
-Whoever needs cells, areas or outlines asks an aperture for them, whatever its kind. In files and texts a round one is
-its diameter and a rectangular one [width, height], along x and along y.
-"""
+"""Aperture: the outline of what is open, or of what has relief, about the centre of a raster; round and rectangular."""
 
 import math
 from abc import ABC, abstractmethod
@@ -13,12 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.errors import InputError
-from fab.grid import Grid
+from fab.grid import SLACK, Grid
 from fab.units import format_length
-
-# Pixels whose centre is exactly on the rim count as inside.
-_SLACK = 1e-12
 
 
 class Aperture(ABC):
@@ -27,7 +18,7 @@ class Aperture(ABC):
     @property
     @abstractmethod
     def extent_m(self) -> tuple[float, float]:
-        """Height and width ``(y, x)`` of the smallest box around it, metres."""
+        """Height and width ``(y, x)`` of the smallest box about the origin that holds it, metres."""
 
     @property
     @abstractmethod
@@ -55,8 +46,8 @@ class Aperture(ABC):
         """The same with its rim moved inward, metres."""
 
     @abstractmethod
-    def outline_m(self, corners: int) -> NDArray[np.float64]:
-        """Return the corners x, y ``(n, 2)`` of its outline, metres; so many where it is round."""
+    def outlines_m(self, corners: int) -> list[NDArray[np.float64]]:
+        """Return the corners x, y ``(n, 2)`` of its outlines, metres, what is open on their left; so many if round."""
 
     @property
     @abstractmethod
@@ -65,6 +56,10 @@ class Aperture(ABC):
 
     def record(self, unit_m: float = 1.0, digits: int | None = None) -> Any:
         """Return it as a value of JSON, in multiples of a unit, rounded to some digits; `aperture_from` reads it."""
+        return self.sizes(unit_m, digits)
+
+    def sizes(self, unit_m: float, digits: int | None = None) -> Any:
+        """Return `sizes_m` in multiples of a unit, rounded to some digits: a number, or a list of two."""
         lengths = [size if unit_m == 1.0 else size / unit_m for size in self.sizes_m]
         lengths = lengths if digits is None else [round(length, digits) for length in lengths]
         return lengths if len(lengths) > 1 else lengths[0]
@@ -121,7 +116,7 @@ class RoundAperture(Aperture):
 
     def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
         """By the distance from the middle."""
-        return y_m**2 + x_m**2 <= (self.diameter_m / 2) ** 2
+        return y_m**2 + x_m**2 <= (self.diameter_m / 2) ** 2 * (1 + SLACK)
 
     def inside(self, grid: Grid) -> NDArray[np.bool_]:
         """Pixels of the disc."""
@@ -135,10 +130,10 @@ class RoundAperture(Aperture):
         """A disc whose diameter is smaller by twice as much."""
         return RoundAperture(self.diameter_m - 2 * by_m)
 
-    def outline_m(self, corners: int) -> NDArray[np.float64]:
+    def outlines_m(self, corners: int) -> list[NDArray[np.float64]]:
         """A regular polygon with its corners on the circle."""
         angle = (np.arange(corners) + 0.5) * 2 * np.pi / corners
-        return self.diameter_m / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return [self.diameter_m / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)]
 
     @property
     def sizes_m(self) -> tuple[float, ...]:
@@ -172,7 +167,7 @@ class RectangularAperture(Aperture):
 
     def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
         """By the distances from the axes."""
-        half_y, half_x = (side / 2 * (1 + _SLACK) for side in self.size_m)
+        half_y, half_x = (side / 2 * (1 + SLACK) for side in self.size_m)
         return (np.abs(y_m) <= half_y) & (np.abs(x_m) <= half_x)
 
     def inside(self, grid: Grid) -> NDArray[np.bool_]:
@@ -189,41 +184,12 @@ class RectangularAperture(Aperture):
         """A rectangle whose sides are smaller by twice as much."""
         return RectangularAperture((self.size_m[0] - 2 * by_m, self.size_m[1] - 2 * by_m))
 
-    def outline_m(self, corners: int) -> NDArray[np.float64]:
+    def outlines_m(self, corners: int) -> list[NDArray[np.float64]]:
         """Its four corners, counter-clockwise from the lowest."""
         half_y, half_x = (side / 2 for side in self.size_m)
-        return np.array([(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)])
+        return [np.array([(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)])]
 
     @property
     def sizes_m(self) -> tuple[float, ...]:
         """Width and height."""
         return self.size_m[::-1]
-
-
-def aperture_from(value: Any, unit_m: float = 1.0, digits: int | None = None) -> Aperture:
-    """Return an aperture from itself, a diameter, or [width, height]: numbers of a unit, rounded to digits of a metre.
-
-    Raises:
-        InputError: a list of more or fewer numbers.
-        TypeError or ValueError: something that is no number.
-    """
-    if isinstance(value, Aperture):
-        return value
-    given = value if isinstance(value, list | tuple) else [value]
-    sizes = [float(size) if unit_m == 1.0 else float(size) * unit_m for size in given]
-    sizes = sizes if digits is None else [round(size, digits) for size in sizes]
-    if len(sizes) not in (1, 2):
-        raise InputError("aperture", "must be a diameter or [width, height]", repr(value), "Give one or two lengths.")
-    return RoundAperture(sizes[0]) if len(sizes) == 1 else RectangularAperture((sizes[1], sizes[0]))
-
-
-def diameter_of(aperture: Aperture) -> float:
-    """Return the diameter of a round `aperture`, metres, for what can do with no other.
-
-    Raises:
-        InputError: it has another shape.
-    """
-    if isinstance(aperture, RoundAperture):
-        return aperture.diameter_m
-    cure = "Give a diameter as the aperture, or leave out what needs a round one."
-    raise InputError("aperture", "must be round here", str(aperture), cure)
