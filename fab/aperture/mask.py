@@ -75,7 +75,7 @@ class MaskAperture(Aperture):
 
     @property
     def area(self) -> OpenArea:
-        """What is open; lines in cells from the middle of the raster."""
+        """The open area; lines in cells from the middle of the raster."""
         return _area_of(self)
 
     def area_on(self, y: NDArray[np.int64], x: NDArray[np.int64], inset: int) -> OpenArea:

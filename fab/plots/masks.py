@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fab.aperture import Aperture, MaskAperture
 from fab.figure import CHROME, HEIGHTS, INK, MARK, panels, scale_bar, shrunk
 from fab.plots.maps import Window, box_mm, frame_window, outline_of, show_map, window_around
 from fab.units import MM, NM, UM, format_length
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-    from fab.aperture import Aperture
     from fab.level_map import LevelMap
 
 _MOST = 560
@@ -87,5 +87,6 @@ def _draw_chrome(axes: "Axes", level_map: "LevelMap", chrome: "tuple[Aperture, f
     outlines = opening, level_map.shown_relief
     clear, relief = (" × ".join(f"{size / MM:.6g}" for size in outline.sizes_m) for outline in outlines)
     name = "clear aperture" if len(opening.sizes_m) == 1 else "clear"
+    name += " within" if isinstance(opening, MaskAperture) else ""
     axes.set_title(f"chrome: {name} {clear} mm,\nrelief {relief} mm (dashed)")
     scale_bar(axes, 2.06 * outer * MM)
