@@ -1,9 +1,57 @@
-"""Loops around the open cells of a raster whose lines may be uneven."""
+"""Loops around the open cells of a raster whose lines may be uneven, and the parts that they bound."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Division(NamedTuple):
+    """A plane divided by outlines into parts that are open and parts that are closed.
+
+    A part is the number of the loop around it, None for what lies around everything, and those of the loops within it.
+    """
+
+    loops: list[NDArray[np.float64]]  # corners x, y ``(n, 2)``, counter-clockwise
+    open: list[tuple[int | None, list[int]]]
+    closed: list[tuple[int | None, list[int]]]
+
+    @property
+    def corners(self) -> int:
+        """Number of corners of all loops."""
+        return sum(map(len, self.loops))
+
+    @property
+    def touches(self) -> bool:
+        """Whether loops meet at a corner."""
+        return len(np.unique(np.concatenate(self.loops), axis=0)) < self.corners
+
+
+def divided(loops: list[NDArray[np.float64]], y: NDArray[Any], x: NDArray[Any], cells: NDArray[np.bool_]) -> Division:
+    """Divide the plane by the loops around open cells between lines.
+
+    Open parts that touch at a corner are two, closed ones are one.
+    """
+    from scipy import ndimage
+
+    label: Any = ndimage.label
+    whole, around = np.pad(cells, 1), []
+    numbered: list[Any] = [label(~whole, np.ones((3, 3)))[0], label(whole)[0]]
+    parts: dict[tuple[bool, int], tuple[list[int], list[int]]] = {}
+    for number, loop in enumerate(loops):
+        # The lowest side of a loop runs toward +x where what is open lies above it.
+        start = int(np.lexsort((loop[:, 0], loop[:, 1]))[0])
+        row, column = np.searchsorted(y, loop[start, 1]), np.searchsorted(x, loop[start, 0])
+        is_outer = bool(whole[row + 1, column + 1])
+        above, below = (row + 1, column + 1), (row, column + 1)
+        for is_open, at in ((True, above if is_outer else below), (False, below if is_outer else above)):
+            part = parts.setdefault((is_open, int(numbered[is_open][at])), ([], []))
+            part[is_open != is_outer].append(number)
+        around.append(loop if is_outer else loop[::-1])
+    found: dict[bool, list[tuple[int | None, list[int]]]] = {True: [], False: []}
+    for (is_open, _), (outer, inner) in parts.items():
+        found[is_open].append((outer[0] if outer else None, inner))
+    return Division(around, found[True], found[False])
 
 
 def loops_around(y: NDArray[Any], x: NDArray[Any], cells: NDArray[np.bool_]) -> list[NDArray[np.float64]]:

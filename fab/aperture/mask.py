@@ -104,6 +104,15 @@ class MaskAperture(Aperture):
         y, x, cells = self.area
         return times * float(np.diff(y) @ cells @ np.diff(x)) * (self.pitch_m / pitch_m) ** 2 if cells.size else 0.0
 
+    @property
+    def centroid_m(self) -> tuple[float, float]:
+        """Mean of the middles of its cells."""
+        y, x, cells = self.area
+        rows, columns = np.diff(y) * (cells @ np.diff(x)), np.diff(x) * (np.diff(y) @ cells)
+        sums = (float(part @ (lines[1:] + lines[:-1]) / 2) for part, lines in ((rows, y), (columns, x)))
+        low, left = (total / self.area_in(self.pitch_m) * self.pitch_m for total in sums)
+        return low, left
+
     def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
         """By the cell that they lie in, or by any that they touch."""
         y, x, cells = self.area

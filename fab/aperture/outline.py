@@ -74,6 +74,11 @@ class Aperture(ABC):
         return self.area_in(1.0)
 
     @property
+    def centroid_m(self) -> tuple[float, float]:
+        """Centre of its area ``(y, x)``, metres."""
+        return 0.0, 0.0
+
+    @property
     def disc_m(self) -> float:
         """Diameter of a disc of the same area, metres; its own, if it is one."""
         return 2 * math.sqrt(self.area_m2 / math.pi)

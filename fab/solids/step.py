@@ -12,10 +12,12 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fab.aperture.loops import Division
 from fab.errors import CheckFailed, InputError
 from fab.files import os_errors_explained, read_bytes, write_atomic
 from fab.units import MM
@@ -110,10 +112,30 @@ def _holed(surface: Any, hole: Any) -> Any:
     return occ.BRepBuilderAPI_MakeFace(surface, wire).Face()
 
 
-def framed(radius_m: float, corners_m: Sequence[tuple[float, float]], thickness_m: float) -> Any:
-    """Return a disc of some thickness (metres) on z = 0 with a polygon, by its corners x, y, cut out of it."""
-    ring = _holed(outline(2 * radius_m, 0.0), filled(corners_m))
-    return occ.BRepPrimAPI_MakePrism(ring, occ.gp_Vec(0, 0, thickness_m / MM)).Shape()
+def _parted(division: Division, surface: Any) -> tuple[list[Any], list[Any]]:
+    """Return the open and the closed parts of a face at z = 0; neighbours have their edges in common."""
+    loops = [filled(loop.tolist()) for loop in division.loops]
+
+    def faces(parts: list[tuple[int | None, list[int]]]) -> list[Any]:
+        grounds = [surface if outer is None else loops[outer] for outer, _ in parts]
+        return [
+            reduce(_holed, (loops[n] for n in inner), face) for face, (_, inner) in zip(grounds, parts, strict=True)
+        ]
+
+    return faces(division.open), faces(division.closed)
+
+
+def framed(radius_m: float, division: Division, thickness_m: float) -> Any:
+    """Return a disc of some thickness (metres) on z = 0 without the open parts of a division, metres."""
+    _, closed = _parted(division, outline(2 * radius_m, 0.0))
+    solids = [occ.BRepPrimAPI_MakePrism(part, occ.gp_Vec(0, 0, thickness_m / MM)).Shape() for part in closed]
+    return solids[0] if len(solids) == 1 else _compound(solids)
+
+
+def opened(division: Division) -> Any:
+    """Return the open parts of a division, metres, without thickness in the plane z = 0."""
+    parts, _ = _parted(division._replace(closed=[]), None)
+    return parts[0] if len(parts) == 1 else _compound(parts)
 
 
 def _compound(shapes: Iterable[Any]) -> Any:
@@ -190,10 +212,10 @@ def _closed(faces: Iterable[Any]) -> Any:
     return solid
 
 
-def marked_plate(surface: Any, thickness_m: float, corners_m: Sequence[tuple[float, float]]) -> Any:
-    """Return a plate below a face at z = 0 with a polygon, by its corners x, y (metres), as a face of its own."""
-    mark = filled(corners_m)
-    return _closed([*_walls(surface, thickness_m), _holed(surface, mark), mark])
+def marked_plate(surface: Any, thickness_m: float, division: Division) -> Any:
+    """Return a plate below a face at z = 0 with the parts of a division (metres) as faces of their own."""
+    opened_parts, closed_parts = _parted(division, surface)
+    return _closed([*_walls(surface, thickness_m), *closed_parts, *opened_parts])
 
 
 @contextmanager

@@ -4,6 +4,7 @@ A STEP file must hold every point, plane and circle where a fresh drawing has it
 volume and its centre of mass.
 """
 
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from fab.solids.substrate import (
     ChromeRing,
     Rings,
     Substrate,
+    division_of,
     substrate_bodies,
     substrate_step,
     wafer_bodies,
@@ -28,6 +30,9 @@ from fab.solids.substrate import (
 )
 from fab.units import MM, format_length
 
+_LOG = logging.getLogger("doedesign")
+# Corners of outlines, a wall each: 4500 of them take the kernel a minute, which grows with their square.
+_MOST_CORNERS = 1500
 # Double precision, less what the kernel loses.
 _RELATIVE_ERROR = 1e-11
 
@@ -39,6 +44,24 @@ def _die(model: DoeModel) -> tuple[Substrate, ChromeRing]:
 
 def _chrome(model: DoeModel) -> ChromeRing:
     return ChromeRing(model.chrome.opening(model.level_map.relief), model.chrome.rim_m(model.level_map))
+
+
+def _drawable(model: DoeModel) -> bool:
+    """Whether the kernel takes the outlines of relief and opening; the log says so if it does not."""
+    relief = model.level_map.relief
+    if not isinstance(relief, MaskAperture):
+        return True
+    divisions = [division_of(one) for one in (relief, model.chrome.opening(relief))]
+    corners = sum(division.corners for division in divisions)
+    if corners <= _MOST_CORNERS and not any(division.touches for division in divisions):
+        return True
+    _LOG.warning(
+        "no STEP files of this plate: the outlines of its mask have %d corners (at most %d) or meet at corners; "
+        "its meshes have all of it",
+        corners,
+        _MOST_CORNERS,
+    )
+    return False
 
 
 def _rings(model: DoeModel) -> tuple[Rings | None, str]:
@@ -55,7 +78,7 @@ def _rings(model: DoeModel) -> tuple[Rings | None, str]:
 
 
 def _die_entry(path: Path, model: DoeModel) -> ModelEntry | None:
-    if isinstance(model.level_map.relief, MaskAperture):
+    if not _drawable(model):
         return None
     rings, about = _rings(model)
     return model_entry(path, about, substrate_bodies(*_die(model), rings), _RELATIVE_ERROR)
@@ -78,7 +101,7 @@ def _wafer(model: DoeModel) -> tuple[Substrate, ChromeRing]:
 
 
 def _wafer_entry(path: Path, model: DoeModel) -> ModelEntry | None:
-    if isinstance(model.level_map.relief, MaskAperture):
+    if not _drawable(model):
         return None
     glass, chrome = _wafer(model)
     flat = f"primary flat of {format_length(glass.flat_m)} at -y, as usual for this diameter (SEMI M1)"

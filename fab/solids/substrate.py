@@ -18,15 +18,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, RoundAperture, diameter_of
+from fab.aperture import Aperture, MaskAperture, RoundAperture, diameter_of
+from fab.aperture.loops import Division, divided
 from fab.errors import InputError
 from fab.solids.step import (
     Body,
     Copies,
     disc,
-    filled,
     framed,
     marked_plate,
+    opened,
     outline,
     plate,
     revolved,
@@ -110,17 +111,20 @@ class ChromeRing:
 
     @property
     def body(self) -> Body:
-        """The ring around the axis, on z = 0."""
+        """The film around the opening, on z = 0."""
         area = math.pi * self.outer_m**2 - self.opening.area_m2
         if isinstance(self.opening, RoundAperture):
             area = math.pi * (self.outer_m + self.opening.reach_m) * (self.outer_m - self.opening.reach_m)
-        return Body(area * self.thickness_m, (0.0, 0.0, self.thickness_m / 2))
+        y_m, x_m = self.opening.centroid_m
+        # What the opening takes from the disc moves its centre away.
+        x, y = (-at * self.opening.area_m2 / area for at in (x_m, y_m))
+        return Body(area * self.thickness_m, (x, y, self.thickness_m / 2))
 
     def solid(self) -> Any:
         """The same as a shape of the kernel."""
         low, high = 0.0, self.thickness_m
         if not isinstance(self.opening, RoundAperture):
-            return framed(self.outer_m, self.opening.outlines_m(4)[0].tolist(), high)
+            return framed(self.outer_m, division_of(self.opening), high)
         inner_m = self.opening.reach_m
         corners = [(inner_m, low), (self.outer_m, low), (self.outer_m, high), (inner_m, high)]
         return revolved(corners, closed=True)
@@ -231,7 +235,7 @@ def substrate_step(
         profile = rings.profile_m() if rings is not None else [(0.0, 0.0), (relief.reach_m, 0.0)]
         glass = plate(surface, substrate.thickness_m, profile)
     else:
-        glass = marked_plate(surface, substrate.thickness_m, relief.outlines_m(4)[0].tolist())
+        glass = marked_plate(surface, substrate.thickness_m, division_of(relief))
     parts = {"SUBSTRATE": glass, "DATUM_RELIEF": _face(relief)}
     if chrome is not None:
         parts["CHROME"] = chrome.solid()
@@ -240,14 +244,23 @@ def substrate_step(
 
 def _face(relief: Aperture) -> Any:
     """The outline of a relief, filled, as a shape of the kernel."""
-    return disc(relief.reach_m) if isinstance(relief, RoundAperture) else filled(relief.outlines_m(4)[0].tolist())
+    return disc(relief.reach_m) if isinstance(relief, RoundAperture) else opened(division_of(relief))
+
+
+def division_of(aperture: Aperture) -> Division:
+    """Return the parts into which an aperture that is not round divides a plane, metres."""
+    if isinstance(aperture, MaskAperture):
+        y, x, cells = aperture.area
+        return divided(aperture.outlines_m(0), y * aperture.pitch_m, x * aperture.pitch_m, cells)
+    return Division(aperture.outlines_m(0), [(0, [])], [(None, [0])])
 
 
 def wafer_bodies(wafer: Substrate, chrome: ChromeRing, places_m: Sequence[tuple[float, float]]) -> dict[str, Body]:
     """Return volume and centre of every solid that `wafer_step` writes, by closed form and name."""
     x, y = (math.fsum(axis) / len(places_m) for axis in zip(*places_m, strict=True))
     one = chrome.body
-    return {"SUBSTRATE": wafer.body, "CHROME": Body(len(places_m) * one.volume_m3, (x, y, one.centre_m[2]))}
+    centre = (x + one.centre_m[0], y + one.centre_m[1], one.centre_m[2])
+    return {"SUBSTRATE": wafer.body, "CHROME": Body(len(places_m) * one.volume_m3, centre)}
 
 
 def wafer_step(
