@@ -157,8 +157,11 @@ def read_height(
         height_m *= scale_m
     require_heights(height_m, str(path))
     grid = Grid((height_m.shape[0], height_m.shape[1]), metres(pitch, "pitch"))
+    return HeightMap(height_m, grid, min(grid.extent_m) if aperture is None else outline_on(grid, aperture))
+
+
+def outline_on(grid: Grid, aperture: Aperture | float | str) -> Aperture:
+    """Return the outline of a relief on a grid: itself, a diameter, or of a picture by its name (`read_height`)."""
     if isinstance(aperture, str) and aperture.lower().endswith(MASK_FILES):
-        aperture = MaskAperture.of(read_mask(aperture, grid.shape), grid.pitch_m)
-    if not isinstance(aperture, Aperture):
-        aperture = min(grid.extent_m) if aperture is None else metres(aperture, "aperture")
-    return HeightMap(height_m, grid, aperture)
+        return MaskAperture.of(read_mask(aperture, grid.shape), grid.pitch_m)
+    return aperture if isinstance(aperture, Aperture) else aperture_from(metres(aperture, "aperture"))

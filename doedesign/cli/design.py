@@ -104,7 +104,8 @@ def masks(
         etch_depths: Depth of every mask where it is not 2^k steps, such as "80 nm,150 nm"; for a bare height map.
         pitch: Pixel pitch of a bare height map, such as "1.85 um".
         scale: Height of one count of an integer map, such as "1 nm".
-        aperture: Diameter of the relief, or width and height such as "2 mm,1 mm"; the map's shorter side by default.
+        aperture: Diameter of the relief, width and height such as "2 mm,1 mm", or a picture that is white where it is;
+            the map's shorter side by default.
         on_violation: Where the process cannot print a mask: warn, fail, or fix the level map and say what it costs.
         probe: Wavelength of the laser that the lab tests the plate with; 520 nm by default.
         patch: Also write a window of the relief, "X, Y, EDGE" about its middle, as STEP (at most 2000 boxes) and mesh.
@@ -151,14 +152,18 @@ def masks(
         etch_depths_m=[length_of("--etch-depths", depth) or 0.0 for depth in (etch_depths or "").split(",") if depth],
         pitch_m=length_of("--pitch", pitch),
         scale_m=length_of("--scale", scale),
-        aperture_m=_sizes(aperture),
+        aperture_m=_aperture(aperture),
     )
     say(f"{len(done.report.checks)} checks passed: every pixel of every file is {drawn_as(done)}")
     print_results(done.folder, json_, checks=len(done.report.checks))
 
 
-def _sizes(text: str | None) -> list[float] | None:
-    """One length, or width and height, in metres."""
+def _aperture(text: str | None) -> list[float] | str | None:
+    """One length, or width and height, in metres; or the name of a picture."""
+    from fab.aperture.picture import MASK_FILES
+
+    if text is not None and text.lower().endswith(MASK_FILES):
+        return text
     found = [length_of("--aperture", size.strip()) for size in (text or "").split(",") if size.strip()]
     return [size for size in found if size is not None] or None
 

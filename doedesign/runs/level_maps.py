@@ -16,7 +16,7 @@ from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, sha256_file
 from fab.grid import Grid
-from fab.height import HeightMap, read_height
+from fab.height import HeightMap, outline_on, read_height
 from fab.layout.geometry import pixel_edges
 from fab.level_map import LevelMap, read_level_map, write_level_map
 from fab.levels import Levels
@@ -35,7 +35,10 @@ class Drawing(NamedTuple):
 
 
 def read_any_height(
-    path: Path, pitch_m: float | None = None, scale_m: float | None = None, aperture: Aperture | float | None = None
+    path: Path,
+    pitch_m: float | None = None,
+    scale_m: float | None = None,
+    aperture: Aperture | float | str | None = None,
 ) -> HeightMap:
     """Read a height map from .exr, .npy, .tif or .png.
 
@@ -43,7 +46,8 @@ def read_any_height(
         path: the file.
         pitch_m: pixel pitch, metres; needed unless the file holds it (EXR of our own).
         scale_m: metres per count, for integers.
-        aperture: outline of the relief, or its diameter in metres; by default what the file says, or its shorter side.
+        aperture: outline of the relief, its diameter in metres, or the name of a picture of it; by default what the
+            file says, or its shorter side.
     """
     if path.is_dir():
         raise InputError(str(path), f"a height map is a file ({', '.join(HEIGHT_FILES)})", "a folder", "Give the file.")
@@ -62,7 +66,7 @@ def read_any_height(
     grid = Grid((ny, nx), pitch_m)
     if aperture is None:
         aperture = stored.aperture or min(grid.extent_m)
-    return HeightMap(stored.height_m, grid, aperture)
+    return HeightMap(stored.height_m, grid, outline_on(grid, aperture))
 
 
 def level_map_of_run(run: Run, count: int | None = None) -> LevelMap:
@@ -147,7 +151,7 @@ def drawing_from(
     etch_depths_m: Sequence[float] = (),
     pitch_m: float | None = None,
     scale_m: float | None = None,
-    aperture_m: float | Sequence[float] | None = None,
+    aperture_m: float | Sequence[float] | str | None = None,
 ) -> Drawing:
     """Return the level map of a design, of a run (as optimised, not as an order draws it) or of a height map.
 
@@ -158,7 +162,8 @@ def drawing_from(
         etch_depths_m: depth of every mask where it is not 2^k steps, mask 0 first, metres.
         pitch_m: pixel pitch, metres.
         scale_m: metres per count, for integers.
-        aperture_m: diameter of the relief, or its width and height, metres.
+        aperture_m: diameter of the relief, or its width and height, metres; or the name of a picture of it
+            (`fab.aperture.picture`).
 
     Raises:
         InputError: neither a run nor a readable height map, or the number or step of the levels is missing.
@@ -190,7 +195,8 @@ def drawing_from(
         missing, name = ("number of levels", "levels") if count is None else ("height of a level", "step")
         raise InputError(str(source), f"a bare height map needs the {missing}", "none", f"Give `{name}`.")
     levels = Levels(count, step_m, tuple(etch_depths_m))
-    height = read_any_height(source, pitch_m, scale_m, None if aperture_m is None else aperture_from(aperture_m))
+    relief = aperture_m if aperture_m is None or isinstance(aperture_m, str) else aperture_from(aperture_m)
+    height = read_any_height(source, pitch_m, scale_m, relief)
     # Mask shops take ASCII names; a name of other letters alone leaves nothing.
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in source.stem).strip("_") or "height"
     try:
