@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fab.aperture import Aperture, MaskAperture, aperture_from, diameter_of
+from fab.aperture import Aperture, MaskAperture, aperture_from
 from fab.aperture.picture import MASK_FILES, read_mask
 from fab.errors import InputError
 from fab.files import read_npy
@@ -58,11 +58,6 @@ class HeightMap:
     def relief(self) -> Aperture:
         """The outline of the relief."""
         return aperture_from(self.aperture)
-
-    @property
-    def aperture_m(self) -> float:
-        """Diameter of a round relief, metres; an InputError for another."""
-        return diameter_of(self.relief)
 
     def plot(self, ax: "Axes | None" = None) -> "FigureBase":
         """Draw the map as a whole and cell by cell, and the share of area at every height (`fab.plots.height`)."""

@@ -194,7 +194,7 @@ def read_level_map(path: str | Path) -> LevelMap:
             raise InputError(str(path), f"must hold {levels.bits} planes of {ny} x {nx}", bits.shape, cure)
         level = level_map_from_planes(bits, levels)
         aperture = math.inf if header["aperture_m"] is None else header["aperture_m"]
-        return LevelMap(level, levels, grid, aperture_from(aperture), str(header["name"]))
+        return LevelMap(level, levels, grid, aperture_from(aperture, where=f"{path}: aperture_m"), str(header["name"]))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

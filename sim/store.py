@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fab.aperture import Aperture, MaskAperture, aperture_from, diameter_of
+from fab.aperture import Aperture, MaskAperture, aperture_from
 from fab.errors import InputError
 from fab.files import canonical_json, read_bytes, write_atomic
 from fab.pictures import MOST_PER_BYTE
@@ -51,11 +51,6 @@ class StoredHeight(NamedTuple):
     pitch_m: float | None  # cell pitch, metres, or None
     aperture: Aperture | None  # the clear aperture, or None
     metadata: dict[str, str]  # the other text attributes
-
-    @property
-    def aperture_m(self) -> float | None:
-        """Diameter of a round clear aperture, metres, or None; an InputError for another."""
-        return None if self.aperture is None else diameter_of(self.aperture)
 
 
 def write_height(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from fab.aperture import Aperture, aperture_from, diameter_of
+from fab.aperture import Aperture, aperture_from
 from fab.errors import InputError
 from fab.files import MANIFEST_NAME, canonical_json, read_json, sha256_bytes
 from fab.grid import Grid
@@ -268,11 +268,6 @@ class Manifest:
     def relief(self) -> Aperture:
         """Outline of the relief; light passes the opening of the chrome, the clear aperture."""
         return aperture_from(self.aperture_mm, MM, 18)
-
-    @property
-    def aperture_m(self) -> float:
-        """Diameter of a round relief, metres; an InputError for another."""
-        return diameter_of(self.relief)
 
     def to_json(self) -> bytes:
         """Return the bytes of the manifest file, with the digest of everything else in it under ``sha256``."""

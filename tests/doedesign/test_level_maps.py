@@ -10,6 +10,7 @@ from doedesign.design.design import Design
 from doedesign.runs.folder import Run, begin_run, claim_run, finish_run
 from doedesign.runs.level_maps import drawing_from, level_map_of_run, read_any_height, write_design
 from doedesign.spec import load_spec
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import HeightMap
@@ -85,9 +86,9 @@ def test_what_an_exr_does_not_say_must_be_given(tmp_path: Path):
     path = tmp_path / "plate.exr"
     write_height(path, np.zeros((4, 6)), 2e-6, 5e-6)
     height = read_any_height(path)
-    assert (height.grid.pitch_m, height.aperture_m) == (2e-6, 5e-6)
+    assert (height.grid.pitch_m, height.relief) == (2e-6, RoundAperture(5e-6))
     height = read_any_height(path, pitch_m=3e-6, aperture=7e-6)
-    assert (height.grid.pitch_m, height.aperture_m) == (3e-6, 7e-6)
+    assert (height.grid.pitch_m, height.relief) == (3e-6, RoundAperture(7e-6))
     for wrong in ({"pitch_m": 0.0}, {"aperture": 0.0}):
         with pytest.raises(InputError, match="positive"):
             read_any_height(path, **wrong)

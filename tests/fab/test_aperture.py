@@ -31,6 +31,22 @@ def test_a_number_is_a_diameter_and_two_are_width_and_height():
         diameter_of(WIDE)
 
 
+@pytest.mark.parametrize("value", ["wide", None, [], ["1", "a"], [[1.0]], np.ones((2, 2)), 10**400, object()], ids=str)
+def test_what_is_no_aperture_is_refused_by_where_it_came_from(value):
+    with pytest.raises(InputError, match=r"map\.exr: must be a diameter or \[width, height\]") as error:
+        aperture_from(value, where="map.exr")
+    assert len(str(error.value)) < 200
+
+
+def test_points_on_the_rim_of_a_disc_are_inside_as_cells_are():
+    # 3, 4, 5: a centre exactly on the circle, but for rounding.
+    grid = Grid((9, 9), 0.1)
+    disc = RoundAperture(1.0)
+    y, x = grid.axis_m("y")[:, None], grid.axis_m("x")[None, :]
+    np.testing.assert_array_equal(disc.contains(y, x), disc.inside(grid))
+    assert disc.contains(np.array([0.1 * 3]), np.array([0.4])).all()  # 0.30000000000000004
+
+
 @pytest.mark.parametrize("shape", [(40, 60), (41, 61), (30, 50)])
 def test_cells_of_a_rectangle_are_those_whose_centres_lie_in_it(shape):
     grid = Grid(shape, UM)

@@ -3,6 +3,7 @@ import pytest
 import tifffile
 from PIL import Image
 
+from fab.aperture import RoundAperture
 from fab.errors import InputError
 from fab.grid import Grid
 from fab.height import HeightMap, read_height
@@ -17,8 +18,8 @@ def test_a_bare_array_is_metres_with_row_zero_lowest(tmp_path):
     found = read_height(tmp_path / "h.npy", pitch=UM)
     assert np.array_equal(found.height_m, HEIGHTS)
     assert found.grid == Grid((3, 4), UM)
-    assert found.aperture_m == 3 * UM
-    assert read_height(tmp_path / "h.npy", pitch=UM, aperture=2 * UM).aperture_m == 2 * UM
+    assert found.relief == RoundAperture(3 * UM)
+    assert read_height(tmp_path / "h.npy", pitch=UM, aperture=2 * UM).relief == RoundAperture(2 * UM)
 
 
 def test_single_precision_stays_single(tmp_path):

@@ -48,7 +48,7 @@ def drawn_by(folder):
 
 def relief(folder):
     manifest = read_manifest(folder)
-    return manifest.grid().inside_circle(manifest.aperture_m)
+    return manifest.relief.inside(manifest.grid())
 
 
 def test_an_order_of_six_levels_is_whole(order):

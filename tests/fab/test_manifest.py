@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from fab.aperture import diameter_of
 from fab.errors import InputError
 from fab.files import canonical_json, sha256_bytes
 from fab.manifest.records import read_manifest
@@ -24,7 +25,7 @@ def test_it_knows_its_staircase_raster_and_aperture(written_order, levels, grid)
     manifest = read_manifest(written_order)
     assert manifest.staircase() == levels
     assert manifest.grid() == grid
-    assert manifest.aperture_m == pytest.approx(grid.extent_m[1], rel=1e-12)
+    assert diameter_of(manifest.relief) == pytest.approx(grid.extent_m[1], rel=1e-12)
     assert manifest.source == {"height_map": "a test"}
 
 

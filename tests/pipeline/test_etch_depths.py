@@ -58,7 +58,7 @@ def test_the_order_is_made_of_the_depths_that_the_run_chose(chosen):
         manifest.drawn_files(order), levels, pixel_edges(manifest.grid()), manifest.doe_cell, manifest.edge_moves()
     )
     stored = read_height(run / "height.exr")
-    inside = manifest.grid().inside_circle(manifest.aperture_m)
+    inside = manifest.relief.inside(manifest.grid())
     heights = height_of(rebuilt, manifest.staircase()).astype(np.float32)
     assert np.array_equal(heights[inside], stored.height_m[inside])
     sheet = json.loads(next(order.glob("*_RUNSHEET.json")).read_text())
@@ -160,7 +160,7 @@ def test_a_bare_map_takes_depths_from_the_command_line(cli, tmp_path):
     assert done.code == 0, done.err
     manifest = read_manifest(tmp_path / "o")
     assert manifest.staircase() == levels
-    inside = manifest.grid().inside_circle(manifest.aperture_m)
+    inside = manifest.relief.inside(manifest.grid())
     assert np.array_equal(np.load(tmp_path / "o" / manifest.level_map_file)[inside], level_map[inside])
     for depths, message in (("250 nm", "2 etches"), ("250, 600 nm", "a length with a unit"), ("250 nm,,", "2 etches")):
         done = cli(*bare, "--etch-depths", depths)

@@ -55,7 +55,6 @@ def test_a_mask_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, 
         ("psf", run, "--masks", order, "--fabricated", "--seed", 0),
         ("tolerance", run, "--masks", order, "--draws", 2, "--workers", 1),
         ("certify", run),
-        ("report", run),
     ):
         done = cli(*command)
         assert done.code == 0, done.err

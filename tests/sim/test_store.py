@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fab.aperture import RectangularAperture
+from fab.aperture import MaskAperture, RectangularAperture, RoundAperture
 from fab.errors import InputError
 from sim.psf_bank import PsfBank
 from sim.store import read_bank, read_height, read_picture, write_bank, write_height, write_picture
@@ -56,7 +56,7 @@ def test_heights_come_back_exactly(
     stored = read_height(path)
     np.testing.assert_array_equal(stored.height_m, height)
     assert stored.height_m.dtype == np.float32
-    assert (stored.pitch_m, stored.aperture_m) == (pitch_m, aperture_m)  # all digits of a float64
+    assert (stored.pitch_m, stored.aperture) == (pitch_m, RoundAperture(aperture_m))  # all digits of a float64
     assert stored.metadata == {"note": "π is fine"}
     np.testing.assert_array_equal(given_array, before)
 
@@ -189,7 +189,7 @@ def test_wrong_content_is_named(tmp_path: Path):
 def test_heights_of_another_program_may_lack_their_lengths(tmp_path: Path):
     write_foreign(tmp_path / "bare.exr", {"height": heights()})
     stored = read_height(tmp_path / "bare.exr")
-    assert (stored.pitch_m, stored.aperture_m) == (None, None)
+    assert (stored.pitch_m, stored.aperture) == (None, None)
     np.testing.assert_array_equal(stored.height_m, heights()[::-1])
 
 
@@ -217,7 +217,7 @@ def test_every_truncation_and_every_flipped_byte_is_noticed(tmp_path: Path, capf
             refused += 1
             continue
         np.testing.assert_array_equal(stored.height_m, height)
-        assert (stored.pitch_m, stored.aperture_m) == (1.85e-6, 1.11e-5)
+        assert (stored.pitch_m, stored.aperture) == (1.85e-6, RoundAperture(1.11e-5))
     assert refused > 0.6 * len(damaged)
     printed = capfd.readouterr()
     assert printed.out == ""
@@ -298,5 +298,13 @@ def test_a_rectangular_aperture_comes_back_with_all_its_digits(tmp_path: Path):
     write_height(tmp_path / "slit.exr", np.zeros((2, 3), np.float32), 1.85e-6, slit)
     stored = read_height(tmp_path / "slit.exr")
     assert stored.aperture == slit
-    with pytest.raises(InputError, match="must be round here"):
-        _ = stored.aperture_m
+
+
+def test_a_mask_comes_back_and_a_damaged_one_is_refused_by_its_file(tmp_path: Path):
+    mask = MaskAperture.of(np.eye(3)[:2], 1.85e-6).shrunk(0.1e-6)
+    write_height(tmp_path / "mask.exr", np.zeros((2, 3), np.float32), 1.85e-6, mask)
+    assert read_height(tmp_path / "mask.exr").aperture == mask
+    for text in ("{", '{"shape": [2, 3]}', '{"shape": [1e9, 3], "pitch": 1, "inset": 0, "rows": []}'):
+        write_foreign(tmp_path / "bad.exr", {"height": heights()}, aperture_m=text)
+        with pytest.raises(InputError, match=r"bad\.exr: aperture_m: must"):
+            read_height(tmp_path / "bad.exr")
