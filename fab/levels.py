@@ -11,6 +11,7 @@ pixel another are refused; in glass the others occur where errors of a process l
 """
 
 import math
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,9 +53,14 @@ class Levels:
     depths_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.count, int) or not FEWEST <= self.count <= MOST:
+        try:
+            count = operator.index(self.count)
+        except TypeError:
+            count = 0
+        if not FEWEST <= count <= MOST:
             cure = "For example 6 or 16; powers of two use every set of masks."
             raise InputError("levels", f"must be a whole number from {FEWEST} to {MOST}", self.count, cure)
+        object.__setattr__(self, "count", count)
         if not 0 < self.step_m < math.inf:
             raise InputError("level step", "must be positive and finite", self.step_m, 'Give a step such as "75 nm".')
         binary = tuple(2**bit * self.step_m for bit in range(self.bits))

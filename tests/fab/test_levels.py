@@ -28,7 +28,13 @@ def test_the_papers_staircase():
         SIXTEEN.etch_depth_m(4)
 
 
-@pytest.mark.parametrize("count", [0, 1, 65, 128, -2, 10**30, 6.0, True])
+def test_a_count_may_be_a_whole_number_of_numpy():
+    levels = Levels(np.int64(16), 75 * NM)  # type: ignore[arg-type]
+    assert levels == SIXTEEN
+    assert type(levels.count) is int
+
+
+@pytest.mark.parametrize("count", [0, 1, 65, 128, -2, 10**30, 6.0, np.float32(6), "6", None, True])
 def test_counts_that_are_no_whole_number_from_2_to_64_are_refused(count):
     with pytest.raises(InputError, match=r"levels: must be a whole number from 2 to 64, but got"):
         Levels(count, 75 * NM)
