@@ -20,8 +20,8 @@ from doedesign.spec.errors import validated
 from doedesign.spec.models import Spec
 from doedesign.spec.targets.areas import AreaSpec
 from doedesign.spec.targets.spots import corners
-from doedesign.spec.values import STARTS
-from fab.units import format_length, parse_angle, parse_length
+from doedesign.spec.values import STARTS, is_start
+from fab.units import MM, format_length, parse_angle, parse_length
 
 # Starts that are designs of their own, and which of them are lenses by one of their options.
 _CLASSIC = tuple(start for start in STARTS if start not in ("flat", "random", "ring"))
@@ -30,6 +30,7 @@ _AIMS = ("spots", "area", "focus")
 
 _MARGIN = 1.25
 _PER_DETAIL = 2  # pixels
+_COARSEST_M = MM  # photosites that a spec may have
 _LEAST, _MOST, _LARGEST = 64, 1024, 8192  # pixels of a window: at least, with pixels of our choice, and at all
 
 
@@ -45,14 +46,15 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
         InputError: a mistake in what the spec says, which has to be right before the rest can follow from it.
     """
     filled: dict[str, Any] = dict(raw)
-    aimed = any(isinstance(raw.get(name), Mapping | list) for name in _AIMS)
+    # A mistake in what says the task is told by itself, without all that would follow from it.
+    aimed = any(name in raw for name in _AIMS)
     optimize, optics, sensor = (raw.get(name, {}) for name in ("optimize", "optics", "sensor"))
-    classic = isinstance(optimize, Mapping) and optimize.get("start") in _CLASSIC
+    classic = not isinstance(optimize, Mapping) or _is_classic(optimize.get("start", "flat"))
     if aimed or classic or isinstance(raw.get("illumination"), Mapping):
         scene = raw.get("scene", {})
         if isinstance(scene, Mapping) and not {"near", "far"} & scene.keys():
             filled["scene"] = {**scene, "far": ["inf"]}
-    if classic and not aimed and not raw.get("objective") and "steps" not in optimize:
+    if classic and isinstance(optimize, Mapping) and not aimed and not raw.get("objective") and "steps" not in optimize:
         filled["optimize"] = {**optimize, "steps": 0}
     if not ((aimed or classic) and isinstance(optics, Mapping) and isinstance(sensor, Mapping)):
         return filled
@@ -72,12 +74,21 @@ def with_left_out(raw: Mapping[str, Any], source: str, overridden: Collection[st
     return filled
 
 
+def _is_classic(start: Any) -> bool:
+    """Whether a start is a design of its own, or no start at all."""
+    return start in _CLASSIC or not (isinstance(start, str) and is_start(start))
+
+
 def _distance(raw: Mapping[str, Any]) -> Any:
     """Distance at which foci or a start that is a lens bring light to a focus, as the spec has it, or None."""
     focus, optimize = raw.get("focus"), raw.get("optimize", {})
     if isinstance(focus, Mapping):
         distances = focus.get("distances")
-        return distances[0] if isinstance(distances, list) and distances else None
+        first = str(distances[0]) if isinstance(distances, list) and distances else ""
+        try:
+            return first if parse_length(first) > 0 else None
+        except ValueError:
+            return None
     options = optimize.get("start_options") if isinstance(optimize, Mapping) else None
     key = _LENSES.get(str(optimize.get("start"))) if isinstance(options, Mapping) else None
     return options.get(key) if key and isinstance(options, Mapping) else None
@@ -97,6 +108,7 @@ def _sensor(spec: Spec, missing: Set[str]) -> dict[str, Any]:
     pixel = sensor.pixel_m
     if missing - {"window"}:
         pixel = max(detail / _PER_DETAIL, min(full, most) / (_MOST if "window" in missing else sensor.window))
+        pixel = pixel if sensor.in_angles else min(pixel, sensor.binning * _COARSEST_M)
         one = float(f"{pixel / sensor.binning:.3g}")
         if sensor.in_angles:
             degrees = float(f"{math.degrees(math.asin(min(1.0, one))):.3g}")
@@ -141,18 +153,23 @@ def _far_end_m(area: AreaSpec, detail_m: float) -> float:
 
 def _steepest(spec: Spec, wavelength_m: float) -> float:
     """Largest direction sine to which a classic start sends light; 0 where its options are still to be mended."""
-    start, options, radius = spec.optimize.start, spec.optimize.start_options, spec.doe.relief.reach_m
     try:
-        if start == "axicon":
-            return math.sin(abs(parse_angle(options.get("angle", ""))))
-        if start == "blazed":
-            return wavelength_m / parse_length(options.get("period", ""))
-        if start == "lens_array":
-            return parse_length(options.get("pitch", "")) / 2 / parse_length(options.get("focal_length", ""))
-        if start in _LENSES:
-            return radius / parse_length(options.get(_LENSES[start], ""))
-        if start == "vortex":
-            return 2 * abs(float(options.get("charge", 1))) * wavelength_m / (2 * radius)
-        return 3 * abs(float(options.get("waves", 5))) * wavelength_m / radius
+        sine = _sine(spec, wavelength_m)
     except (ValueError, TypeError, ZeroDivisionError):
         return 0.0
+    return sine if math.isfinite(sine) else 0.0
+
+
+def _sine(spec: Spec, wavelength_m: float) -> float:
+    start, options, radius = spec.optimize.start, spec.optimize.start_options, spec.doe.relief.reach_m
+    if start == "axicon":
+        return math.sin(abs(parse_angle(options.get("angle", ""))))
+    if start == "blazed":
+        return wavelength_m / parse_length(options.get("period", ""))
+    if start == "lens_array":
+        return parse_length(options.get("pitch", "")) / 2 / parse_length(options.get("focal_length", ""))
+    if start in _LENSES:
+        return radius / parse_length(options.get(_LENSES[start], ""))
+    if start == "vortex":
+        return 2 * abs(float(options.get("charge", 1))) * wavelength_m / (2 * radius)
+    return 3 * abs(float(options.get("waves", 5))) * wavelength_m / radius

@@ -43,6 +43,7 @@ from doedesign.spec.values import (
     accepted,
     broken,
     from_toml,
+    is_start,
     known,
     length,
     share,
@@ -74,7 +75,7 @@ ObjectiveName = Annotated[
 Start = Annotated[
     str,
     accepted(
-        lambda name: name in STARTS or name.lower().endswith(HEIGHT_FILES),
+        is_start,
         f"must be a known start or a height map file ({', '.join(HEIGHT_FILES)})",
         STARTS,
     ),

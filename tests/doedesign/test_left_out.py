@@ -151,6 +151,30 @@ def test_mistakes_are_those_of_the_spec(tmp_path: Path, task: list[str], words: 
         assert word in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("task", "only"),
+    [
+        (["spots=3"], "spots: must be a table"),
+        (["area=3"], "area: must be a list"),
+        (['focus="8 mm"'], "focus: must be a table"),
+        (["focus={ distances = [3] }"], "focus.distances[0]: must be a number with a unit"),
+        (['focus={ distances = ["8 deg"] }'], "focus.distances[0]: must be a number with a unit"),
+        (["optimize=3"], "optimize: must be a table"),
+        ([ORDERS, LENS, 'doe.aperture="3 um"'], "doe.aperture: must equal samples x pitch"),
+    ],
+)
+def test_what_would_follow_from_a_mistake_is_no_second_one(tmp_path: Path, task: list[str], only: str):
+    with pytest.raises(InputError) as refused:
+        spec_of(tmp_path, *task)
+    assert only in str(refused.value)
+    assert not any(word in str(refused.value) for word in ("sensor", "scene"))
+
+
+def test_options_of_a_start_without_end_say_nothing_of_the_sensor(tmp_path: Path):
+    """They are refused where the start is made."""
+    assert spec_of(tmp_path, *start("vortex", charge="inf")).sensor.window == 64
+
+
 def test_a_lens_beside_angles_is_one_mistake(tmp_path: Path):
     with pytest.raises(InputError, match="directions are looked at without lens") as refused:
         spec_of(tmp_path, ORDERS, LENS, 'sensor.pixel_angle="0.1 deg"')

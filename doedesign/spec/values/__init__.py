@@ -50,6 +50,11 @@ STARTS = {
 }
 
 
+def is_start(name: str) -> bool:
+    """Whether a start has this name: a built-in one, or a file of heights."""
+    return name in STARTS or name.lower().endswith(HEIGHT_FILES)
+
+
 def broken(rule: str, cure: str) -> PydanticCustomError:
     """Return the error of a broken rule ("must be ...", and a sentence on what to do), for a validator to raise."""
     return PydanticCustomError("spec", "{rule}", {"rule": rule, "cure": cure})
