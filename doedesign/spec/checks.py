@@ -332,7 +332,18 @@ def _training(spec: Spec) -> Iterator[InputError]:
 def spec_warnings(spec: Spec) -> list[str]:
     """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
     rules = (_level_warning, _printing_warning, _window_warnings, _pixel_warning, _occlusion_warning, _limit_warnings)
+    rules = (*rules, _mask_warning)
     return [warning for rule in rules for warning in rule(spec)]
+
+
+def _mask_warning(spec: Spec) -> Iterator[str]:
+    """Warn of parts of a mask that are too narrow for the overlap of the chrome."""
+    relief, overlap = spec.doe.relief, spec.process.chrome_overlap_m
+    if isinstance(relief, MaskAperture) and (closed := relief.parts_closed(overlap))[1]:
+        yield (
+            f"doe.aperture: the chrome, which reaches {format_length(overlap)} over every edge, closes {closed[1]} of "
+            f"the {closed[0]} parts of the mask. A smaller process.chrome_overlap leaves them open."
+        )
 
 
 def _level_warning(spec: Spec) -> Iterator[str]:

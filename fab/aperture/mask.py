@@ -113,6 +113,19 @@ class MaskAperture(Aperture):
         low, left = (total / self.area_in(self.pitch_m) * self.pitch_m for total in sums)
         return low, left
 
+    def parts_closed(self, by_m: float) -> tuple[int, int]:
+        """Count the parts of the open cells, and those of which nothing is open once the rim has moved further in."""
+        from scipy import ndimage
+
+        label: Any = ndimage.label
+        parts, count = label(self.plane)
+        y, x, cells = self.shrunk(by_m).area
+        rows, columns = (
+            np.floor((lines[1:] + lines[:-1]) / 2 + n / 2).astype(int)
+            for lines, n in zip((y, x), self.shape, strict=True)
+        )
+        return count, count - len(np.unique(parts[np.ix_(rows, columns)][cells]))
+
     def contains(self, y_m: NDArray[np.floating], x_m: NDArray[np.floating]) -> NDArray[np.bool_]:
         """By the cell that they lie in, or by any that they touch."""
         y, x, cells = self.area

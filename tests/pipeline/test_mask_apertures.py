@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from doedesign.spec import load_spec, spec_digest, spec_from_json, spec_to_json
+from doedesign.spec import load_spec, spec_digest, spec_from_json, spec_to_json, spec_warnings
 from fab.aperture import MaskAperture
 from fab.manifest.records import read_manifest
 from fab.pictures import write_pixels
@@ -43,6 +43,15 @@ def test_the_spec_keeps_the_open_cells_and_needs_the_picture_no_more(tmp_path, s
     assert again == read
     assert spec_digest(again) == spec_digest(read)
     assert spec_from_json(json.loads(json.dumps(spec_to_json(read))), "here") == read
+
+
+def test_parts_that_the_chrome_closes_are_told(tmp_path, spec):
+    assert not [warning for warning in spec_warnings(load_spec(spec)) if "doe.aperture" in warning]
+    narrow = plane()
+    narrow[50:60, 24:29] = narrow[24:30, 62:64] = True  # both less than 10 um wide
+    write_pixels(tmp_path / "mask.png", narrow.astype(np.uint8) * 255)
+    (warning,) = (warning for warning in spec_warnings(load_spec(spec)) if "doe.aperture" in warning)
+    assert "reaches 5 um over every edge, closes 2 of the 4 parts of the mask" in warning
 
 
 @pytest.mark.slow
