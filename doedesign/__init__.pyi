@@ -27,6 +27,7 @@ from .prediction import predict as predict
 from .recon.files import reconstruct_files as reconstruct_files
 from .recon.model import Model as Model
 from .recon.reconstruction import Reconstruction as Reconstruction
+from .refinement import refine as refine
 from .runs.certificate import Certificate as Certificate
 from .runs.certificate import certify as certify
 from .runs.fabricated import FabricatedPsfs as FabricatedPsfs

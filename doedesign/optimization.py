@@ -177,7 +177,7 @@ def _optimize_in(
         log.info("evaluating the design")
         if spec.process.chooses_depths:
             log.info(f"chosen: {design.levels}")
-        results = _write_results(run, terms, design)
+        results = write_results(run, terms, design)
         finish_run(run, results, design.levels.depths_m)
     return open_design(folder, False)
 
@@ -274,7 +274,17 @@ def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
     }
 
 
-def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[str]:
+def write_results(
+    run: Run, terms: tuple[Term, ...], design: Design, more: Mapping[str, Any] | None = None
+) -> list[str]:
+    """Look at a design and write its files and pictures into its claimed run; returns their names.
+
+    Args:
+        run: the run.
+        terms: of the loss.
+        design: what was found.
+        more: further metrics.
+    """
     spec, camera, height = run.spec, design.camera, design.nominal_height_m
     near, far, propagation = spec.scene.near_m, spec.scene.far_m, spec.propagation or camera.propagation
     levels = None if spec.optimize.quantisation == "none" else design.levels
@@ -283,7 +293,7 @@ def _write_results(run: Run, terms: tuple[Term, ...], design: Design) -> list[st
     drawn, flat = optic_as_drawn(camera, height, depths_m=(*near, *far)), HeightOptic.of(camera)
     bank, lens = (psf(each, depths=(*near, *far), propagation=propagation) for each in (drawn, flat))
     rows = design_metrics(drawn, bank, near, lens)
-    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light}
+    metrics: dict[str, Any] = {"psf": rows, "lens": camera.lens_text, "light": camera.light, **(more or {})}
     if patterns := drawn_patterns(spec, camera, bank, terms):
         metrics["patterns"] = without_infinities([pattern.summary() for pattern in patterns])
     if spec.process.chooses_depths:

@@ -1,4 +1,4 @@
-"""From a spec to a design and its masks: optimize, masks, verify."""
+"""From a spec to a design and its masks: new, optimize, refine, masks, verify."""
 
 import json
 from pathlib import Path
@@ -64,6 +64,33 @@ def optimize(
     if budget is not None:
         set_ = (*set_, f"optimize.steps={steps_within(read, budget, None if overwrite else folder, own)}")
     work(spec, folder, overrides=set_, objectives=own, overwrite=overwrite)
+    print_paths([folder], json_, metrics=str(folder / "metrics.json"))
+
+
+def refine(
+    run: Path,
+    *,
+    out: Path | None = None,
+    terms: int | None = None,
+    steps: int = 60,
+    overwrite: Flag = False,
+    json_: AsJson = False,
+) -> None:
+    """Refine the unit cell of a run by Maxwell's equations and their gradient, into a run of its own, or resume it.
+
+    For spots that are orders of a cell (spots.period) of a few wavelengths; needs the extra "rigorous".
+
+    Args:
+        run: Run folder; it stays as it is.
+        out: Folder of the new run; runs/NAME_refined by default.
+        terms: Orders of the rigorous solution; by default those that travel in the glass and somewhat more. Time grows
+            with their third power.
+        steps: Gradients that are computed at most.
+        overwrite: Where the folder has another run, remove it and all that was made of it.
+    """
+    from doedesign.refinement import refine as work
+
+    folder = work(run, out, terms=terms, steps=steps, overwrite=overwrite).folder or Path()
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
 
 

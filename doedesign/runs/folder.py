@@ -264,12 +264,21 @@ def begin_run(run: Run) -> None:
     write_atomic(run.path("spec.toml"), spec_to_resolved_toml(run.spec, run.overrides).encode())
 
 
-def finish_run(run: Run, results: Sequence[str], depths_m: Sequence[float] = ()) -> None:
-    """Mark a claimed run done, with its files and, where it was to choose them, the depths of the etches, metres."""
+def finish_run(
+    run: Run, results: Sequence[str], depths_m: Sequence[float] = (), about: Mapping[str, Any] | None = None
+) -> None:
+    """Mark a claimed run done.
+
+    Args:
+        run: the run.
+        results: names of its files.
+        depths_m: depths of the etches, metres, which it keeps where it was to choose them.
+        about: further entries of the manifest.
+    """
     chosen = {_DEPTHS: list(depths_m)} if run.spec.process.chooses_depths else {}
     kept = kept_pictures(run.spec).values()
     digests = {name: sha256_file(run.path(name)) for name in sorted([*results, *kept])}
-    _write_manifest(run, "done", {**chosen, "results_sha256": digests})
+    _write_manifest(run, "done", {**chosen, **(about or {}), "results_sha256": digests})
     run.path(CHECKPOINT).unlink(missing_ok=True)
 
 

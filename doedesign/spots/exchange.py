@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from doedesign.spots.superposition import SpotProblem
 
-_FLAT = 1.4  # (max - min) / (max + min) over that root, about
+FLAT = 1.4  # (max - min) / (max + min) over that root, about
 _ANY, _ANY_OF_TWO = 0.5, 0.1  # share of offers of another level than a neighbour's
 _COLD = 0.3  # share of the sweeps that take improvements alone
 
@@ -67,7 +67,7 @@ def _merit(light: Any, shares: Any, wanted: Any, uniformity: float) -> float:
     for k in range(len(light)):
         off = (light[k].real ** 2 + light[k].imag ** 2) / shares[k] / mean - 1.0
         spread += off**4
-    return total - uniformity * (spread / len(light)) ** 0.25 * _FLAT
+    return total - uniformity * (spread / len(light)) ** 0.25 * FLAT
 
 
 @njit(cache=True, nogil=True)

@@ -5,4 +5,5 @@ bitplanes     a plane as 64-pixel words, and runs of them (numba)
 widths        how narrow runs are found and counted
 repair        the level map nearest to a given one that the process prints
 repair_moves  the single changes that a repair tries
+strokes       cells of two heights that repeat, made of what the process prints
 """

@@ -173,18 +173,29 @@ def _solve(
 
 
 def _directions(permittivity: Any, expansion: Any, lattice: Any) -> tuple[Any, Any]:
-    """Unit vectors `[x, y]` along the nearest walls, as fmmax asks for them; 0 in the midst between walls.
-
-    They are perpendicular to the gradient of the permittivity, smoothed by a kernel with long tails.
-    """
+    """Unit vectors along the nearest walls of square cells of `_SAMPLES` samples, as fmmax asks for them."""
     import jax.numpy as jnp
 
-    raster = np.real(np.asarray(permittivity))
-    waves = [np.fft.fftfreq(count, 1 / _SAMPLES) for count in raster.shape]
+    along_x, along_y = directions_of_walls(np.real(np.asarray(permittivity)), _SAMPLES)
+    return jnp.asarray(along_x, complex), jnp.asarray(along_y, complex)
+
+
+def directions_of_walls(
+    raster: Float[np.ndarray, "x y"], samples: int
+) -> tuple[Float[np.ndarray, "x y"], Float[np.ndarray, "x y"]]:
+    """Components along x and y of unit vectors along the nearest walls; 0 in the midst between walls.
+
+    They are perpendicular to the gradient of the permittivity, smoothed by a kernel with long tails.
+
+    Args:
+        raster: permittivity over a period.
+        samples: of the raster, per cell.
+    """
+    waves = [np.fft.fftfreq(count, 1 / samples) for count in raster.shape]
     kx, ky = 2j * np.pi * waves[0][:, None], 2j * np.pi * waves[1]
     smoothed = np.fft.fft2(raster) / (1 - _SMOOTHED**2 * (kx**2 + ky**2))
     x, y = (np.fft.ifft2(smoothed * k).real for k in (kx, ky))
     slope = np.hypot(x, y)
     # Without digits there is no direction.
     slope = np.where(slope > 1e-9 * slope.max(), slope, np.inf)
-    return jnp.asarray(-y / slope, complex), jnp.asarray(x / slope, complex)
+    return -y / slope, x / slope

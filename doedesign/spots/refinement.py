@@ -1,0 +1,282 @@
+"""Refinement of the unit cell of a grid of orders by rigorous light and its gradient.
+
+From the cell that scalar light found:
+
+1. heights of all cells move freely between the levels, by the gradient (Adam), while slabs between levels are pressed
+   to glass or air more and more; of two levels with a narrowest line or space, a smoothed outline moves;
+2. the better one of that cell, on levels, and of the one at the start has cells exchanged, those that promise most by
+   the gradient, as long as its score grows. Of two levels with a narrowest line or space, strokes of its brush are
+   exchanged (`fab.rules.strokes`), so that every cell on the way can be printed.
+
+What is scored is efficiency less `uniformity` times how unequal the spots are, by the smooth measure of `exchange`; the
+cell with the most efficiency less `uniformity` times the uniformity error is kept.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from doedesign.spots.exchange import FLAT
+from doedesign.spots.spots import Spots
+from doedesign.spots.superposition import SpotLight, spot_light
+from fab.levels import Levels
+from fab.rules.strokes import Strokes
+from sim.rigorous.slab_cell import SlabCell
+
+_SHARPNESS = (3.0, 16.0)  # of slabs, at the beginning of the first part and at its end
+_RATE = 0.1  # steps of a level per step, at first
+_MOST = 30  # exchanges at a time
+_TRIES, _ROW_TRIES = 8, 200  # exchanges that are tried one by one where several at a time do not help
+_OFFERS = 400  # that are looked at
+
+
+class RefinementState(NamedTuple):
+    """Everything a step changes.
+
+    Attributes:
+        height: `[y, x]` free heights, in levels from the lowest.
+        mean: of their gradients, for Adam.
+        square: of the squares of those.
+        cell: `[y, x]` levels from the lowest that are exchanged.
+        best: those of the best cell so far.
+        numbers: score of `cell`, merit of `best`, exchanges at a time, and 1 where nothing more is found.
+        step: steps done.
+    """
+
+    height: Float[np.ndarray, "y x"]
+    mean: Float[np.ndarray, "y x"]
+    square: Float[np.ndarray, "y x"]
+    cell: UInt8[np.ndarray, "y x"]
+    best: UInt8[np.ndarray, "y x"]
+    numbers: Float[np.ndarray, "4"]
+    step: int
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """Arrays that a checkpoint keeps."""
+        return list(self[:-1])
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more is found."""
+        return bool(self.numbers[3])
+
+
+class _Offer(NamedTuple):
+    """A change of a cell: its pixels, and the level that they get."""
+
+    pixels: np.ndarray
+    value: int
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementTask:
+    """A unit cell that is to be refined.
+
+    Attributes:
+        solver: light of its slabs, which are those between its levels.
+        spots: where light should go, as orders.
+        uniformity: how much efficiency a uniformity error is worth.
+        ways: `[x and y]` share of the light with its electric field along x and along y.
+        start: `[y, x]` levels from the lowest to begin with.
+        count: number of levels.
+        strokes: what the process prints of two levels; None where any cell will do.
+        steps: in all; two thirds of them of free heights.
+    """
+
+    solver: SlabCell
+    spots: Spots
+    uniformity: float
+    ways: Float[np.ndarray, "2"]
+    start: UInt8[np.ndarray, "y x"]
+    count: int
+    strokes: Strokes | None
+    steps: int
+
+    @property
+    def free_steps(self) -> int:
+        """Steps of free heights."""
+        return 2 * self.steps // 3
+
+    @property
+    def template(self) -> list[np.ndarray]:
+        """Arrays of the shapes and kinds of a checkpoint's."""
+        like = self.start.astype(np.float64)
+        return [like, like, like, self.start, self.start, np.zeros(4)]
+
+    def filled(self, cell: UInt8[np.ndarray, "y x"]) -> Float[np.ndarray, "slab y x"]:
+        """Share of glass of every slab, the one nearest to the air first."""
+        return (cell > np.arange(self.count - 1)[::-1, None, None]).astype(np.float64)
+
+    def light(self, orders: Float[np.ndarray, "2 order"], number: Int[np.ndarray, "order 2"]) -> SpotLight:
+        """Sum and uniformity error of the spots' light.
+
+        Args:
+            orders: shares of the light along x and along y.
+            number: `[order, y and x]` of every order.
+        """
+        return spot_light(self.ways @ orders[:, places_of(self.spots, number)], self.spots.shares)
+
+    def initial_state(self) -> RefinementState:
+        """The cell at the start, or the nearest one that can be printed."""
+        cell = self._printable(self.start - (self.count - 1) / 2, self.start)
+        none, height = np.zeros(cell.shape), cell.astype(np.float64)
+        return RefinementState(height, none, none, cell, cell, np.array([np.nan, -np.inf, _MOST, 0.0]), 0)
+
+    def run(self, state: RefinementState) -> Iterator[tuple[RefinementState, dict[str, Any]]]:
+        """Do the remaining steps one by one; yields the state, and the line of the history."""
+        while state.step < self.steps and not state.ended:
+            step = state.step
+            state, light = (self._free_step if step < self.free_steps else self._exchange_step)(state)
+            terms = [float(part) for part in light]
+            loss = 1 - light.merit(self.uniformity)
+            yield state, {"step": step, "loss": loss, "terms": terms, "names": ["efficiency", "uniformity_error"]}
+
+    def _score(self, orders: Any) -> Any:
+        """Efficiency less how unequal spots are."""
+        light = self.ways @ orders[:, places_of(self.spots, self.solver.number)]
+        over = light / self.spots.shares
+        spread = (((over / over.mean() - 1) ** 4).mean() + 1e-16) ** 0.25
+        return light.sum() - self.uniformity * FLAT * spread
+
+    def _solved(self, cell: np.ndarray) -> tuple[float, SpotLight]:
+        orders = self.solver.transmitted(self.filled(cell))
+        return float(self._score(orders)), self.light(orders, self.solver.number)
+
+    def _free_step(self, state: RefinementState) -> tuple[RefinementState, SpotLight]:
+        done = state.step / max(self.free_steps, 1)
+        sharpness = _SHARPNESS[0] * (_SHARPNESS[1] / _SHARPNESS[0]) ** done
+        height = self._smoothed(state.height)
+        below = np.arange(self.count - 1)[::-1, None, None]
+        bent = np.tanh(sharpness * (height - below - 0.5))
+        _, orders, change = self.solver.gradient((1 + bent) / 2, self._score)
+        slope = self._smoothed((change * sharpness * (1 - bent**2) / 2).sum(0))
+        mean, square = 0.8 * state.mean + 0.2 * slope, 0.95 * state.square + 0.05 * slope**2
+        count = state.step + 1
+        move = mean / (1 - 0.8**count) / (np.sqrt(square / (1 - 0.95**count)) + 1e-12)
+        moved = (state.height + _RATE * (1 - 0.7 * done) * move).clip(-0.3, self.count - 0.7)
+        state = state._replace(height=moved, mean=mean, square=square, step=count)
+        return state, self.light(orders, self.solver.number)
+
+    def _begin_exchange(self, state: RefinementState) -> RefinementState:
+        """The better one of the cell at the start and the free heights on levels."""
+        height = self._smoothed(state.height)
+        rounded = np.rint(height).clip(0, self.count - 1).astype(np.uint8)
+        cells = [state.cell, self._printable(height - (self.count - 1) / 2, rounded)]
+        found = [self._solved(cell) for cell in cells]
+        merits = [light.merit(self.uniformity) for _, light in found]
+        first, best = int(np.argmax([score for score, _ in found])), int(np.argmax(merits))
+        numbers = np.array([found[first][0], merits[best], _MOST, 0.0])
+        return state._replace(cell=cells[first], best=cells[best], numbers=numbers)
+
+    def _exchange_step(self, state: RefinementState) -> tuple[RefinementState, SpotLight]:
+        if np.isnan(state.numbers[0]):
+            state = self._begin_exchange(state)
+        score, merit, most, _ = state.numbers
+        _, orders, change = self.solver.gradient(self.filled(state.cell), self._score)
+        light = self.light(orders, self.solver.number)
+        offers = self._offers(state.cell, change[::-1])
+        sizes = list(dict.fromkeys(max(1, round(most / 3**part)) for part in range(4)))
+        tried = [self._changed(state.cell, offers, size) for size in sizes]
+        tried += [self._changed(state.cell, offers[one:], 1) for one in range(1, min(self._tries, len(offers)))]
+        for number, cell in enumerate(tried):
+            if np.array_equal(cell, state.cell):
+                continue
+            found, own = self._solved(cell)
+            if found > score + 1e-9:
+                most = 1.5 * sizes[number] if number < len(sizes) else 1.0
+                best = state.best
+                if own.merit(self.uniformity) > merit:
+                    best, merit = cell, own.merit(self.uniformity)
+                numbers = np.array([found, merit, min(most, _MOST), 0.0])
+                return state._replace(cell=cell, best=best, numbers=numbers, step=state.step + 1), own
+        return state._replace(numbers=np.array([score, merit, most, 1.0]), step=state.step + 1), light
+
+    @property
+    def _tries(self) -> int:
+        return _ROW_TRIES if 1 in self.start.shape else _TRIES
+
+    def _offers(self, cell: np.ndarray, change: np.ndarray) -> list[_Offer]:
+        """Changes by what they promise, the most first; `change`: of the score, by the glass of slabs from the lowest."""
+        if self.strokes is not None:
+            gains, offers = self._offered_strokes(cell, change[0], self.strokes)
+        else:
+            reached = np.concatenate([np.zeros((1, *cell.shape)), np.cumsum(change, 0)])
+            gains = (reached - np.take_along_axis(reached, cell[None].astype(np.int64), 0)).ravel()
+            gains[np.flatnonzero((np.arange(self.count)[:, None, None] == cell).ravel())] = -np.inf
+            offers = [_Offer(np.array([at % cell.size]), at // cell.size) for at in range(gains.size)]
+        order = np.argsort(-gains, kind="stable")[:_OFFERS]
+        # The gradient alone does not say how much a whole slab does: of a row, all are worth a try.
+        least = -np.inf if 1 in cell.shape else 0.0
+        return [offers[at] for at in order if gains[at] > least]
+
+    def _offered_strokes(self, cell: np.ndarray, change: np.ndarray, strokes: Strokes) -> tuple[np.ndarray, list[_Offer]]:
+        gains, offers, (ny, nx) = list[float](), list[_Offer](), cell.shape
+        for glass in (True, False):
+            gain = np.where((cell > 0) != glass, change if glass else -change, 0.0)
+            for y in range(ny):
+                for x in range(nx):
+                    pixels = strokes.stroke(cell.shape, y, x, glass)
+                    pixels = pixels[cell.flat[pixels] != glass]
+                    if pixels.size:
+                        gains.append(float(gain.flat[pixels].sum()))
+                        offers.append(_Offer(pixels, int(glass)))
+        return np.array(gains), offers
+
+    def _changed(self, cell: np.ndarray, offers: list[_Offer], most: int) -> np.ndarray:
+        """The cell with the first changes, as many as `most`, that leave it printable and each other alone."""
+        cell, taken, free = cell.copy(), 0, np.ones(cell.size, bool)
+        for offer in offers[: 20 * most]:
+            if not free[offer.pixels].all():
+                continue
+            before = cell.flat[offer.pixels]
+            cell.flat[offer.pixels] = offer.value
+            if self.strokes is not None and not self.strokes.follows(cell > 0):
+                cell.flat[offer.pixels] = before
+                continue
+            free[offer.pixels], taken = False, taken + 1
+            if taken == most:
+                break
+        return cell
+
+    def _printable(self, outline: np.ndarray, cell: np.ndarray) -> UInt8[np.ndarray, "y x"]:
+        if self.strokes is None or self.strokes.follows(cell > 0):
+            return cell
+        found: Bool[np.ndarray, "y x"] | None = self.strokes.nearest(outline)
+        return self.start if found is None else found.astype(np.uint8)
+
+    def _smoothed(self, height: np.ndarray) -> np.ndarray:
+        """Smooth by a cone as wide as the wider brush; its own adjoint."""
+        if self.strokes is None or max(self.strokes[:2]) == 1:
+            return height
+        y, x = (np.fft.fftfreq(count, 1 / count) for count in height.shape)
+        cone = np.maximum(0, 1 - np.hypot(y[:, None], x) / max(self.strokes[:2]))
+        return np.fft.ifft2(np.fft.fft2(height) * np.fft.fft2(cone / cone.sum())).real
+
+
+def places_of(spots: Spots, number: Int[np.ndarray, "order 2"]) -> Int[np.ndarray, " m"]:
+    """Where the orders of spots stand among those that were solved.
+
+    Args:
+        spots: of a grid of orders.
+        number: `[order, y and x]` of every order.
+
+    Raises:
+        KeyError: an order was not solved.
+    """
+    assert spots.orders is not None
+    place = {(int(y), int(x)): at for at, (y, x) in enumerate(number)}
+    return np.array([place[int(y), int(x)] for y, x in spots.orders])
+
+
+def ranks(levels: Levels) -> tuple[UInt8[np.ndarray, " level"], UInt8[np.ndarray, " level"]]:
+    """Levels from the lowest to the highest, and the place of every level among them.
+
+    Args:
+        levels: a staircase.
+    """
+    order = levels.by_height()[0]
+    return order, np.argsort(order).astype(np.uint8)
