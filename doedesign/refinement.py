@@ -41,7 +41,7 @@ from sim.propagation.directions import efficiencies
 from sim.rigorous.crossed import require_fmmax
 from sim.rigorous.slab_cell import SlabCell, gradient_bytes, usual_terms
 
-STEPS = 60
+STEPS, ROW_STEPS = 60, 300
 _MORE = 1.5  # terms of the judge over those of the solver
 _MOST_BYTES = 8 * 10**9
 _FEWEST_TERMS, _MOST_STEPS, _WIDEST = 9, 10_000, 32
@@ -63,25 +63,21 @@ class _Row(NamedTuple):
 
 
 class _Cell(NamedTuple):
-    """Unit cell of a run, all that light needs to know of it.
-
-    `part` is where one lies in the level map; `level` its levels.
-    """
+    """Unit cell of a run: its design and spec, orders, cells, levels, wavelength and index of the glass."""
 
     design: Design
     spec: Spec
     spots: Spots
     grid: Grid
-    period: int
     level: UInt8[np.ndarray, "y x"]
     wavelength_m: float
-    index: float
+    glass: float
 
     def solver(self, terms: int) -> SlabCell:
         """Light of its slabs."""
         heights = self.design.levels.by_height()[1]
         slabs = np.diff(heights)[::-1]
-        return SlabCell(self.grid.shape, self.grid.pitch_m, slabs, self.wavelength_m, self.index, terms)
+        return SlabCell(self.grid.shape, self.grid.pitch_m, slabs, self.wavelength_m, self.glass, terms)
 
 
 def refine(
@@ -89,7 +85,7 @@ def refine(
     out: str | Path | None = None,
     *,
     terms: int | None = None,
-    steps: int = STEPS,
+    steps: int | None = None,
     overwrite: bool = False,
 ) -> Design:
     """Refine the unit cell of a finished run by rigorous light, into a run of its own, where a stopped one goes on.
@@ -103,19 +99,20 @@ def refine(
         out: folder of the new run; runs/NAME_refined by default.
         terms: orders of the rigorous solution; by default those that travel in the glass and somewhat more. The cells
             are judged with half as many again.
-        steps: gradients that are computed at most.
+        steps: gradients that are computed; 60 by default, 300 of a row of cells.
         overwrite: where the folder has another run, remove it with all that was made of it.
 
     Raises:
-        InputError: fmmax is missing, a run that cannot be read or has no unit cell, several wavelengths, tilted light, a
-            cell that is too large, or a folder that belongs to something else.
+        InputError: fmmax is missing, a run that cannot be read or has no unit cell, several wavelengths, tilted light,
+            a cell that is too large, or a folder that belongs to something else.
     """
     require_fmmax()
-    if not 1 <= steps <= _MOST_STEPS:
-        raise InputError("steps", f"must lie from 1 to {_MOST_STEPS}", steps, f"{STEPS} are usual.")
     run = source if isinstance(source, Run) else open_run(Path(source))
     cell = _cell_of(open_design(run, False))
     terms = _terms_of(cell, terms)
+    steps = steps if steps is not None else ROW_STEPS if 1 in cell.grid.shape else STEPS
+    if not 1 <= steps <= _MOST_STEPS:
+        raise InputError("steps", f"must lie from 1 to {_MOST_STEPS}", steps, f"{STEPS} are usual.")
     spec = _named(cell.spec, f"{cell.spec.name}_refined")
     folder = Path(out or Path("runs") / spec.name)
     if folder.resolve() == run.folder.resolve():
@@ -147,9 +144,9 @@ def _refine_in(run: Run, cell: _Cell, task: RefinementTask, about: dict[str, Any
     ny, nx = cell.grid.shape
     log.info(f"refining a cell of {ny} x {nx} with {task.solver.terms} terms and {task.count - 1} slabs")
     with meter("refining", task.steps, state.step) as progress:
-        for state, record in task.run(state):  # noqa: B007
+        for state, record in task.run(state):  # noqa: B020 - goes on from it
             history.append(record)
-            progress.advance(task.steps if state.ended else state.step, f"loss {record['loss']:.4f}")
+            progress.advance(state.step, f"loss {record['loss']:.4f}")
             save_checkpoint(run, state.arrays, state.step, history)
     level = ranks(cell.design.levels)[0][state.best]
     rows = _table(cell, task, level)
@@ -189,13 +186,13 @@ def _cell_of(design: Design) -> _Cell:
         raise InputError(design.name, rule, str(design.level_map.relief), "Choose a larger aperture.")
     wavelength_m, spots = wavelengths[0], spots_from_spec(spec.spots, camera)
     index = refractive_index(camera.material, wavelength_m)
-    return _Cell(design, spec, spots, grid, period, design.level_map.level[part], wavelength_m, index)
+    return _Cell(design, spec, spots, grid, design.level_map.level[part], wavelength_m, index)
 
 
 def _terms_of(cell: _Cell, terms: int | None) -> int:
     """The number asked for, or the usual one, if it fits into memory and holds all orders."""
     shape, pitch_m, slabs = cell.grid.shape, cell.grid.pitch_m, cell.design.levels.count - 1
-    usual = usual_terms(shape, pitch_m, cell.wavelength_m, cell.index)
+    usual = usual_terms(shape, pitch_m, cell.wavelength_m, cell.glass)
     wanted = usual if terms is None else terms
     most = int(np.sqrt(_MOST_BYTES / gradient_bytes(1, slabs)))
     if not _FEWEST_TERMS <= wanted <= most:
@@ -203,7 +200,9 @@ def _terms_of(cell: _Cell, terms: int | None) -> int:
         rule = f"must lie from {_FEWEST_TERMS} to {most}, which {slabs} slabs take {_MOST_BYTES / 1e9:.3g} GB for"
         ny, nx = shape
         got = f"{wanted} for a cell of {ny} x {nx}, {format_length(pitch_m)} wide"
-        raise InputError("terms", rule, got, f"Refine a cell of {side} at most, take fewer levels, or give fewer terms.")
+        raise InputError(
+            "terms", rule, got, f"Refine a cell of {side} at most, take fewer levels, or give fewer terms."
+        )
     return wanted
 
 
@@ -224,7 +223,8 @@ def _task_of(cell: _Cell, terms: int, steps: int) -> RefinementTask:
     start, ways = ranks(levels)[1][cell.level], np.array(_WAYS[design.camera.polarisation])
     assert cell.spec.spots is not None
     uniformity = cell.spec.spots.uniformity
-    return RefinementTask(solver, cell.spots, uniformity, ways, start, levels.count, strokes, steps)
+    seed = cell.spec.optimize.seed
+    return RefinementTask(solver, cell.spots, uniformity, ways, start, levels.count, strokes, steps, seed)
 
 
 def _named(spec: Spec, name: str) -> Spec:
@@ -255,11 +255,12 @@ def _scalar_light(cell: _Cell, level: UInt8[np.ndarray, "y x"]) -> tuple[float, 
     field = np.exp(2j * np.pi * waves * cell.design.levels.heights_m()[level])
     asked = np.concatenate([cell.spots.waves_per_m, np.zeros((1, 2))])
     found: Float[np.ndarray, " m"] = efficiencies(field, np.ones(cell.grid.shape), cell.grid, asked)
-    return (*spot_light(found[:-1], cell.spots.shares), float(found[-1]))
+    light = spot_light(found[:-1], cell.spots.shares)
+    return light.efficiency, light.uniformity_error, float(found[-1])
 
 
 def _repeated(cell: _Cell, spec: Spec, level: UInt8[np.ndarray, "y x"], history: tuple[Any, ...]) -> Design:
-    """The design of a cell, of which nothing is too narrow at the rim either where the process has rules for two levels."""
+    """The design of a cell; of two levels, nothing is too narrow for the process at the rim either."""
     design, (ny, nx) = cell.design, cell.design.camera.grid.shape
     whole = np.tile(level, (-(-ny // level.shape[0]), -(-nx // level.shape[1])))[:ny, :nx]
     level_map = LevelMap(whole, design.levels, design.camera.grid, spec.doe.relief, spec.name)

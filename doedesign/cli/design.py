@@ -72,7 +72,7 @@ def refine(
     *,
     out: Path | None = None,
     terms: int | None = None,
-    steps: int = 60,
+    steps: int | None = None,
     overwrite: Flag = False,
     json_: AsJson = False,
 ) -> None:
@@ -85,7 +85,7 @@ def refine(
         out: Folder of the new run; runs/NAME_refined by default.
         terms: Orders of the rigorous solution; by default those that travel in the glass and somewhat more. Time grows
             with their third power.
-        steps: Gradients that are computed at most.
+        steps: Gradients that are computed; 60 by default, 300 of a row of cells.
         overwrite: Where the folder has another run, remove it and all that was made of it.
     """
     from doedesign.refinement import refine as work

@@ -5,8 +5,9 @@ From the cell that scalar light found:
 1. heights of all cells move freely between the levels, by the gradient (Adam), while slabs between levels are pressed
    to glass or air more and more; of two levels with a narrowest line or space, a smoothed outline moves;
 2. the better one of that cell, on levels, and of the one at the start has cells exchanged, those that promise most by
-   the gradient, as long as its score grows. Of two levels with a narrowest line or space, strokes of its brush are
-   exchanged (`fab.rules.strokes`), so that every cell on the way can be printed.
+   the gradient, as long as its score grows; then the best one with a few cells changed at random, for as many steps as
+   there are. Of two levels with a narrowest line or space, strokes of its brush are exchanged (`fab.rules.strokes`), so
+   that every cell on the way can be printed.
 
 What is scored is efficiency less `uniformity` times how unequal the spots are, by the smooth measure of `exchange`; the
 cell with the most efficiency less `uniformity` times the uniformity error is kept.
@@ -14,6 +15,8 @@ cell with the most efficiency less `uniformity` times the uniformity error is ke
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,9 +30,11 @@ from fab.rules.strokes import Strokes
 from sim.rigorous.slab_cell import SlabCell
 
 _SHARPNESS = (3.0, 16.0)  # of slabs, at the beginning of the first part and at its end
-_RATE = 0.1  # steps of a level per step, at first
+_FREE = 40  # steps of the first part at most
+_RATE = 0.05  # steps of a level per step, at first
 _MOST = 30  # exchanges at a time
-_TRIES, _ROW_TRIES = 8, 200  # exchanges that are tried one by one where several at a time do not help
+_TRIES, _ROW_TRIES = 12, 200  # exchanges that are tried one by one where several at a time do not help
+_SHAKEN = 12  # cells of which one is changed before exchanges begin anew
 _OFFERS = 400  # that are looked at
 
 
@@ -42,7 +47,8 @@ class RefinementState(NamedTuple):
         square: of the squares of those.
         cell: `[y, x]` levels from the lowest that are exchanged.
         best: those of the best cell so far.
-        numbers: score of `cell`, merit of `best`, exchanges at a time, and 1 where nothing more is found.
+        numbers: score of `cell`, none before exchanges begin; merit of `best`; exchanges at a time; and how often they
+            have begun anew.
         step: steps done.
     """
 
@@ -58,11 +64,6 @@ class RefinementState(NamedTuple):
     def arrays(self) -> list[np.ndarray]:
         """Arrays that a checkpoint keeps."""
         return list(self[:-1])
-
-    @property
-    def ended(self) -> bool:
-        """Whether nothing more is found."""
-        return bool(self.numbers[3])
 
 
 class _Offer(NamedTuple):
@@ -84,7 +85,8 @@ class RefinementTask:
         start: `[y, x]` levels from the lowest to begin with.
         count: number of levels.
         strokes: what the process prints of two levels; None where any cell will do.
-        steps: in all; two thirds of them of free heights.
+        steps: in all; at most two thirds of them, and 40, of free heights.
+        seed: of what is shaken.
     """
 
     solver: SlabCell
@@ -95,11 +97,12 @@ class RefinementTask:
     count: int
     strokes: Strokes | None
     steps: int
+    seed: int
 
     @property
     def free_steps(self) -> int:
         """Steps of free heights."""
-        return 2 * self.steps // 3
+        return min(2 * self.steps // 3, _FREE)
 
     @property
     def template(self) -> list[np.ndarray]:
@@ -121,14 +124,18 @@ class RefinementTask:
         return spot_light(self.ways @ orders[:, places_of(self.spots, number)], self.spots.shares)
 
     def initial_state(self) -> RefinementState:
+        """The cell to begin with."""
+        none, height = np.zeros(self.first.shape), self.first.astype(np.float64)
+        return RefinementState(height, none, none, self.first, self.first, np.array([np.nan, -np.inf, _MOST, 0.0]), 0)
+
+    @cached_property
+    def first(self) -> UInt8[np.ndarray, "y x"]:
         """The cell at the start, or the nearest one that can be printed."""
-        cell = self._printable(self.start - (self.count - 1) / 2, self.start)
-        none, height = np.zeros(cell.shape), cell.astype(np.float64)
-        return RefinementState(height, none, none, cell, cell, np.array([np.nan, -np.inf, _MOST, 0.0]), 0)
+        return self._printable(self.start - (self.count - 1) / 2, self.start)
 
     def run(self, state: RefinementState) -> Iterator[tuple[RefinementState, dict[str, Any]]]:
         """Do the remaining steps one by one; yields the state, and the line of the history."""
-        while state.step < self.steps and not state.ended:
+        while state.step < self.steps:
             step = state.step
             state, light = (self._free_step if step < self.free_steps else self._exchange_step)(state)
             terms = [float(part) for part in light]
@@ -162,26 +169,34 @@ class RefinementTask:
         return state, self.light(orders, self.solver.number)
 
     def _begin_exchange(self, state: RefinementState) -> RefinementState:
-        """The better one of the cell at the start and the free heights on levels."""
-        height = self._smoothed(state.height)
-        rounded = np.rint(height).clip(0, self.count - 1).astype(np.uint8)
-        cells = [state.cell, self._printable(height - (self.count - 1) / 2, rounded)]
-        found = [self._solved(cell) for cell in cells]
-        merits = [light.merit(self.uniformity) for _, light in found]
-        first, best = int(np.argmax([score for score, _ in found])), int(np.argmax(merits))
-        numbers = np.array([found[first][0], merits[best], _MOST, 0.0])
-        return state._replace(cell=cells[first], best=cells[best], numbers=numbers)
+        """Begin with the better one of the free heights on levels and the first cell, then with the best, shaken."""
+        begun, (merit, best) = state.numbers[3], (state.numbers[1], state.best)
+        if begun == 0:
+            height = self._smoothed(state.height)
+            rounded = np.rint(height).clip(0, self.count - 1).astype(np.uint8)
+            cells = [self._printable(height - (self.count - 1) / 2, rounded), self.first]
+        else:
+            rng = np.random.default_rng((self.seed, state.step))
+            offers = self._offers(best, rng.normal(size=(self.count - 1, *best.shape)))
+            cells = [self._changed(best, offers, max(2, best.size // _SHAKEN))]
+        found = [(*self._solved(cell), cell) for cell in cells]
+        for _, light, cell in found:
+            if light.merit(self.uniformity) > merit:
+                merit, best = light.merit(self.uniformity), cell
+        score, _, cell = max(found, key=lambda each: each[0])
+        return state._replace(cell=cell, best=best, numbers=np.array([score, merit, _MOST, begun + 1]))
 
     def _exchange_step(self, state: RefinementState) -> tuple[RefinementState, SpotLight]:
         if np.isnan(state.numbers[0]):
             state = self._begin_exchange(state)
-        score, merit, most, _ = state.numbers
+        score, merit, most, begun = state.numbers
         _, orders, change = self.solver.gradient(self.filled(state.cell), self._score)
         light = self.light(orders, self.solver.number)
         offers = self._offers(state.cell, change[::-1])
         sizes = list(dict.fromkeys(max(1, round(most / 3**part)) for part in range(4)))
         tried = [self._changed(state.cell, offers, size) for size in sizes]
-        tried += [self._changed(state.cell, offers[one:], 1) for one in range(1, min(self._tries, len(offers)))]
+        alone = (self._changed(state.cell, [offer], 1) for offer in offers)
+        tried += list(islice((cell for cell in alone if not np.array_equal(cell, state.cell)), 1, self._tries))
         for number, cell in enumerate(tried):
             if np.array_equal(cell, state.cell):
                 continue
@@ -191,16 +206,18 @@ class RefinementTask:
                 best = state.best
                 if own.merit(self.uniformity) > merit:
                     best, merit = cell, own.merit(self.uniformity)
-                numbers = np.array([found, merit, min(most, _MOST), 0.0])
+                numbers = np.array([found, merit, min(most, _MOST), begun])
                 return state._replace(cell=cell, best=best, numbers=numbers, step=state.step + 1), own
-        return state._replace(numbers=np.array([score, merit, most, 1.0]), step=state.step + 1), light
+        # Nothing is left here.
+        state = state._replace(cell=self.first, numbers=np.array([np.nan, merit, _MOST, begun]))
+        return state._replace(step=state.step + 1), light
 
     @property
     def _tries(self) -> int:
         return _ROW_TRIES if 1 in self.start.shape else _TRIES
 
     def _offers(self, cell: np.ndarray, change: np.ndarray) -> list[_Offer]:
-        """Changes by what they promise, the most first; `change`: of the score, by the glass of slabs from the lowest."""
+        """Changes by what they promise, the most first; `change`: of the score, by the glass of every slab, upward."""
         if self.strokes is not None:
             gains, offers = self._offered_strokes(cell, change[0], self.strokes)
         else:
@@ -213,7 +230,9 @@ class RefinementTask:
         least = -np.inf if 1 in cell.shape else 0.0
         return [offers[at] for at in order if gains[at] > least]
 
-    def _offered_strokes(self, cell: np.ndarray, change: np.ndarray, strokes: Strokes) -> tuple[np.ndarray, list[_Offer]]:
+    def _offered_strokes(
+        self, cell: np.ndarray, change: np.ndarray, strokes: Strokes
+    ) -> tuple[np.ndarray, list[_Offer]]:
         gains, offers, (ny, nx) = list[float](), list[_Offer](), cell.shape
         for glass in (True, False):
             gain = np.where((cell > 0) != glass, change if glass else -change, 0.0)

@@ -46,7 +46,9 @@ class Strokes(NamedTuple):
         Args:
             glass: whether a pixel is left as it is.
         """
-        whole = np.array_equal(glass, _painted(glass, self.space)) and np.array_equal(~glass, _painted(~glass, self.line))
+        whole = np.array_equal(glass, _painted(glass, self.space)) and np.array_equal(
+            ~glass, _painted(~glass, self.line)
+        )
         return whole and (self.corners or not _kissing(glass).any())
 
     def nearest(self, outline: Float[np.ndarray, "y x"]) -> Bool[np.ndarray, "y x"] | None:

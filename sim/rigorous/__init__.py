@@ -28,6 +28,7 @@ from sim.rigorous.edge_widths import edge_widths
 from sim.rigorous.mirrored import MirroredLayer
 from sim.rigorous.pieces import PieceComparison, compare_piece, thin_piece_amplitudes
 from sim.rigorous.rows import Orders, Slab, orders_of, row_slabs
+from sim.rigorous.slab_cell import SlabCell
 
 __all__ = [
     "CertifiedPiece",
@@ -40,6 +41,7 @@ __all__ = [
     "Row",
     "RowComparison",
     "Slab",
+    "SlabCell",
     "certify_pieces",
     "certify_rows",
     "compare_piece",

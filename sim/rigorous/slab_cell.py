@@ -1,9 +1,9 @@
 """A relief of square cells in slabs of given thickness that repeats: its orders, and how they change with every cell.
 
 Each slab of a cell is filled with glass, with air, or with a share of glass, which has the mean permittivity; so light
-changes smoothly from one level of a staircase to the next, and is exact where every slab is full or empty. fmmax (MIT; the
-extra `rigorous`) finds the modes and differentiates through them. Directions of walls are those of `crossed` and are
-taken as constant. A row of cells that is alike along y keeps orders along x alone.
+changes smoothly from one level of a staircase to the next, and is exact where every slab is full or empty. fmmax (MIT;
+the extra `rigorous`) finds the modes and differentiates through them. Directions of walls are those of `crossed` and
+are taken as constant. A row of cells that is alike along y keeps orders along x alone.
 """
 
 from collections.abc import Callable

@@ -28,7 +28,7 @@ def test_the_script_leaves_no_command_out(tmp_path: Path, monkeypatch: pytest.Mo
         (item / f"{name}.exr").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(every_command, "measure", lambda run, out: out / "measurement.toml")
-    assert len(NAMES) == 12
+    assert len(NAMES) == 13
     assert {command[0] for command in every_command.commands(QUICK, "quick")} == NAMES
     assert len(list((tmp_path / "pairs").iterdir())) == 3
 
