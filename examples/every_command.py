@@ -2,8 +2,9 @@
 
     python examples/every_command.py [FOLDER] [--spec examples/quick.toml]
 
-Results go to FOLDER (`every-command` by default), each command is printed before it runs, and all but the fine-tuning,
-which is cut short, take their defaults. Ten minutes on two cores; a second call resumes what was stopped.
+Refinement is shown on `examples/cell.toml`, which repeats. Results go to FOLDER (`every-command` by default), each
+command is printed before it runs, and all but refinement and fine-tuning, which are cut short, take their defaults. Ten
+minutes on two cores; a second call resumes what was stopped.
 """
 
 import argparse
@@ -32,6 +33,8 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
     run, order = Path("runs") / name, Path("masks") / name
     yield ["new"]
     yield ["optimize", str(spec)]
+    yield ["optimize", str(HERE / "cell.toml")]
+    yield ["refine", str(Path("runs") / "cell"), "--steps", "10"]
     yield ["masks", str(run)]
     yield ["verify", str(order)]
     yield ["psf", str(run)]

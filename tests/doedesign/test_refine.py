@@ -38,49 +38,16 @@ pytest.importorskip("fmmax")
 
 WAVE, GLASS, PERIOD = 633e-9, 1.457, 3.01 * 633e-9
 
-SPEC = """
-name = "fan"
-
-[optics]
-wavelengths = ["633 nm"]
-design_wavelength = "633 nm"
-
-[doe]
-samples = 48
-pitch = "300 nm"
-aperture = ["14.4 um", "14.4 um"]
-material = "fused_silica"
-
-[process]
-levels = 5
-level_step = "277 nm"
-
-[sensor]
-pixel_angle = "2 deg"
-
-[spots]
-count = [3, 1]
-period = "2.4 um"
-starts = 8
-
-[optimize]
-steps = 5
-"""
-
-
-def finished(folder: Path, *overrides: str) -> Path:
-    """Optimise the spec into a run."""
-    path = folder / "fan.toml"
-    path.write_text(SPEC)
-    optimize(path, folder / "run", overrides=overrides)
-    return folder / "run"
+SPEC = Path(__file__).parents[2] / "examples" / "cell.toml"
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         leave_out_pictures(patch, optimization)
-        yield finished(tmp_path_factory.mktemp("run"))
+        folder = tmp_path_factory.mktemp("run") / "run"
+        optimize(SPEC, folder, overrides=["spots.starts=8", "optimize.steps=5"])
+        yield folder
 
 
 @pytest.fixture(autouse=True)
@@ -167,11 +134,11 @@ def test_a_run_becomes_another_run(run: Path, tmp_path: Path):
     found = refine(run, tmp_path / "refined", terms=15, steps=12)
     assert (run / "manifest.json").read_bytes() == digest
     assert found.folder == tmp_path / "refined"
-    assert found.name == "fan_refined"
+    assert found.name == "cell_refined"
     assert {path.name for path in run.iterdir()} <= {path.name for path in (tmp_path / "refined").iterdir()}
     manifest = read_json(tmp_path / "refined" / "manifest.json")
     assert manifest["refined"] == {
-        "run": "fan", "level_map_sha256": before.level_map.digest, "terms": 15, "steps": 12,
+        "run": "cell", "level_map_sha256": before.level_map.digest, "terms": 15, "steps": 12,
         "polarisation": "unpolarised",
     }  # fmt: skip
     level = found.level_map.level
@@ -265,20 +232,19 @@ def test_too_large_a_cell_is_told_how_large_it_may_be(run: Path, tmp_path: Path,
 def test_a_binary_grid_from_its_spec_to_its_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Through the command; what is drawn obeys the process, and light gained by more terms than it was refined with."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "fan.toml").write_text(SPEC)
     narrow = 'process.minimum_line="500 nm"', 'process.minimum_space="500 nm"'
     two = "process.levels=2", "process.level_step=692 nm", "spots.count=[2, 2]", "doe.aperture=14.4 um"
     options = [word for change in (*two, *narrow) for word in ("--set", change)]
-    assert call("optimize", "fan.toml", *options)[0] == 0
-    code, out, err = call("refine", "runs/fan", "--terms", 60, "--steps", 24)
-    assert (code, out.strip()) == (0, str(Path("runs") / "fan_refined")), err
-    found = open_design("runs/fan_refined", False)
+    assert call("optimize", SPEC, *options)[0] == 0
+    code, out, err = call("refine", "runs/cell", "--terms", 60, "--steps", 24)
+    assert (code, out.strip()) == (0, str(Path("runs") / "cell_refined")), err
+    found = open_design("runs/cell_refined", False)
     assert check(found.level_map, Rules(500e-9, 500e-9)).clean
-    rows = json.loads(Path("runs/fan_refined/metrics.json").read_text())["refinement"]
+    rows = json.loads(Path("runs/cell_refined/metrics.json").read_text())["refinement"]
     merits = [row["efficiency"] - row["uniformity_error"] for row in rows]
     assert merits[5] > merits[2]
-    order = write_masks("runs/fan_refined")
+    order = write_masks("runs/cell_refined")
     assert verify(order.folder).passed
-    assert call("certify", "runs/fan_refined", "--pieces", "0", "--cells", "8")[0] == 0
+    assert call("certify", "runs/cell_refined", "--pieces", "0", "--cells", "8")[0] == 0
     assert isinstance(found, Design)
-    assert load_spec("runs/fan_refined/spec.toml").name == "fan_refined"
+    assert load_spec("runs/cell_refined/spec.toml").name == "cell_refined"
