@@ -236,11 +236,18 @@ def _named(spec: Spec, name: str) -> Spec:
 
 
 def _table(cell: _Cell, task: RefinementTask, level: UInt8[np.ndarray, "y x"]) -> list[_Row]:
-    """Light of the cell before and after, scalar and rigorous, the latter with more terms, too."""
+    """Light of the cell before and after, scalar and rigorous, the latter with more terms, too.
+
+    Where the process cannot print the cell before, that of the nearest one that it prints stands between them.
+    """
     judge, rows = cell.solver(round(_MORE * task.solver.terms)), list[_Row]()
-    for name, own in (("before", cell.level), ("refined", level)):
+    order, rank = ranks(cell.design.levels)
+    cells = {"before": cell.level, "printable": order[task.first], "refined": level}
+    for name, own in cells.items():
+        if name == "printable" and np.array_equal(own, cell.level):
+            continue
         rows.append(_Row(name, "scalar", 0, *_scalar_light(cell, own)))
-        filled = task.filled(ranks(cell.design.levels)[1][own])
+        filled = task.filled(rank[own])
         for solver in (task.solver, judge):
             orders = solver.transmitted(filled)
             light = task.light(orders, solver.number)

@@ -33,8 +33,8 @@ _SHARPNESS = (3.0, 16.0)  # of slabs, at the beginning of the first part and at 
 _FREE = 40  # steps of the first part at most
 _RATE = 0.05  # steps of a level per step, at first
 _MOST = 30  # exchanges at a time
-_TRIES, _ROW_TRIES = 12, 200  # exchanges that are tried one by one where several at a time do not help
-_SHAKEN = 12  # cells of which one is changed before exchanges begin anew
+_TRIES, _ROW_TRIES = 40, 200  # exchanges that are tried one by one where several at a time do not help
+_SHAKEN = 100  # cells of which one is changed, and two at least, before exchanges begin anew
 _OFFERS = 400  # that are looked at
 
 
