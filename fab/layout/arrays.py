@@ -31,12 +31,12 @@ def cell_name(doe: str) -> str:
 def period_of(level: NDArray[np.uint8]) -> tuple[int, int] | None:
     """Return the period ``(y, x)``, pixels, of the middle of a raster ``[y, x]``, half as long and wide as it is.
 
-    None where less than two periods lie in the middle.
+    None where less than two periods lie in the middle, or all of it is alike.
     """
     ny, nx = level.shape
     middle = level[ny // 4 : ny - ny // 4, nx // 4 : nx - nx // 4]
     along_y, along_x = _along_x(middle.T), _along_x(middle)
-    return None if along_y is None or along_x is None else (along_y, along_x)
+    return None if along_y is None or along_x is None or along_y == along_x == 1 else (along_y, along_x)
 
 
 def _along_x(level: NDArray[np.uint8]) -> int | None:

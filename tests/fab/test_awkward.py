@@ -86,11 +86,11 @@ def test_awkward_maps_make_orders_that_other_libraries_read_pixel_by_pixel(tmp_p
 
 
 def by_klayout(path, cell, layer, grid):
-    """Etched share of every pixel, by KLayout's rasteriser."""
+    """Etched share of every pixel, by KLayout's rasteriser; of copies of a cell, too."""
     layout = kdb.Layout()
     layout.read(str(path))
     found = layout.find_layer(layer, 0)
-    region = kdb.Region() if found is None else kdb.Region(layout.cell(cell).shapes(found))
+    region = kdb.Region() if found is None else kdb.Region(layout.cell(cell).begin_shapes_rec(found))
     (ny, nx), pitch = grid.shape, round(grid.pitch_m / NM)
     origin = kdb.Point(-nx * pitch // 2, -ny * pitch // 2)
     areas = region.rasterize(origin, kdb.Vector(pitch, pitch), kdb.Vector(pitch, pitch), nx, ny)
@@ -98,10 +98,10 @@ def by_klayout(path, cell, layer, grid):
 
 
 def by_gdstk(path, cell, layer, grid):
-    """Whether the middle of every pixel is etched, by gdstk's test of points."""
+    """Whether the middle of every pixel is etched, by gdstk's test of points; of copies of a cell, too."""
     library = gdstk.read_gds(str(path), unit=1e-6)
     found: Any = next(one for one in library.cells if one.name == cell)
-    polygons = [polygon for polygon in found.polygons if (polygon.layer, polygon.datatype) == (layer, 0)]
+    polygons = [polygon for polygon in found.get_polygons() if (polygon.layer, polygon.datatype) == (layer, 0)]
     x, y = np.meshgrid(grid.axis_m("x") / UM, grid.axis_m("y") / UM)
     points = list(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True))
     return np.array(gdstk.inside(points, polygons)).reshape(grid.shape)
