@@ -129,6 +129,7 @@ def test_without_relief_nothing_is_claimed(tmp_path: Path):
     assert any("Not determined by the images" in remark for remark in result.remarks)
 
 
+@pytest.mark.slow
 def test_what_only_adds_up_is_known_only_as_a_sum(tmp_path: Path):
     """Of one mask the common depth and its own cannot be told apart; their sum can."""
     design = plate_drawn(96, 2, window=48)

@@ -102,6 +102,7 @@ def test_the_models_camera_stands_as_the_benchs():
     assert np.linalg.norm(upright - light) > 0.1 * np.linalg.norm(light)
 
 
+@pytest.mark.slow
 def test_errors_are_found_with_a_camera_askew(tmp_path: Path):
     design, process = plate(48, 4)
     hidden = {"common_depth_scale": 0.02, "overlay_y_m[1]": 2 * STEP_M, "overlay_x_m[1]": -STEP_M}

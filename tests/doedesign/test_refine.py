@@ -128,6 +128,7 @@ def test_orders_are_found_by_their_numbers():
         places_of(spots, np.array([[0, 0]]))
 
 
+@pytest.mark.slow
 def test_a_run_becomes_another_run(run: Path, tmp_path: Path):
     before = open_design(run, False)
     digest = (run / "manifest.json").read_bytes()
@@ -162,6 +163,7 @@ def test_a_run_becomes_another_run(run: Path, tmp_path: Path):
         refine(run, tmp_path / "refined", terms=17, steps=12)
 
 
+@pytest.mark.slow
 def test_a_killed_refinement_is_resumed(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     whole = refine(run, tmp_path / "whole", terms=15, steps=6)
     save, saved = refinement.save_checkpoint, []

@@ -34,6 +34,7 @@ def test_a_thin_half_wave_grating_has_the_closed_form():
     assert score.orders[[1, 5], 3] == pytest.approx([0, 0], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_light_from_either_side_has_the_same_0th_order():
     """Reciprocity, against the solver of the certificate, which lights the glass from the air."""
     pytest.importorskip("fmmax")

@@ -202,6 +202,7 @@ def test_impossible_lenses_are_refused():
         plan_direct(replace(CAMERA, mapping="tangent"), WAVELENGTH_M)
 
 
+@pytest.mark.slow
 def test_a_turned_stretched_and_bent_sensor():
     """Value against the sum, and gradient in all coefficients against differences."""
     camera, (rows, columns) = replace(CAMERA, window=61), rows_of(CAMERA)

@@ -247,6 +247,7 @@ def test_random_plates_with_tilted_walls_are_those_of_a_raster():
             assert colour.change() > 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depths_m", [(NEAR_M,), (NEAR_M, np.inf)], ids=["one depth", "near and far"])
 def test_smooth_plates_before_a_near_source_are_those_of_a_raster(depths_m: tuple[float, ...]):
     """Measured 0.18 and 0.26 % in blue, where light to the window's corner is oblique by 0.6 waves per cell."""
