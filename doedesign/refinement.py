@@ -24,7 +24,7 @@ from doedesign.runs.folder import (
 from doedesign.runs.level_maps import open_design
 from doedesign.runtime.progress import meter
 from doedesign.spec import Spec, input_files
-from doedesign.spots.design import spots_from_spec, unit_cell
+from doedesign.spots.design import repeated, spots_from_spec, unit_cell
 from doedesign.spots.refinement import RefinementTask, places_of, ranks
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
@@ -103,8 +103,8 @@ def refine(
         overwrite: where the folder has another run, remove it with all that was made of it.
 
     Raises:
-        InputError: fmmax is missing, a run that cannot be read or has no unit cell, several wavelengths, tilted light,
-            a cell that is too large, or a folder that belongs to something else.
+        InputError: fmmax is missing, a run that cannot be read or has no unit cell, given phases, several wavelengths,
+            tilted light, a cell that is too large, or a folder that belongs to something else.
     """
     require_fmmax()
     run = source if isinstance(source, Run) else open_run(Path(source))
@@ -170,6 +170,9 @@ def _cell_of(design: Design) -> _Cell:
     if spec is None or spec.spots is None or spec.spots.period_m is None:
         rule, cure = "only the unit cell of a grid of orders can be refined", "Give a run whose spots have a period."
         raise InputError(design.name, rule, "a run without one", cure)
+    if spec.spots.phases_rad:
+        rule, cure = "orders are refined for their light alone", "Leave out spots.phases."
+        raise InputError(design.name, rule, "phases that are given", cure)
     wavelengths = sorted({line.wavelength_m for line in camera.lines})
     if len(wavelengths) > 1:
         got = ", ".join(map(format_length, wavelengths))
@@ -268,9 +271,10 @@ def _scalar_light(cell: _Cell, level: UInt8[np.ndarray, "y x"]) -> tuple[float, 
 
 def _repeated(cell: _Cell, spec: Spec, level: UInt8[np.ndarray, "y x"], history: tuple[Any, ...]) -> Design:
     """The design of a cell; of two levels, nothing is too narrow for the process at the rim either."""
-    design, (ny, nx) = cell.design, cell.design.camera.grid.shape
-    whole = np.tile(level, (-(-ny // level.shape[0]), -(-nx // level.shape[1])))[:ny, :nx]
-    level_map = LevelMap(whole, design.levels, design.camera.grid, spec.doe.relief, spec.name)
+    design = cell.design
+    level_map = LevelMap(
+        repeated(level, design.camera.grid), design.levels, design.camera.grid, spec.doe.relief, spec.name
+    )
     process = design.process()
     if design.levels.count == 2 and not check(level_map, process).clean:
         mended = repair(level_map, process, float(design.camera.waves_per_metre(cell.wavelength_m)))

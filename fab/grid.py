@@ -1,8 +1,8 @@
-"""Grid: the pixel raster of a plate, and where its centre is."""
+"""Grid: the pixel raster of a plate, where its centre is, and its edges moved both ways."""
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,23 @@ from fab.errors import InputError
 
 # One part in so many keeps points that are exactly on a rim inside it.
 SLACK = 1e-12
+
+
+def moved_edges(edges: NDArray[Any], move: Any) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the raster of one axis' edges moved both ways, and which cells lie within the move of each of its own.
+
+    Args:
+        edges: edges of cells along an axis, rising.
+        move: how far, in their unit.
+
+    Returns:
+        The lines of the raster, rising, and the first and end cell for every part between two of them.
+    """
+    moved = np.unique(np.concatenate([edges - move, edges + move]))
+    # A cell reaches a part if it begins before the part ends, less the move, and ends after it begins.
+    first = np.searchsorted(edges[1:] + move, moved[:-1], side="right")
+    end = np.searchsorted(edges[:-1] - move, moved[1:], side="left")
+    return moved, first, end
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 from doedesign.areas.problem import AreaScore, lattice_factors, mode_fields
 from doedesign.areas.target import FLAT, OUTER, AreaTarget, camera_for, colour_number, in_plane
 from doedesign.design.design import Design
+from doedesign.design.given_wave import WaveShare
 from doedesign.spec import input_files
 from fab.units import MICROMETRES, MILLIMETRES, PlaceUnit, format_length
 from sim.camera import Camera
@@ -108,10 +109,8 @@ class AreaTable:
         fresnel: share of the light that passes both faces of the substrate, which none of these numbers has.
         along_x: profile along x; None for a picture.
         along_y: profile along y; None for a picture.
-        in_wave: share of the incident light in the wave of the given phase; None where it is free.
-        phase_rmse: root mean square of the phase less the given one where light should be flat, radians, weighted by
-            the light wanted, after the best common phase; None where it is free.
-        wave_ceiling: the largest `in_wave` of a DOE of any phase: all of it in step (triangle inequality).
+        wave: how much light is in the wave of the phase that is given, which is looked at where light should be flat,
+            weighted by the light wanted; None where it is free.
     """
 
     target: AreaTarget
@@ -125,9 +124,7 @@ class AreaTable:
     fresnel: float
     along_x: Profile | None
     along_y: Profile | None
-    in_wave: float | None = None
-    phase_rmse: float | None = None
-    wave_ceiling: float | None = None
+    wave: WaveShare | None = None
 
     @property
     def name(self) -> str:
@@ -146,8 +143,7 @@ class AreaTable:
         profiles, unit = (("x", self.along_x), ("y", self.along_y)), "rad" if self.camera.in_angles else "m"
         sizes = {f"size_{name}_{unit}": p and p.size_m for name, p in profiles}
         edges = {f"edge_{name}_{unit}": p and p.edge_m for name, p in profiles}
-        given = {"in_wave": self.in_wave, "in_wave_ceiling": self.wave_ceiling, "phase_rmse_rad": self.phase_rmse}
-        return (given if self.in_wave is not None else {}) | {
+        return (self.wave.summary() if self.wave else {}) | {
             "efficiency": self.efficiency,
             "contrast": self.contrast,
             "pixel_contrast": self.pixel_contrast,
@@ -172,19 +168,13 @@ class AreaTable:
             found = [(p, p.size_m) for p in (self.along_x, self.along_y)]
             wide = ["?" if w is None else f"{p.in_unit(w, MICROMETRES):.5g}" for p, w in found]
             size = f", {wide[0]} x {wide[1]} {self.camera.told_in(MICROMETRES).suffix} at half the light"
+        wave = f", {self.wave}" if self.wave else ""
         pixels = "" if self.pixel_contrast is None else f" ({100 * self.pixel_contrast:.2f} % on pixels)"
         return (
             f"{self.target.shape}: {100 * self.efficiency:.2f} % of the light (ceiling: none known), contrast "
-            f"{100 * self.contrast:.2f} %{pixels}{size}{self.describe_wave()}, "
+            f"{100 * self.contrast:.2f} %{pixels}{size}{wave}, "
             f"0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of {100 * (1 - self.fresnel):.1f} % apart"
         )
-
-    def describe_wave(self) -> str:
-        """How much light is in the wave of the given phase, and how far that is off; nothing where it is free."""
-        if self.phase_rmse is None or self.in_wave is None or self.wave_ceiling is None:
-            return ""
-        share = f"{100 * self.in_wave:.2f} % (ceiling: {100 * self.wave_ceiling:.2f} %)"
-        return f", {share} in the wave of the given phase, which is off by {np.degrees(self.phase_rmse):.2g} deg"
 
     def to_csv(self) -> str:
         """Both profiles: axis, place in millimetres or degrees, light and light wanted."""
@@ -293,7 +283,7 @@ def area_table(doe: CellOptic, target: AreaTarget, colour: int = 0) -> AreaTable
         camera.transmission(camera.lines[0].wavelength_m),
         None if picture else _profile(over, target, camera, 1),
         None if picture else _profile(over, target, camera, 0),
-        *((None, None, None) if wave is None else _in_wave(doe, target, wave, fields[0], camera, colour)),
+        None if wave is None else _in_wave(doe, target, wave, fields[0], camera, colour),
     )
 
 
@@ -323,14 +313,14 @@ def _in_wave(
     field: Complex[np.ndarray, "v u"],
     camera: Camera,
     colour: int,
-) -> tuple[float, float, float]:
-    """Share of the light in a wave, root mean square of the phase over that of the wave, and the largest such share."""
+) -> WaveShare:
+    """Light in a wave, of one mode."""
     over, weight = (field * wave.conj())[target.flat], np.abs(wave[target.flat]) ** 2
     off = np.angle(over * over.sum().conj())
     rows, columns = lattice_factors(target, camera)
     in_step = np.sum(np.abs(rows.conj().T @ wave @ columns.conj()) * np.abs(mode_fields(doe, colour)[0]))
     rmse = np.sqrt(np.sum(weight * off**2) / weight.sum())
-    return float(np.abs(np.vdot(wave, field)) ** 2), float(rmse), float(in_step**2)
+    return WaveShare(float(np.abs(np.vdot(wave, field)) ** 2), float(in_step**2), float(rmse))
 
 
 def _places(target: AreaTarget, camera: Camera, axis: int) -> Float[np.ndarray, " n"]:

@@ -18,7 +18,8 @@ are reported together. `spec_warnings` returns what is allowed but probably not 
     order       the table of what a mask shop is asked for
     training    the tables of the network and its training
     variation   files of their own: a process, the errors of one DOE
-    checks      rules that join several tables, and warnings; process_checks those of the process
+    checks      rules that join several tables; process_checks those of the process
+    doubts      warnings of what is allowed but probably not meant
     errors      mistakes in words a user can act on
     text        a spec as TOML and as JSON
 """
@@ -29,7 +30,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from doedesign.spec.checks import find_problems, spec_warnings
+from doedesign.spec.checks import find_problems
+from doedesign.spec.doubts import spec_warnings
 from doedesign.spec.errors import SpecError, Table, key_as_written, spec_error, validated
 from doedesign.spec.left_out import with_left_out
 from doedesign.spec.models import Spec

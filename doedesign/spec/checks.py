@@ -1,6 +1,6 @@
-"""Rules that join several values of a spec, so that the optics are possible, and warnings of what is doubtful.
+"""Rules that join several values of a spec, so that the optics are possible.
 
-A broken rule is an `InputError` whose `where` is the key; a warning is a sentence. Neither changes the spec.
+A broken rule is an `InputError` whose `where` is the key.
 """
 
 import math
@@ -17,13 +17,9 @@ from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
 from doedesign.spec.values.table import toml_key
 from fab.aperture import MaskAperture
 from fab.errors import InputError
-from fab.units import DEGREES, MICROMETRES, NM, format_length
-from sim.camera import check_lens, image_place
-from sim.material import full_wave_height_m, full_wave_wavelength_m, refractive_index
-
-_WAVE_TOLERANCE = 0.02
-_FINEST = 16  # pixels per wavelength / aperture
-
+from fab.units import MICROMETRES, format_length
+from sim.camera import check_lens
+from sim.material import refractive_index
 
 # Keys of a beam of each kind: those that it needs, and those that it may have besides.
 _BEAM_KEYS = {
@@ -32,7 +28,6 @@ _BEAM_KEYS = {
     "plane": ((), ()),
     "point": (("distance_m",), ()),
 }
-_DEPTHS_OF = {"ring_to_disc": "near depth", "far_spot": "far depth"}  # all others exist at every depth
 
 
 def find_problems(spec: Spec) -> list[InputError]:
@@ -129,11 +124,12 @@ def _directions(spec: Spec) -> Iterator[InputError]:
             yield InputError(key, rule, "also sensor.pixel_angle", "Leave one of them out.")
     if sensor.window_m > 2:
         most = int(2 / sensor.pixel_m)
-        got = f"{sensor.window} pixels of {_pixel_text(spec)}, a sine of {sensor.window_m / 2:.4g} at their edge"
+        got = f"{sensor.window} pixels of {pixel_text(spec)}, a sine of {sensor.window_m / 2:.4g} at their edge"
         yield InputError("sensor.window", "directions end at 90 deg, a sine of 1", got, f"Set window = {most} or less.")
 
 
-def _pixel_text(spec: Spec) -> str:
+def pixel_text(spec: Spec) -> str:
+    """Write the size of a pixel, in micrometres or degrees."""
     return f"{float(spec.told_in(MICROMETRES).of(spec.sensor.pixel_m)):.4g} {spec.told_in(MICROMETRES).suffix}"
 
 
@@ -188,22 +184,23 @@ def _scene(spec: Spec) -> Iterator[InputError]:
     # Neighbouring cells must see a source less than half a wave apart: the bound of eq. 6 for the depth.
     for key, depths in (("scene.near", near), ("scene.far", far)):
         if depths and min(depths) < least_m:
-            rule = f"every depth must be at least samples x pitch^2 / wavelength = {_rounded(least_m)}, "
+            rule = f"every depth must be at least samples x pitch^2 / wavelength = {rounded(least_m)}, "
             rule += "or the cells cannot follow the wave of the source"
             cure = "Move the source away or choose a finer pitch for the same aperture."
             yield InputError(key, rule, format_length(min(depths)), cure)
 
 
-def _shortest_m(spec: Spec) -> float:
+def shortest_m(spec: Spec) -> float:
+    """Return the shortest wavelength, metres."""
     return min(wavelength_m for colour in spec.optics.colours for wavelength_m in colour.wavelengths_m)
 
 
 def _nyquist_length_m(spec: Spec) -> float:
     """Radius of the strongest wavefront curvature the cells can sample (paper eq. 6), at the shortest wavelength."""
-    return max(spec.doe.shape) * spec.doe.pitch_m**2 / _shortest_m(spec)
+    return max(spec.doe.shape) * spec.doe.pitch_m**2 / shortest_m(spec)
 
 
-def _rounded(length_m: float) -> str:
+def rounded(length_m: float) -> str:
     """Write a derived length with four digits."""
     return format_length(float(f"{length_m:.4g}"))
 
@@ -234,7 +231,7 @@ def _illumination(spec: Spec) -> Iterator[InputError]:
         yield InputError("illumination.picture", rule, got, "Save the picture as one of these.")
     least_m = _nyquist_length_m(spec)
     if beam.distance_m is not None and beam.distance_m < least_m:
-        rule = f"must be at least samples x pitch^2 / wavelength = {_rounded(least_m)}, "
+        rule = f"must be at least samples x pitch^2 / wavelength = {rounded(least_m)}, "
         rule += "or the cells cannot follow the wave of the point"
         cure = "Move the point away or choose a finer pitch for the same aperture."
         yield InputError("illumination.distance", rule, format_length(beam.distance_m), cure)
@@ -250,7 +247,7 @@ def _illumination(spec: Spec) -> Iterator[InputError]:
 
 
 def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
-    wavelength_m, focal_m, needed_m = _shortest_m(spec), spec.optics.focal_length_m, _nyquist_length_m(spec)
+    wavelength_m, focal_m, needed_m = shortest_m(spec), spec.optics.focal_length_m, _nyquist_length_m(spec)
     if spec.optics.propagation != "fresnel" or focal_m is None or needed_m <= focal_m:
         return
     span_m = max(spec.doe.shape) * spec.doe.pitch_m
@@ -259,9 +256,9 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
     yield InputError(
         "optics.propagation",
         '"fresnel" needs samples x pitch^2 / wavelength <= focal_length at every wavelength (eq. 6)',
-        f"{_rounded(needed_m)} > {format_length(focal_m)} at {format_length(wavelength_m)}",
-        f"For this aperture the pitch may be at most {_rounded(wavelength_m * focal_m / span_m)} "
-        f'(samples = {samples}, pitch = "{_rounded(span_m / samples)}"); or set propagation = "far_field".',
+        f"{rounded(needed_m)} > {format_length(focal_m)} at {format_length(wavelength_m)}",
+        f"For this aperture the pitch may be at most {rounded(wavelength_m * focal_m / span_m)} "
+        f'(samples = {samples}, pitch = "{rounded(span_m / samples)}"); or set propagation = "far_field".',
     )
 
 
@@ -310,7 +307,7 @@ def _process(spec: Spec) -> Iterator[InputError]:
     if reach_m > radius_m:
         rule = f"the DOE must lie on the wafer of radius {format_length(radius_m)}"
         cure = "Move the die inward or choose a larger process.wafer_radius."
-        yield InputError("process.die", rule, f"a DOE that reaches {_rounded(reach_m)} from its middle", cure)
+        yield InputError("process.die", rule, f"a DOE that reaches {rounded(reach_m)} from its middle", cure)
 
 
 def _limits(spec: Spec) -> Iterator[InputError]:
@@ -327,129 +324,3 @@ def _training(spec: Spec) -> Iterator[InputError]:
         rule = 'scenes off the axis need optics.mapping = "sine" without distortion, for all steps share one plan'
         cure = 'Set field = "off", or leave mapping and distortion out while training.'
         yield InputError("train.field", rule, '"random"', cure)
-
-
-def spec_warnings(spec: Spec) -> list[str]:
-    """Return what is allowed in a valid spec but probably not meant, one sentence or two each."""
-    rules = (_level_warning, _printing_warning, _window_warnings, _pixel_warning, _occlusion_warning, _limit_warnings)
-    rules = (*rules, _mask_warning)
-    return [warning for rule in rules for warning in rule(spec)]
-
-
-def _mask_warning(spec: Spec) -> Iterator[str]:
-    """Warn of parts of a mask that are too narrow for the overlap of the chrome."""
-    relief, overlap = spec.doe.relief, spec.process.chrome_overlap_m
-    if isinstance(relief, MaskAperture) and (closed := relief.parts_closed(overlap))[1]:
-        yield (
-            f"doe.aperture: the chrome, which reaches {format_length(overlap)} over every edge, closes {closed[1]} of "
-            f"the {closed[0]} parts of the mask. A smaller process.chrome_overlap leaves them open."
-        )
-
-
-def _level_warning(spec: Spec) -> Iterator[str]:
-    process, material = spec.process, spec.doe.material
-    height_m = process.levels * process.level_step_m
-    wave_m = full_wave_height_m(material, spec.optics.design_wavelength_m)
-    waves = height_m / wave_m
-    whole = max(1, round(waves))  # a relief of several waves parts colours
-    if abs(waves / whole - 1) <= _WAVE_TOLERANCE:
-        return
-    try:
-        exact = f"of {material} is one wave at {full_wave_wavelength_m(material, height_m) / NM:.0f} nm"
-    except InputError:
-        exact = f"is one wave at no wavelength {material} is known for"
-    yield (
-        f"process.level_step: {process.levels} x {format_length(process.level_step_m)} = {_rounded(height_m)} {exact}; "
-        f"at the design wavelength of {format_length(spec.optics.design_wavelength_m)} it is "
-        f"{waves:.4f} waves, {100 * (waves / whole - 1):+.1f} % off, so the top of the staircase does not meet its "
-        f'foot. A level_step of "{whole * wave_m / process.levels / NM:.2f} nm" would.'
-    )
-
-
-def _image_share(spec: Spec, sine: float) -> float:
-    """Where light with a direction sine lands, focal lengths from the axis."""
-    optics = spec.optics
-    if optics.mapping == "tangent" and sine >= 1:
-        return math.inf
-    return image_place(optics.mapping, optics.distortion, 0.0, sine)[1]
-
-
-def _window_warnings(spec: Spec) -> Iterator[str]:
-    sensor, focal_m, pitch_m = spec.sensor, spec.optics.focal_length_m or spec.image_distance_m, spec.doe.pitch_m
-    binned = min(sensor.resolution or (math.inf,)) // sensor.binning
-    if sensor.window > binned:
-        yield (
-            f"sensor.window: {sensor.window} pixels are more than the {binned} binned pixels of the sensor's shorter "
-            "side; PSFs will reach beyond the sensor."
-        )
-    # Cells steer light about the direction in which it arrives.
-    moved_m = focal_m * max(map(abs, spec.moved_sines))
-    wavelength_m, half_m = _shortest_m(spec), sensor.window_m / 2 + moved_m
-    reach_m, unit = focal_m * _image_share(spec, wavelength_m / (2 * pitch_m)), spec.told_in(MICROMETRES)
-    if half_m > reach_m:
-        axis = "where light arrives" if moved_m else "the axis"
-        most = int(2 * max(reach_m - moved_m, 0.0) / sensor.pixel_m)
-        ends, reaches = (
-            f"{unit.of(at):{'.4g' if unit.in_degrees else '.0f'}} {unit.suffix}" for at in (half_m, reach_m)
-        )
-        yield (
-            f"sensor.window: it ends {ends} from {axis}, but cells of {format_length(pitch_m)} steer "
-            f"{format_length(wavelength_m)} only {reaches} far; "
-            f"beyond that the PSF repeats. At most {most} pixels avoid it."
-        )
-    depth_m = min(spec.scene.near_m, default=math.inf)
-    disc_m = spec.doe.relief.widest_m * focal_m / depth_m
-    if disc_m > sensor.window_m:
-        yield (
-            f"sensor.window: the blur disc of a point at {format_length(depth_m)} is {_rounded(disc_m)} wide, "
-            f"more than the window's {_rounded(sensor.window_m)}; its rim is cut off."
-        )
-
-
-def _pixel_warning(spec: Spec) -> Iterator[str]:
-    """Warn of directions told apart far more finely than diffraction by the aperture lets them differ."""
-    detail = _shortest_m(spec) / spec.doe.relief.widest_m
-    if spec.sensor.in_angles and spec.sensor.pixel_m < detail / _FINEST:
-        yield (
-            f"sensor.pixel_angle: pixels of {_pixel_text(spec)} are more than {_FINEST} times finer than what an "
-            f"aperture of {spec.doe.relief} can show, {DEGREES.of(detail):.4g} deg at "
-            f'{format_length(_shortest_m(spec))}; "{DEGREES.of(detail / 4):.2g} deg" is enough.'
-        )
-
-
-def _occlusion_warning(spec: Spec) -> Iterator[str]:
-    """Warn of an obstruction whose effect on light is not said: no command that takes pictures goes on without it."""
-    if (spec.obstruction or spec.scene.near_m) and spec.scene.occlusion is None:
-        yield (
-            "scene.occlusion: not named, so `simulate` and `train` will ask for it: how the obstruction takes light "
-            'from what is behind it has no default. Add occlusion = "reciprocal", the nearest to wave optics for '
-            'plates of every kind, "radiometric", or "paper" for eq. 10.'
-        )
-
-
-def _printing_warning(spec: Spec) -> Iterator[str]:
-    """Warn of cells finer than what the lithography prints: bit 0 may have lines of a single cell."""
-    process, pitch_m = spec.process.filled(), spec.doe.pitch_m
-    for key, smallest_m, what in (
-        ("minimum_line", process.minimum_line_m, "lines"),
-        ("minimum_space", process.minimum_space_m, "gaps"),
-    ):
-        if smallest_m and pitch_m < smallest_m * (1 - 1e-9):
-            yield (
-                f"process.{key}: cells of {format_length(pitch_m)} are finer than the {what} of "
-                f"{format_length(smallest_m)} that the process prints, so single cells of the finest mask (bit 0) are "
-                "lost. Choose a coarser pitch, a finer process, or accept that they will not be there."
-            )
-
-
-def _limit_warnings(spec: Spec) -> Iterator[str]:
-    """Warn of limits that every plate obeys, for there is nothing at the depths of the scene that they apply to."""
-    near, far = spec.scene.near_m, spec.scene.far_m
-    for index, limit in enumerate(spec.limits):
-        where, depths = _DEPTHS_OF.get(limit.quantity, "depth"), (*near, *far)
-        if limit.quantity in _DEPTHS_OF:
-            depths = near if where == "near depth" else far
-        at = "" if limit.depth_m is None else f" at {format_length(limit.depth_m)}"
-        if limit.depth_m not in (None, *depths) or not depths:
-            listed = ", ".join(format_length(depth_m) for depth_m in depths) or "none"
-            yield f"limit[{index}]: {limit.quantity}{at} limits nothing; the scene's {where}s are: {listed}."

@@ -147,8 +147,7 @@ class SpotTask:
         level = self.problem.level(state.best)
         if self.periodic:
             level = self._exchanged(level)
-            ny, nx = self.camera.grid.shape
-            level = np.tile(level, (-(-ny // level.shape[0]), -(-nx // level.shape[1])))[:ny, :nx]
+            level = repeated(level, self.camera.grid)
         spec, far_m = self.spec, self.spec.scene.far_m
         level_map = LevelMap(level, self.levels, self.camera.grid, spec.doe.relief, spec.name)
         return Design(level_map, self.camera, (), far_m, spec=spec, history=tuple(history))
@@ -211,6 +210,12 @@ def unit_cell(table: SpotsSpec, camera: Camera) -> Grid:
     count = round(table.period_m / camera.grid.pitch_m)
     ny, nx = (count if spots > 1 else 1 for spots in reversed(table.count))
     return Grid((ny, nx), camera.grid.pitch_m)
+
+
+def repeated(level: UInt8[np.ndarray, "v u"], grid: Grid) -> UInt8[np.ndarray, "y x"]:
+    """Repeat a unit cell over the cells of a grid, from its first one on."""
+    (height, width), (ny, nx) = level.shape, grid.shape
+    return np.tile(level, (-(-ny // height), -(-nx // width)))[:ny, :nx]
 
 
 def spots_from_spec(table: SpotsSpec, camera: Camera) -> Spots:

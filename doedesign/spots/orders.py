@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Complex, Float
 
+from doedesign.design.given_wave import WaveShare
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
 from fab.aperture import RoundAperture
@@ -82,8 +83,7 @@ class OrderTable:
         light: "scalar" or "edges", as the DOE was looked at.
         unit: in which places are told.
         phase_errors: `[spot]` phases less those that are given, radians, after the best common one; None where free.
-        in_wave: share of the light in the wave of the given phases; None where they are free.
-        wave_ceiling: the largest `in_wave` of a DOE of any phase: all of it in step (triangle inequality).
+        wave: how much light is in the wave of the phases that are given; None where they are free.
     """
 
     spots: Spots
@@ -96,8 +96,7 @@ class OrderTable:
     light: str = "scalar"
     unit: PlaceUnit = MILLIMETRES
     phase_errors: Float[np.ndarray, " m"] | None = None
-    in_wave: float | None = None
-    wave_ceiling: float | None = None
+    wave: WaveShare | None = None
 
     @property
     def total(self) -> float:
@@ -124,15 +123,9 @@ class OrderTable:
         """Name of its files and of its entry among metrics."""
         return "orders"
 
-    @property
-    def phase_rmse(self) -> float | None:
-        """Root mean square of the phase errors, radians; None where phases are free."""
-        return None if self.phase_errors is None else float(np.sqrt(np.mean(self.phase_errors**2)))
-
     def summary(self) -> dict[str, Any]:
         """All numbers, for metrics."""
-        given = {"in_wave": self.in_wave, "in_wave_ceiling": self.wave_ceiling, "phase_rmse_rad": self.phase_rmse}
-        return (given if self.in_wave is not None else {}) | {
+        return (self.wave.summary() if self.wave else {}) | {
             "efficiency": self.total,
             "uniformity_error": self.uniformity_error,
             "rmse": self.rmse,
@@ -153,15 +146,10 @@ class OrderTable:
     def describe(self) -> str:
         """One line."""
         bound = "none known" if self.ceiling.efficiency is None else f"{100 * self.ceiling.efficiency:.1f} %"
-        phases = ""
-        if self.phase_rmse is not None and self.in_wave is not None and self.wave_ceiling is not None:
-            share = f"{100 * self.in_wave:.2f} % (ceiling: {100 * self.wave_ceiling:.2f} %)"
-            phases = (
-                f", {share} in the wave of the given phases, which are off by {np.degrees(self.phase_rmse):.2g} deg"
-            )
+        wave = f", {self.wave}" if self.wave else ""
         return (
             f"{self.spots.count} spots: {100 * self.total:.2f} % of the light (ceiling: {bound}), uniformity error "
-            f"{100 * self.uniformity_error:.2f} %{phases}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
+            f"{100 * self.uniformity_error:.2f} %{wave}, 0th order {100 * self.zeroth_order:.3f} %; Fresnel loss of "
             f"{100 * (1 - self.fresnel):.1f} % apart"
         )
 
@@ -227,6 +215,7 @@ def order_table(
     asked = [spots.waves_per_m, np.zeros((1, 2)), *([stray] if len(stray := _stray(spots)) else [])]
     light = peak_amplitudes(field, coverage, grid, np.concatenate(asked))
     found, own_light, given = np.abs(light) ** 2, light[: spots.count], spots.about(middle_m)
+    errors, wave = (None, None) if given.phases is None else _in_wave(given, own_light, coverage, grid)
     own, zeroth, rest = np.split(found, [spots.count, spots.count + 1])
     equal = bool(np.ptp(spots.shares) < 1e-9)
     return OrderTable(
@@ -239,17 +228,19 @@ def order_table(
         ceiling_of(count, levels, equal=equal) if levels else Ceiling(None, "none known"),
         camera.light,
         camera.told_in(MILLIMETRES),
-        *((None, None, None) if given.phases is None else _in_wave(given, own_light, coverage, grid)),
+        errors,
+        wave,
     )
 
 
 def _in_wave(
     spots: Spots, light: Complex[np.ndarray, " m"], coverage: Float[np.ndarray, "y x"], grid: Grid
-) -> tuple[Float[np.ndarray, " m"], float, float]:
-    """Phase errors of spots of given phases, the share of the light in their wave, and the largest such share."""
+) -> tuple[Float[np.ndarray, " m"], WaveShare]:
+    """Phase errors of spots of given phases, and how much light is in their wave."""
     wave = DirectionSum(grid, spots.waves_per_m).superposition(spots.wave)
     in_step = np.sum(np.abs(wave) * coverage, dtype=np.float64) / np.sum(coverage, dtype=np.float64)
-    return spots.phase_errors(light), spots.in_wave(light), float(in_step**2)
+    errors = spots.phase_errors(light)
+    return errors, WaveShare(spots.in_wave(light), float(in_step**2), float(np.sqrt(np.mean(errors**2))))
 
 
 def _whole_periods(

@@ -19,7 +19,10 @@ from functools import cached_property
 from itertools import islice
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Bool, Float, Int, UInt8
 
 from doedesign.spots.exchange import FLAT
@@ -31,6 +34,7 @@ from sim.rigorous.slab_cell import SlabCell
 
 _SHARPNESS = (3.0, 16.0)  # of slabs, at the beginning of the first part and at its end
 _FREE = 40  # steps of the first part at most
+_ADAM = optax.scale_by_adam(0.8, 0.95, 1e-12)
 _RATE = 0.05  # steps of a level per step, at first
 _MOST = 30  # exchanges at a time
 _TRIES, _ROW_TRIES = 40, 200  # exchanges that are tried one by one where several at a time do not help
@@ -161,11 +165,12 @@ class RefinementTask:
         bent = np.tanh(sharpness * (height - below - 0.5))
         _, orders, change = self.solver.gradient((1 + bent) / 2, self._score)
         slope = self._smoothed((change * sharpness * (1 - bent**2) / 2).sum(0))
-        mean, square = 0.8 * state.mean + 0.2 * slope, 0.95 * state.square + 0.05 * slope**2
-        count = state.step + 1
-        move = mean / (1 - 0.8**count) / (np.sqrt(square / (1 - 0.95**count)) + 1e-12)
+        with jax.enable_x64(True):
+            moments: Any = optax.ScaleByAdamState(jnp.asarray(state.step), state.mean, state.square)
+            found, moments = _ADAM.update(slope, moments)
+        move, mean, square = map(np.asarray, (found, moments.mu, moments.nu))
         moved = (state.height + _RATE * (1 - 0.7 * done) * move).clip(-0.3, self.count - 0.7)
-        state = state._replace(height=moved, mean=mean, square=square, step=count)
+        state = state._replace(height=moved, mean=mean, square=square, step=state.step + 1)
         return state, self.light(orders, self.solver.number)
 
     def _begin_exchange(self, state: RefinementState) -> RefinementState:

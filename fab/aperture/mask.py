@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fab.aperture.loops import loops_around
 from fab.aperture.outline import Aperture
 from fab.errors import InputError
-from fab.grid import SLACK, Grid
+from fab.grid import SLACK, Grid, moved_edges
 from fab.units import format_length
 
 _MOST_SIDE = 20_000
@@ -248,7 +248,9 @@ def _moved(plane: NDArray[np.bool_], y: NDArray[Any], x: NDArray[Any], inset: An
     """Move the rim of the open cells of a plane inward, by its cell edges in the unit of the inset."""
     if not inset:
         return _cropped(y, x, plane)
-    (rows, low, high), (columns, left, right) = (_within(edges, inset) for edges in (y, x))
+    # Closed cells lie around the plane, wider than the inset.
+    around = (np.concatenate([edges[:1] - 3 * inset, edges, edges[-1:] + 3 * inset]) for edges in (y, x))
+    (rows, low, high), (columns, left, right) = (moved_edges(edges, inset) for edges in around)
     # Number of closed cells below and left of every corner; a ring of them lies around the plane.
     closed = np.pad(~np.pad(plane, 1), ((1, 0), (1, 0))).astype(np.int32)
     np.cumsum(closed, axis=0, out=closed)
@@ -256,18 +258,6 @@ def _moved(plane: NDArray[np.bool_], y: NDArray[Any], x: NDArray[Any], inset: An
     above, below = closed[high], closed[low]
     none = above[:, right] - above[:, left] == below[:, right] - below[:, left]
     return _cropped(rows, columns, none)
-
-
-def _within(edges: NDArray[Any], inset: Any) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the edges of an axis moved both ways, and the first and end cell within the inset between two of them.
-
-    Cells are counted from one that lies before the first.
-    """
-    edges = np.concatenate([edges[:1] - 3 * inset, edges, edges[-1:] + 3 * inset])
-    moved = np.unique(np.concatenate([edges[1:-1] - inset, edges[1:-1] + inset]))
-    first = np.searchsorted(edges[1:] + inset, moved[:-1], side="right")
-    end = np.searchsorted(edges[:-1] - inset, moved[1:], side="left")
-    return moved, first, end
 
 
 def _cropped(y: NDArray[Any], x: NDArray[Any], cells: NDArray[np.bool_]) -> OpenArea:

@@ -17,8 +17,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fab.errors import InputError
+from fab.grid import moved_edges
 from fab.layout.geometry import PixelEdges, Shapes
-from fab.layout.polygons import rectangles, smallest_runs
+from fab.layout.polygons import covered, rectangles, smallest_runs
 from fab.units import format_length
 
 _LIMIT = 2**31 - 1
@@ -29,15 +30,6 @@ def edge_moves(bias_m: Sequence[float], dbu_m: float) -> tuple[int, ...]:
     if not np.all(np.isfinite(bias_m)):
         raise InputError("CD bias", "must be finite", list(bias_m), "Give one length per mask.")
     return tuple(-round(bias / dbu_m) for bias in bias_m)
-
-
-def _cells(edges: NDArray[np.int64], move: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the moved raster of one axis, and the first and end pixel within the move of each of its cells."""
-    moved = np.unique(np.concatenate([edges - move, edges + move]))
-    # A pixel reaches a cell if it begins before the cell ends, less the move, and ends after it begins.
-    first = np.searchsorted(edges[1:] + move, moved[:-1], side="right")
-    end = np.searchsorted(edges[:-1] - move, moved[1:], side="left")
-    return moved, np.stack([first, end], axis=1)
 
 
 @njit(cache=True, nogil=True)
@@ -69,18 +61,6 @@ def _gather(cells, rows, columns, out):  # pragma: no cover - compiled
                     out[y, x] = 0
 
 
-@njit(cache=True, nogil=True)
-def _fill(boxes, out):  # pragma: no cover - compiled
-    # Paint boxes of cells; return how many cells were painted again.
-    overlaps = 0
-    for k in range(boxes.shape[0]):
-        for j in range(boxes[k, 1], boxes[k, 3]):
-            for i in range(boxes[k, 0], boxes[k, 2]):
-                overlaps += out[j, i]
-                out[j, i] = 1
-    return overlaps
-
-
 class _Raster(NamedTuple):
     """Lines of a moved raster, and first and end pixel within the move of its cells; shrinking grows the complement."""
 
@@ -96,12 +76,12 @@ class _Raster(NamedTuple):
         move, lines = abs(move_units), [edges.x.astype(np.int64), edges.y.astype(np.int64)]
         if move_units < 0:
             lines = [np.concatenate([[axis[0] - 2 * move], axis, [axis[-1] + 2 * move]]) for axis in lines]
-        (x, columns), (y, rows) = (_cells(axis, move) for axis in lines)
+        (x, *columns), (y, *rows) = (moved_edges(axis, move) for axis in lines)
         worst = max(abs(int(v)) for v in (x[0], x[-1], y[0], y[-1]))
         if worst > _LIMIT:
             got = f"an edge at {worst} units"
             raise InputError("edge move", "the moved drawing must fit 32-bit coordinates", got, "Choose a smaller one.")
-        return cls(x, y, columns, rows, move_units < 0)
+        return cls(x, y, np.stack(columns, axis=1), np.stack(rows, axis=1), move_units < 0)
 
     def cells(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the moved plane, cell by cell."""
@@ -162,21 +142,14 @@ def read_back(shapes: Shapes, edges: PixelEdges, move_units: int) -> NDArray[np.
         InputError: polygons, rectangles that overlap, an edge that is no moved pixel edge, or the area of no plane.
     """
     raster, where = _Raster.of(edges, move_units), "compensated mask"
-    boxes = shapes.rectangles.astype(np.int64)
-    places = [np.searchsorted(lines, boxes[:, k]) for k, lines in enumerate((raster.x, raster.y) * 2)]
-    on_line = [
-        (place < len(lines)) & (lines[np.minimum(place, len(lines) - 1)] == boxes[:, k])
-        for k, (place, lines) in enumerate(zip(places, (raster.x, raster.y) * 2, strict=True))
-    ]
-    strays = len(shapes.polygons) + int(np.count_nonzero(~np.logical_and.reduce(on_line)))
-    if strays:
+    found = covered(shapes.rectangles, raster.x, raster.y)
+    if strays := len(shapes.polygons) + found.strays:
         rule = f"every edge must be a pixel edge moved by {_text(move_units, edges)}"
         raise InputError(where, rule, f"{strays} shapes that are not", "Draw the mask again.")
-    cells = np.zeros((len(raster.rows), len(raster.columns)), dtype=np.uint8)
-    if _fill(np.stack(places, axis=1), cells):
+    if found.overlaps:
         raise InputError(where, "rectangles must not overlap", "some that do", "Draw the mask again.")
-    plane = raster.pixels(cells)
-    if not np.array_equal(raster.cells(plane), cells):
+    plane = raster.pixels(found.cells)
+    if not np.array_equal(raster.cells(plane), found.cells):
         rule = f"must be a plane of pixels with its edges moved by {_text(move_units, edges)}"
         raise InputError(where, rule, "another area", "Draw the mask again.")
     return plane

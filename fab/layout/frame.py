@@ -85,7 +85,7 @@ def draw_frame(
 
     The photomasks come in the order in which they are used. The DOE as ordered is the first of the splits; the others
     take some dies each. The stem of the job names the top cell, and begins the names of the others. `chrome` is the
-    annulus of the DOE (`fab.layout.geometry.chrome_shapes`).
+    chrome around the DOE (`fab.layout.geometry.chrome_shapes`).
 
     Raises:
         InputError: the wafer is too small for what is asked, or the dies lie too close.

@@ -200,11 +200,8 @@ class Chrome:
         """Return the opening for a DOE with this relief."""
         opening = relief.shrunk(self.overlap_m) if self.overlap_m >= 0 else None
         if opening is None or not opening.narrowest_m > 0:
-            rule, got = (
-                f"must be 0 or more and leave an opening in an aperture of {relief}",
-                format_length(self.overlap_m),
-            )
-            raise InputError("chrome overlap", rule, got, "Choose a smaller one.")
+            rule = f"must be 0 or more and leave an opening in an aperture of {relief}"
+            raise InputError("chrome overlap", rule, format_length(self.overlap_m), "Choose a smaller one.")
         return opening
 
     def rim_m(self, level_map: LevelMap) -> float:
@@ -280,7 +277,10 @@ def chrome_layer(levels: Levels) -> Layer:
 
 
 def chrome_shapes(level_map: LevelMap, dbu_m: float, chrome: Chrome) -> Shapes:
-    """Draw the chrome around the clear aperture as sectors of an annulus that share their radial edges."""
+    """Draw the chrome around the clear aperture as sectors that share their radial edges.
+
+    They reach to an opening that is round, and to a square frame around any other, which is drawn as well.
+    """
     opening, outer = chrome.opening(level_map.relief), round(chrome.rim_m(level_map) / dbu_m)
     if outer > _LIMIT:
         got = format_length(outer * dbu_m)

@@ -12,6 +12,7 @@ and two angles fill what is left: no corner is sharper than 45 degrees.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -140,6 +141,36 @@ def paint(
     """
     overlaps, strays, first = _paint(rects, x_edges, y_edges, np.uint8(1 << bit), canvas)
     return Painted(int(overlaps), int(strays), int(first))
+
+
+class Covered(NamedTuple):
+    """Cells between lines, 1 where covered; how many are covered again, and how many rectangles end at no line."""
+
+    cells: NDArray[np.uint8]
+    overlaps: int
+    strays: int
+
+
+@njit(cache=True, nogil=True)
+def _fill(boxes, out):  # pragma: no cover - compiled
+    overlaps = 0
+    for k in range(boxes.shape[0]):
+        for j in range(boxes[k, 1], boxes[k, 3]):
+            for i in range(boxes[k, 0], boxes[k, 2]):
+                overlaps += out[j, i]
+                out[j, i] = 1
+    return overlaps
+
+
+def covered(rects: NDArray[np.integer], x: NDArray[np.integer], y: NDArray[np.integer]) -> Covered:
+    """Paint rectangles ``(n, 4)`` onto the cells between lines along x and y, rising, which may be uneven."""
+    lines = (x, y, x, y)
+    places = [np.minimum(np.searchsorted(axis, rects[:, k]), len(axis) - 1) for k, axis in enumerate(lines)]
+    on_line = [axis[place] == rects[:, k] for k, (place, axis) in enumerate(zip(places, lines, strict=True))]
+    sound = np.logical_and.reduce(on_line)
+    cells = np.zeros((len(y) - 1, len(x) - 1), dtype=np.uint8)
+    overlaps = _fill(np.stack(places, axis=1)[sound], cells)
+    return Covered(cells, int(overlaps), int(np.count_nonzero(~sound)))
 
 
 @njit(cache=True, nogil=True)

@@ -15,7 +15,7 @@ from fab.errors import InputError
 from fab.gds.gdstk_reader import LayerReading
 from fab.layout.compensation import read_back
 from fab.layout.geometry import Cell, Layer, Layout, PixelEdges, Shapes, frame_half, opening_units
-from fab.layout.polygons import paint
+from fab.layout.polygons import covered, paint
 from fab.manifest.cells import cell_entry, shapes_digest
 from fab.manifest.records import CellEntry, DrawnEntry, FileEntry, Manifest, MaskEntry
 from fab.units import MM, NM, UM
@@ -100,21 +100,13 @@ def _chrome_problems(layer: Layer, drawn: Shapes, expected: Expected) -> list[st
 def _mask_problems(layer: Layer, boxes: NDArray[np.int32], opening: MaskAperture, edges: PixelEdges) -> list[str]:
     """Check that rectangles fill, once, what is not open of the frame around a mask."""
     area, half = opening_units(opening, edges), frame_half(opening, edges.dbu_m)
-    lines = [np.concatenate([[-half], axis, [half]]) for axis in (area.x, area.y)]
-    places = [np.searchsorted(axis[:-1], boxes[:, k]) for k, axis in enumerate(lines * 2)]
-    on_line = [axis[place] == boxes[:, k] for k, (place, axis) in enumerate(zip(places, lines * 2, strict=True))]
-    sound = np.logical_and.reduce(on_line)
-    # Every rectangle begins and ends at corners, between which its windings are summed.
-    windings = np.zeros((len(lines[1]), len(lines[0])), np.int32)
-    x0, y0, x1, y1 = (place[sound] for place in places)
-    for rows, columns, step in ((y0, x0, 1), (y0, x1, -1), (y1, x0, -1), (y1, x1, 1)):
-        np.add.at(windings, (rows, columns), step)
-    windings = np.cumsum(np.cumsum(windings, axis=0), axis=1)[:-1, :-1]
-    open_ = np.pad(area.cells, 1)
+    x, y = (np.concatenate([[-half], axis, [half]]) for axis in (area.x, area.y))
+    found, open_ = covered(boxes, x, y), np.pad(area.cells, 1)
     counts = {
-        "rectangles in the chrome are off the edges of the opening": np.count_nonzero(~sound),
-        "cells of the opening are covered by chrome": np.count_nonzero(open_ & (windings != 0)),
-        "cells around the opening are not covered once": np.count_nonzero(~open_ & (windings != 1)),
+        "rectangles in the chrome are off the edges of the opening": found.strays,
+        "cells of the opening are covered by chrome": np.count_nonzero(open_ & (found.cells > 0)),
+        "cells around the opening are not covered": np.count_nonzero(~open_ & (found.cells == 0)),
+        "cells of the chrome are covered again": found.overlaps,
     }
     return [problem for what, count in counts.items() for problem in _count_problem(layer, int(count), what)]
 

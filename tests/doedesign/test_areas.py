@@ -151,14 +151,13 @@ def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
     assert spread["free"] > 1.0
     assert spread["flat"] < 0.05
     flat, free = tables["flat"], tables["free"]
-    assert free.in_wave is None
+    assert free.wave is None
     assert "in_wave" not in free.summary()
-    assert flat.in_wave is not None
-    assert flat.phase_rmse == pytest.approx(spread["flat"], abs=0.05)
+    assert flat.wave is not None
+    assert flat.wave.phase_rmse == pytest.approx(spread["flat"], abs=0.05)
     # Nearly all light on the area is in the wave. It is less than if all cells were in step, when the area is uneven.
-    assert 0.95 * flat.efficiency < flat.in_wave <= flat.efficiency * (1 + 1e-6)
-    assert flat.wave_ceiling is not None
-    assert 0.4 * flat.wave_ceiling < flat.in_wave < flat.wave_ceiling
+    assert 0.95 * flat.efficiency < flat.wave.share <= flat.efficiency * (1 + 1e-6)
+    assert 0.4 * flat.wave.ceiling < flat.wave.share < flat.wave.ceiling
     # Summed in double precision: a cell of 4 um is a point for light that stays within 200 um of the axis.
     target, y, x = flat.target, design.camera.grid.axis_m("y"), design.camera.grid.axis_m("x")
     rows, columns = (
@@ -167,16 +166,16 @@ def test_an_area_has_a_flat_phase_if_that_is_asked_for(tmp_path: Path):
     steps = np.ptp(target.sines_y[:2]) * np.ptp(target.sines_x[:2]) / 532e-9**2
     sent = np.abs(rows @ target.wave @ columns.T) * (np.hypot(y[:, None], x) < design.camera.opening.reach_m)
     share = np.sum(sent) ** 2 * steps * 4e-6**4 / design.camera.opening.area_m2
-    assert flat.wave_ceiling == pytest.approx(share, rel=0.02)
-    assert "in the wave of the given phase" in flat.describe()
+    assert flat.wave.ceiling == pytest.approx(share, rel=0.02)
+    assert "in the wave that is given" in flat.describe()
 
 
 def test_a_frame_around_a_wave_is_dark_if_that_is_asked_for(tmp_path: Path):
     spec = spec_of(tmp_path, "optimize.steps=120", "area.phase=flat", "area.dark=60 um")
     design = optimize(spec)
     (table,) = areas_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
-    assert table.phase_rmse is not None
-    assert table.phase_rmse < 0.05
+    assert table.wave is not None
+    assert table.wave.phase_rmse < 0.05
     assert table.light[table.target.dark].max() < 0.2
     assert table.light[~(table.target.dark | table.target.lit)].max() > 5  # what is left is right beyond the frame
 
@@ -200,8 +199,8 @@ def test_a_ring_has_the_vortex_of_a_picture(tmp_path: Path):
     # The run has a copy of its own.
     (tmp_path / "turn.png").unlink()
     (table,) = areas_of_design(open_design(tmp_path / "run", masks=False), design.as_optic())
-    assert table.phase_rmse is not None
-    assert table.phase_rmse < 0.4
+    assert table.wave is not None
+    assert table.wave.phase_rmse < 0.4
     write_pixels(tmp_path / "turn.png", np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(InputError, match="a picture of a phase must be grey"):
         optimize(spec)

@@ -212,9 +212,13 @@ def test_what_has_no_cell_for_one_wavelength_is_refused(run: Path, monkeypatch: 
     two = replace(camera, colours=(*camera.colours, Colour("green", (532e-9,), (1.0,))))
     tilted = replace(camera, beam=GaussianBeam((5e-6, 5e-6), tilt_rad=(0.0, 0.1)))
     level_map = design.level_map
+    given = spec.model_copy(
+        update={"spots": spec.spots and spec.spots.model_copy(update={"phases_rad": (0.0, 1.0, 0.0)})}
+    )
     small = LevelMap(level_map.level, level_map.levels, level_map.grid, 1.2e-6)
     for other, words in (
         (replace(design, spec=spec.model_copy(update={"spots": None})), "only the unit cell of a grid of orders"),
+        (replace(design, spec=given), "refined for their light alone, but got phases that are given"),
         (replace(design, camera=two), "for one wavelength, but got 532 nm, 633 nm"),
         (replace(design, camera=tilted), "normal incidence, but got 0, 5.73 degrees along y and x"),
         (replace(design, level_map=small), "must hold a whole period of 2.4 um"),

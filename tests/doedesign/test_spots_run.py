@@ -119,20 +119,19 @@ def test_orders_have_the_phases_that_are_given(tmp_path: Path, cells: int):
     table = on_target(design, HeightOptic.of(design.camera, design.nominal_height_m))
     assert isinstance(table, OrderTable)
     # Levels of 45 degrees leave a few; orders of a round aperture of few periods reach over into each other.
-    assert table.phase_rmse is not None
-    assert np.degrees(table.phase_rmse) < 3
+    assert table.wave is not None
+    assert np.degrees(table.wave.phase_rmse) < 3
     light = waves_of(design, table.spots.waves_per_m)
     off = np.angle(light * np.exp(-1j * np.radians(given)))
     off = np.degrees(np.angle(np.exp(1j * (off - np.angle(np.sum(np.exp(1j * off)))))))
     assert np.abs(off).max() < 8
     # These phases cost light: free ones take 93.9 % of it at best.
-    assert table.in_wave is not None
-    assert 0.55 < table.in_wave <= table.total * (1 + 1e-9) < 0.88
+    assert table.wave is not None
+    assert 0.55 < table.wave.share <= table.total * (1 + 1e-9) < 0.88
     assert table.uniformity_error < 0.06
-    assert table.summary()["in_wave"] == table.in_wave
-    assert table.wave_ceiling is not None
-    assert 0.75 * table.wave_ceiling < table.in_wave < table.wave_ceiling
-    assert "in the wave of the given phases" in table.describe()
+    assert table.summary()["in_wave"] == table.wave.share
+    assert 0.75 * table.wave.ceiling < table.wave.share < table.wave.ceiling
+    assert "in the wave that is given" in table.describe()
     assert table.to_csv().splitlines()[0].endswith("over_wanted,phase_error_deg")
 
 
@@ -145,7 +144,8 @@ def test_spots_on_a_sensor_have_the_phases_that_are_given(free: Path):
         assert isinstance(table, OrderTable)
         light = waves_of(design, table.spots.waves_per_m)
         assert np.degrees(np.angle(light[1] / light[0] * np.exp(-1j * np.radians(shift)))) == pytest.approx(0, abs=2)
-        assert table.in_wave == pytest.approx(table.total, rel=2e-3)
+        assert table.wave is not None
+        assert table.wave.share == pytest.approx(table.total, rel=2e-3)
         # A sum of two waves is real but for a phase: its sign alone sends 8 / pi^2 into both.
         assert table.total == pytest.approx(8 / np.pi**2, abs=0.02)
 

@@ -1,9 +1,26 @@
-"""What the tests of parts share: how another library sees a part, and which corners only touch."""
+"""What the tests of drawings share: how other libraries see parts and dies, and which corners only touch."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fab.layout.geometry import Cell, Layer
 from fab.layout.part import Part
+from fab.manifest.records import read_manifest
+
+
+def chrome_of_dies(order: Path) -> Iterator[list[Any]]:
+    """Polygons of the chrome of every kind of die of an order, all that its cell places included, read by gdstk."""
+    import gdstk
+
+    chrome = read_manifest(order).chrome
+    cells: list[Any] = gdstk.read_gds(str(order / chrome.file)).cells
+    dies = [cell for cell in cells if cell.name.endswith("_DIE")]
+    assert dies
+    for die in dies:
+        yield [polygon for polygon in die.get_polygons() if polygon.layer == chrome.layer]
 
 
 def region(part: Part | Cell, *layers: Layer):

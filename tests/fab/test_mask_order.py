@@ -26,6 +26,7 @@ from fab.order.write import write_planned
 from fab.solids.step import step_bodies
 from tests.fab.maps import FEW, PLAIN
 from tests.fab.mended import mend, restate, told
+from tests.fab.parts import chrome_of_dies
 
 UM = 1e-6
 GRID = Grid((30, 40), 2 * UM)
@@ -107,14 +108,9 @@ def test_klayout_reads_the_same(written):
 
 def test_no_chrome_of_a_die_lies_in_its_opening(written):
     """All of the die counts: that around the DOE, and that from there to the edges of the die."""
-    chrome = read_manifest(written).chrome
-    cells: list[Any] = gdstk.read_gds(str(written / chrome.file)).cells
-    dies = [cell for cell in cells if cell.name.endswith("_DIE")]
-    assert dies
-    for die in dies:
-        drawn = region(polygon for polygon in die.get_polygons() if polygon.layer == chrome.layer)
+    for drawn in chrome_of_dies(written):
         around = db.Region(db.Box(-560_000, -560_000, 560_000, 560_000))  # its corners lie beyond the outer circle
-        assert (around - drawn ^ wanted_opening()).is_empty()
+        assert (around - region(drawn) ^ wanted_opening()).is_empty()
 
 
 def test_the_order_is_proved_from_its_files_and_its_request(written):
@@ -188,7 +184,10 @@ def covered(shapes: Shapes) -> Shapes:
     [
         (shifted, "1 rectangles in the chrome are off the edges of the opening"),
         (covered, "cells of the opening are covered by chrome"),
-        (lambda s: Shapes(s.rectangles[[0, *range(len(s.rectangles) - 1)]], s.polygons), "not covered once"),
+        (
+            lambda s: Shapes(s.rectangles[[0, *range(len(s.rectangles) - 1)]], s.polygons),
+            "cells around the opening are not covered",
+        ),
         (lambda s: Shapes(s.rectangles[1:], s.polygons), "chrome polygons instead of"),
         (lambda s: Shapes(s.rectangles, (*s.polygons[1:], s.polygons[0][:-1])), "lies|leaves|chrome"),
     ],

@@ -28,6 +28,7 @@ from fab.runsheet.as_built import read_as_built
 from fab.solids.step import step_bodies
 from tests.fab.maps import FEW, PLAIN
 from tests.fab.mended import mend, restate, told
+from tests.fab.parts import chrome_of_dies
 
 UM, MM = 1e-6, 1e-3
 LEVELS = Levels(4, 0.3e-6)
@@ -97,12 +98,7 @@ def test_another_library_sees_the_rectangle_where_it_should_be(written):
 
 def test_no_chrome_of_a_die_lies_in_its_opening(written):
     """All of the die counts: that around the DOE, and that from there to the edges of the die."""
-    chrome = read_manifest(written).chrome
-    cells: list[Any] = gdstk.read_gds(str(written / chrome.file)).cells
-    dies = [cell for cell in cells if cell.name.endswith("_DIE")]
-    assert dies
-    for die in dies:
-        drawn = [polygon for polygon in die.get_polygons() if polygon.layer == chrome.layer]
+    for drawn in chrome_of_dies(written):
         around = gdstk.rectangle((-560, -560), (560, 560))  # its corners lie beyond the outer circle
         (opening,) = gdstk.boolean(around, drawn, "not", precision=1e-4)
         assert opening.area() == pytest.approx(OPENING_UM[0] * OPENING_UM[1], rel=1e-6)
