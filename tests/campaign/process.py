@@ -24,6 +24,7 @@ from tests.campaign.shim import Fault, shimmed
 
 ROOT = Path(__file__).parents[2]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_STREAMS = ("out", "err")
 # A process that has grown beyond the first gives way to a new one; the second saves the machine.
 _GROWN_BYTES, _DATA_BYTES = 2 << 30, 6 << 30
 
@@ -84,6 +85,8 @@ class Worker:
     def begin(self, arguments: Sequence[object], place: Path, fault: Fault = Fault()) -> None:  # noqa: B008
         """Begin a command in the folder `place`/work, with `place`/tmp for temporary files."""
         (place / "tmp").mkdir(exist_ok=True)
+        for name in _STREAMS:  # a process may be killed before it opens them
+            (self._said / name).write_bytes(b"")
         self._start().send(_Job(tuple(map(str, arguments)), place, fault))
         self._fault, self._begun = fault, time.monotonic()
 
@@ -109,7 +112,7 @@ class Worker:
         process.join(10)
         code, wall = process.exitcode, time.monotonic() - self._begun
         self.stop()
-        out, err = ((self._said / name).read_text("utf-8", "replace") for name in ("out", "err"))
+        out, err = ((self._said / name).read_text("utf-8", "replace") for name in _STREAMS)
         return End(None if late else code, out, err, wall_s=wall)
 
     def run(self, arguments: Sequence[object], place: Path, fault: Fault = Fault(), **limits: Any) -> End:  # noqa: B008
@@ -180,7 +183,7 @@ def _done(job: _Job, said: Path) -> End:
     tempfile.tempdir = os.environ["TMPDIR"] = str(job.place / "tmp")
     _OPENED.clear()
     _WATCHED[0] = f"{folder}{os.sep}"
-    handles = [os.open(said / name, os.O_RDWR | os.O_CREAT | os.O_TRUNC) for name in ("out", "err")]
+    handles = [os.open(said / name, os.O_RDWR | os.O_CREAT | os.O_TRUNC) for name in _STREAMS]
     kept = [os.dup(1), os.dup(2)]
     for stream, handle in zip((1, 2), handles, strict=True):
         os.dup2(handle, stream)

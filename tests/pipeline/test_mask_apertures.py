@@ -63,7 +63,7 @@ def test_a_mask_goes_from_the_spec_to_a_proved_order_and_to_its_light(tmp_path, 
         ("verify", order),
         ("psf", run, "--masks", order, "--fabricated", "--seed", 0),
         ("tolerance", run, "--masks", order, "--draws", 2, "--workers", 1),
-        ("certify", run),
+        ("certify", run, "--cells", 12, "--pieces", 0),
     ):
         done = cli(*command)
         assert done.code == 0, done.err
