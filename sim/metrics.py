@@ -318,10 +318,21 @@ class MetricInputs:
         own, lens = participation(self.energy[colour, depth]), self.lens_participation[colour, depth]
         return own / lens if is_traced(own, lens) else float(own) / float(lens)
 
-    def concentration_bound(self, colour: int) -> Any:
-        """Square of the largest far-spot energy, or None without a far depth."""
-        far = [self.far_spot(colour, d) for d, depth in enumerate(self.depths_m) if depth not in self.near_m]
-        return reduce(jnp.maximum if is_traced(far) else max, far) ** 2 if far else None
+    def concentration_bound(self, colour: int, depth: int) -> Any:
+        """Least concentration of a near PSF that keeps all light in the window, or None without a far depth.
+
+        The share s of the light that a far source finds in its sharp spot cannot tell depths apart: nearby it draws
+        the bare lens's disc. What is left at best spreads evenly over the window, of which the disc covers the part
+        a: s² + (1 - s)² a. The disc's area is that of an even disc as concentrated as the lens's PSF. Light that leaves
+        the window may take a PSF below it.
+        """
+        far = [self.far_spot(colour, d) for d, at in enumerate(self.depths_m) if at not in self.near_m]
+        if not far:
+            return None
+        lens = total(self.lens[colour, depth])
+        kept = reduce(jnp.maximum if is_traced(far) else max, far) / lens
+        area = lens**2 / self.lens_participation[colour, depth] / self.camera.window**2
+        return kept**2 + (1 - kept) ** 2 * area
 
 
 @dataclass(frozen=True)
@@ -382,7 +393,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         ),
         "concentration": Metric("concentration", lambda e, c, d: e.concentration(c, d), ("design",), "near"),
         "concentration_bound": Metric(
-            "least concentration", lambda e, c, d: e.concentration_bound(c), ("design",), "near"
+            "least concentration", lambda e, c, d: e.concentration_bound(c, d), ("design",), "near"
         ),
         "far_spot": Metric("far spot", lambda e, c, d: e.far_spot(c, d), _BOTH, "far", worse="low", unit="%"),
         "spot_radius_m": Metric(

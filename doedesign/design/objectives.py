@@ -126,15 +126,30 @@ def spot_weights(camera: Camera) -> Float[np.ndarray, "w y x"]:
 
 def far_spot(psfs: PsfSet) -> Array:
     """Share of the scene's light that misses the sharp spot, 0-1, over colours and far depths."""
-    inside = jnp.einsum("wfyx,wyx->wf", psfs.far, spot_weights(psfs.camera))
-    return 1.0 - psfs.lowest(inside)
+    return 1.0 - psfs.lowest(_spots(psfs))
+
+
+def spot_energy(psfs: PsfSet, *, energy: float) -> Array:
+    """Squared distance of the far spot of every colour and depth from a stated `energy`, 0-1.
+
+    A weight w leaves it off by the slope of the other terms with respect to it, over 2w.
+    """
+    return psfs.highest((_spots(psfs) - _share("spot_energy", "energy", energy)) ** 2)
+
+
+def equal_colours(psfs: PsfSet) -> Array:
+    """Variance of the far spot over the colours, over its squared mean, at every far depth: 0 if all are equal."""
+    spots = _spots(psfs)
+    return psfs.highest(jnp.var(spots, axis=0) / jnp.mean(spots, axis=0) ** 2)
 
 
 def near_spread(psfs: PsfSet) -> Array:
     """Concentration of near PSFs relative to the plain lens: sum p² / sum p_lens², 1 for no effect.
 
-    The coherent part of the light cannot tell depths apart, so a design with far-spot energy s keeps at least s² of
-    it (design.md §4): with weights 1 for `far_spot` and w for this term the ideal DOE has s = 1 / (2w).
+    The coherent part of the light cannot tell depths apart, so a design with far-spot energy s keeps at least
+    s² + (1 - s)² a of it, a being the part of the window that the lens's disc covers
+    (`sim.metrics.MetricInputs.concentration_bound`): with weights 1 for `far_spot` and w for this term the ideal DOE
+    has s = (1 / (2w) + a) / (1 + a).
     """
     return psfs.highest(participation(psfs.near) / psfs.lens_participation)
 
@@ -145,8 +160,15 @@ def window_loss(psfs: PsfSet) -> Array:
     Without it `near_spread` and `far_spot` agree on sending unwanted light to angles beyond the window, where it
     becomes stray light on the rest of the sensor.
     """
-    images = jnp.concatenate([psfs.near, psfs.far], axis=1)
-    return 1.0 - psfs.lowest(jnp.sum(images, axis=(-2, -1)))
+    return 1.0 - psfs.lowest(_in_window(psfs))
+
+
+def window_share(psfs: PsfSet, *, least: float) -> Array:
+    """Squared lack of light in the sensor window below `least`, 0-1, over colours and depths: a constraint.
+
+    It is zero, and costs nothing, for a design that holds it; with a large weight the other terms decide all else.
+    """
+    return psfs.highest(jnp.maximum(_share("window_share", "least", least) - _in_window(psfs), 0.0) ** 2)
 
 
 def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
@@ -168,6 +190,23 @@ def handcrafted(psfs: PsfSet, *, near_weight: float = 1.0) -> Array:
 def target_pattern(psfs: PsfSet, *, target: Float[np.ndarray, "y x"]) -> Array:
     """Squared distance of every far PSF from a target that holds all light, relative to the target's own square."""
     return psfs.highest(jnp.sum((psfs.far - target) ** 2, axis=(-2, -1))) / float(np.sum(target**2))
+
+
+def _spots(psfs: PsfSet) -> Float[Array, "w f"]:
+    """Light in the far spot of every colour and far depth."""
+    return jnp.einsum("wfyx,wyx->wf", psfs.far, spot_weights(psfs.camera))
+
+
+def _in_window(psfs: PsfSet) -> Float[Array, "w d"]:
+    """Light in the window, of every colour and depth."""
+    return jnp.sum(jnp.concatenate([psfs.near, psfs.far], axis=1), axis=(-2, -1))
+
+
+def _share(objective: str, option: str, value: object) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= 1:
+        rule, cure = "must be a share of the light from 0 to 1", "For example 0.3."
+        raise InputError(f"{objective}: {option}", rule, repr(value), cure)
+    return float(value)
 
 
 BUILT_IN: dict[str, Objective] = {name: globals()[name] for name in OBJECTIVES}

@@ -48,8 +48,8 @@ class OptimizationState(NamedTuple):
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
-    """Adam whose step size falls to a tenth along a cosine, so that levels settle."""
-    schedule = optax.cosine_decay_schedule(spec.optimize.learning_rate, max(spec.optimize.steps, 1), alpha=0.1)
+    """Adam whose step size falls to a twentieth along a cosine, so that levels settle."""
+    schedule = optax.cosine_decay_schedule(spec.optimize.learning_rate, max(spec.optimize.steps, 1), alpha=0.05)
     return optax.adam(schedule)
 
 

@@ -50,15 +50,62 @@ def lens(setup: StartSetup, power_per_m: float) -> Heights:
     return np.mod(-(setup.radii_m() ** 2) * power_per_m / (2 * setup.wavelength_m), 1.0) * setup.wave_m
 
 
-def grating(setup: StartSetup, far_energy: float, period_m: float) -> Heights:
-    """Circular binary grating: `far_energy` of the light stays in the 0th order, the rest draws a ring.
+class Ridge(NamedTuple):
+    """Profile of a binary grating: height of its ridges, metres, and their share of the period, 0-0.5."""
 
-    Half of each period is raised by h with cos²(phi/2) = far_energy, phi = 2 pi (n-1) h / lambda, the 0th-order
-    efficiency of a binary grating (J. W. Goodman, *Introduction to Fourier Optics*, §4.4). From a far source the ring
-    has radius lambda f / period; a near one widens it by the defocus disc.
+    height_m: float
+    duty: float
+
+
+def zeroth_orders(setup: StartSetup, ridge: Ridge) -> Float[np.ndarray, " w"]:
+    """Share of the light of every colour that a binary grating leaves in its 0th order.
+
+    1 - 4 p (1 - p) sin²(phi / 2) for a duty p and ridges of phase phi = 2 pi (n-1) h / lambda, the square of the mean
+    of its two waves (J. W. Goodman, *Introduction to Fourier Optics*, §4.4).
     """
-    height = setup.wave_m * (2 * np.arccos(np.sqrt(far_energy))) / (2 * np.pi)
-    return np.where(np.mod(setup.radii_m() / period_m, 1.0) < 0.5, height, 0.0)
+    material, (height_m, duty) = setup.camera.material, ridge
+
+    def order(wavelength_m: float) -> float:
+        half_phase = np.pi * height_m / full_wave_height_m(material, wavelength_m)
+        return 1 - 4 * duty * (1 - duty) * float(np.sin(half_phase)) ** 2
+
+    colours = setup.camera.colours
+    return np.array([np.dot(c.weights, [order(w) for w in c.wavelengths_m]) / sum(c.weights) for c in colours])
+
+
+def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
+    """Ridge whose 0th order holds `far_energy` of every colour, as evenly as height and duty allow.
+
+    One colour: half of the period, and the height of that order at the design wavelength. Several: the least sum of
+    squared misses, with heights up to one wave, by DIRECT-L (global, no gradient) and then Sbplx, both of NLopt.
+    """
+    import nlopt
+
+    if len(setup.camera.colours) == 1:
+        return Ridge(setup.wave_m * float(np.arccos(np.sqrt(far_energy))) / np.pi, 0.5)
+
+    def miss(values: np.ndarray, _gradient: np.ndarray) -> float:
+        ridge = Ridge(float(values[0]) * setup.wave_m, float(values[1]))
+        return float(np.sum((zeroth_orders(setup, ridge) - far_energy) ** 2))
+
+    best = np.array([0.5, 0.25])
+    for algorithm, count in ((nlopt.GN_DIRECT_L, 400), (nlopt.LN_SBPLX, 400)):
+        search = nlopt.opt(algorithm, 2)
+        search.set_min_objective(miss)
+        search.set_lower_bounds([0.0, 0.0])
+        search.set_upper_bounds([1.0, 0.5])
+        search.set_initial_step(0.01)
+        search.set_maxeval(count)
+        best = search.optimize(best)
+    return Ridge(float(best[0]) * setup.wave_m, float(best[1]))
+
+
+def grating(setup: StartSetup, ridge: Ridge, period_m: float) -> Heights:
+    """Circular binary grating: its 0th order stays, the rest draws a ring.
+
+    From a far source the ring has radius lambda f / period; a near one widens it by the defocus disc.
+    """
+    return np.where(np.mod(setup.radii_m() / period_m, 1.0) < ridge.duty, ridge.height_m, 0.0)
 
 
 def ring_period_m(camera: Camera) -> float:
@@ -86,13 +133,15 @@ def random(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
 
 
 def ring(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
-    """Circular `grating` of `far_energy` and `period` that the optimiser can leave.
+    """Circular `grating` of `period`, equally bright in all colours (`balanced_ridge`), that the optimiser can leave.
 
-    A perfect grating is a stationary point in many directions; a little `roughness`, in waves, lets the optimiser leave
-    it. The quarter wave below keeps the floor of the grating away from the wrap at zero.
+    `height` and `duty` may be given in place of `far_energy`. A perfect grating is a stationary point in many
+    directions; a little `roughness`, in waves, lets the optimiser leave it. The quarter wave below keeps the floor of
+    the grating away from the wrap at zero.
     """
-    far_energy = _number(options, "far_energy", 0.25, 0.0, 1.0)
-    heights = grating(setup, far_energy, _length(options, "period", ring_period_m(setup.camera)))
+    ridge = balanced_ridge(setup, _number(options, "far_energy", 0.25, 0.0, 1.0))
+    ridge = Ridge(_length(options, "height", ridge.height_m), _number(options, "duty", ridge.duty, 0.0, 1.0))
+    heights = grating(setup, ridge, _length(options, "period", ring_period_m(setup.camera)))
     noise = np.random.default_rng(setup.seed).standard_normal(heights.shape)
     return heights + setup.wave_m * (0.25 + _number(options, "roughness", 0.02, 0.0, 1.0) * noise)
 

@@ -15,14 +15,17 @@ from scipy import special
 from doedesign.design.objectives import (
     BUILT_IN,
     PsfSet,
+    equal_colours,
     far_spot,
     handcrafted,
     import_objectives,
     near_spread,
     source_digests,
+    spot_energy,
     spot_weights,
     terms_from_spec,
     window_loss,
+    window_share,
 )
 from doedesign.design.patterns import target_image
 from doedesign.optimization import optimize
@@ -76,6 +79,34 @@ def test_coherent_light_obeys_its_bound() -> None:
 
 def test_window_loss_counts_what_is_not_there() -> None:
     assert float(window_loss(view(0.5 * even(), point()))) == pytest.approx(0.25, abs=1e-6)
+
+
+def of_spots(*spots: float, window: float = 1.0) -> PsfSet:
+    """One PSF per colour with this light in the spot, and the rest of what falls into the window in its corner."""
+    camera = replace(CAMERA, colours=tuple(Colour(str(i), (550e-9,), (1.0,)) for i in range(len(spots))))
+    far = np.stack([spot * point() for spot in spots])[:, None]
+    far[:, 0, 0, 0] += window - np.array(spots, np.float32)
+    return PsfSet(jnp.asarray(far), jnp.asarray(far), jnp.ones((len(spots), 1)), camera)
+
+
+def test_a_stated_spot_and_equal_colours_by_hand() -> None:
+    spots = of_spots(0.2, 0.3, 0.4)
+    assert float(spot_energy(spots, energy=0.3)) == pytest.approx(0.02 / 3, rel=1e-4)
+    assert float(spot_energy(replace(spots, worst=True), energy=0.25)) == pytest.approx(0.15**2, rel=1e-4)
+    assert float(equal_colours(spots)) == pytest.approx(0.02 / 3 / 0.3**2, rel=1e-4)
+    assert float(equal_colours(of_spots(0.3, 0.3))) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_window_costs_nothing_where_it_holds_enough() -> None:
+    assert float(window_share(of_spots(0.3, window=0.7), least=0.8)) == pytest.approx(0.01, rel=1e-4)
+    assert float(window_share(of_spots(0.3, window=0.85), least=0.8)) == 0.0
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5, True])
+def test_shares_are_shares(share: Any) -> None:
+    for call in (lambda: spot_energy(of_spots(0.3), energy=share), lambda: window_share(of_spots(0.3), least=share)):
+        with pytest.raises(InputError, match="must be a share of the light from 0 to 1"):
+            call()
 
 
 def test_handcrafted_is_zero_at_its_targets() -> None:
@@ -225,7 +256,7 @@ def test_a_picture_is_a_target_with_its_top_at_the_highest_y(tmp_path: Path) -> 
 def test_the_objectives_are_those_of_the_spec() -> None:
     """And each says by itself whether it looks at near depths, as the spec's table does."""
     assert BUILT_IN.keys() == set(OBJECTIVES)
-    given = {"target_pattern": {"target": even()}}
+    given = {"target_pattern": {"target": even()}, "spot_energy": {"energy": 0.3}, "window_share": {"least": 0.5}}
     for name in OBJECTIVES:
         without = PsfSet(jnp.zeros((1, 0, 64, 64)), jnp.asarray(point())[None, None], jnp.zeros((1, 0)), CAMERA)
         value = float(BUILT_IN[name](without, **given.get(name, {})))

@@ -1,9 +1,23 @@
 """Baseline designs: each has a closed form to meet."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from doedesign.design.starts import BUILT_IN, StartSetup, flat, grating, lens, random, ring_period_m, start_heights
+from doedesign.design.starts import (
+    BUILT_IN,
+    Ridge,
+    StartSetup,
+    balanced_ridge,
+    flat,
+    grating,
+    lens,
+    random,
+    ring_period_m,
+    start_heights,
+    zeroth_orders,
+)
 from doedesign.spec.values import STARTS
 from fab.errors import InputError
 from fab.grid import Grid
@@ -21,14 +35,55 @@ SETUP = StartSetup(CAMERA, False, GREEN, 3)
 
 @pytest.mark.parametrize("far_energy", [0.0, 0.25, 0.6, 1.0])
 def test_ring_keeps_the_asked_share_in_the_0th_order(far_energy: float) -> None:
-    height = grating(SETUP, far_energy, 16e-6)
+    height = grating(SETUP, balanced_ridge(SETUP, far_energy), 16e-6)
     # Eight cells per period: the raster's area shares differ from one half by about 1 %.
     assert zeroth_order(HeightOptic.of(CAMERA, height))[0] == pytest.approx(far_energy, abs=0.01)
 
 
+def of_lines(*waves_nm: float) -> StartSetup:
+    colours = tuple(Colour(f"{wave:g}", (wave * 1e-9,), (1.0,)) for wave in waves_nm)
+    return SETUP._replace(camera=replace(CAMERA, colours=colours))
+
+
+@pytest.mark.parametrize(
+    ("waves_nm", "far_energy", "spread"),
+    [
+        ((656, 486), 0.3, 1e-4),  # two unknowns for two colours
+        ((656, 486), 0.6, 1e-4),
+        ((656, 589, 486), 0.3, 0.025),
+        ((656, 589, 486), 0.6, 0.025),
+        ((650, 600, 550, 500, 450), 0.3, 0.06),
+    ],
+)
+def test_ring_is_equally_bright_in_all_colours(waves_nm: tuple[float, ...], far_energy: float, spread: float) -> None:
+    """As a plate has it, and as no grid of heights and duties betters."""
+    setup = of_lines(*waves_nm)
+    ridge = balanced_ridge(setup, far_energy)
+    orders = zeroth_orders(setup, ridge)
+    assert np.abs(orders - far_energy).max() < spread
+    height = grating(setup, ridge, 15.3e-6)
+    # Of 26 rings the ridges, each on the inner side, cover p (1 - p) / 26 less than their duty p.
+    np.testing.assert_allclose(zeroth_order(HeightOptic.of(setup.camera, height)), orders, atol=0.02)
+    tried = [
+        np.sum((zeroth_orders(setup, Ridge(share * setup.wave_m, duty)) - far_energy) ** 2)
+        for share in np.linspace(0, 1, 81)
+        for duty in np.linspace(0, 0.5, 51)
+    ]
+    assert np.sum((orders - far_energy) ** 2) <= min(tried)
+
+
+def test_a_ring_of_given_height_and_duty() -> None:
+    """Half a wave in the middle of the band, where the order hardly depends on the colour."""
+    setup = of_lines(656, 589, 486)
+    found = start_heights("ring", {"height": "605 nm", "duty": 0.245, "roughness": 0.0, "period": "80 um"}, setup)
+    floor, top = np.unique(found)
+    assert top - floor == pytest.approx(605e-9, rel=1e-6)
+    np.testing.assert_allclose(zeroth_orders(setup, Ridge(605e-9, 0.245)), (0.305, 0.266, 0.302), atol=1e-3)
+
+
 def test_ring_has_the_radius_of_its_grating_order() -> None:
     period = 16e-6
-    height = grating(SETUP, 0.0, period)
+    height = grating(SETUP, balanced_ridge(SETUP, 0.0), period)
     image = psf(height, CAMERA, [np.inf]).energy[0, 0]
     radius = radius_map_m(image.shape, CAMERA.pixel_m)
     profile = [image[(radius >= r) & (radius < r + 4e-6)].sum() for r in np.arange(0, 240e-6, 4e-6)]

@@ -191,3 +191,21 @@ def test_concentration_compares_pixels_with_the_lens(traced: bool):
     expected = participation(own[0, 0]) / participation(lens[0, 0])
     found = jax.jit(concentration)(own) if traced else concentration(own)
     assert float(found) == pytest.approx(float(expected), rel=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 1.0])
+def test_no_even_halo_around_the_lens_disc_is_below_the_bound(share: float):
+    """s of the light on the lens's 4 pixels and the rest on the 60 others of the window: s² + (1 - s)² 4 / 60."""
+    camera = dataclasses.replace(CAMERA, window=8)
+    lens = np.zeros((1, 2, 8, 8), np.float32)
+    lens[0, 0, 3:5, 3:5], lens[0, 1, 4, 4] = 0.2, 0.8  # the near disc and the far spot, a fifth lost at the faces
+    own = lens * share
+    own[0, 0][lens[0, 0] == 0] = 0.8 * (1 - share) / 60
+    depths_m = (0.1, np.inf)
+    inputs = MetricInputs(own, depths_m, camera, near_m=depths_m[:1], lens=lens)
+    kept = inputs.far_spot(0, 1) / 0.8
+    assert inputs.concentration_bound(0, 0) == pytest.approx(kept**2 + (1 - kept) ** 2 * 4 / 64, rel=1e-5)
+    found = share**2 + (1 - share) ** 2 * 4 / 60
+    assert inputs.concentration(0, 0) == pytest.approx(found, rel=1e-5)
+    assert inputs.concentration_bound(0, 0) <= found + 1e-6
+    assert MetricInputs(own[:, :1], (0.1,), camera, near_m=(0.1,), lens=lens[:, :1]).concentration_bound(0, 0) is None

@@ -29,6 +29,9 @@ OBJECTIVES = (
     "far_spot",
     "near_spread",
     "window_loss",
+    "spot_energy",
+    "equal_colours",
+    "window_share",
     "handcrafted",
     "target_pattern",
 )
@@ -39,7 +42,7 @@ STARTS = {
     "flat": (),
     "random": ("feature",),
     "fresnel": ("focal_length", "evaluations"),
-    "ring": ("far_energy", "period", "roughness"),
+    "ring": ("far_energy", "height", "duty", "period", "roughness"),
     "axicon": ("angle",),
     "vortex": ("charge",),
     "blazed": ("period", "azimuth"),
