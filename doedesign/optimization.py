@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from doedesign.design.accuracy import accuracies, in_words
+from doedesign.design.descent import descend
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, drawn_patterns
@@ -106,7 +107,7 @@ def optimize(
     problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(steps(spec, problem, sources, state), spec, state, [])
-    return finished_design(spec, problem, state, history)
+    return finished_design(spec, problem, _polished(spec, problem, sources, state), history)
 
 
 def steps_within(
@@ -173,6 +174,7 @@ def _optimize_in(
             state, history = _resume(run, problem, sources, files)
             begin_run(run)
             state, history = _iterate(steps(spec, problem, sources, state), spec, state, history, run)
+            state = _polished(spec, problem, sources, state)
             design, terms = finished_design(spec, problem, state, history), problem.terms
         log.info("evaluating the design")
         if spec.process.chooses_depths:
@@ -180,6 +182,19 @@ def _optimize_in(
         results = write_results(run, terms, design)
         finish_run(run, results, design.levels.depths_m)
     return open_design(folder, False)
+
+
+def _polished(spec: Spec, problem: Problem, sources: SourceSet, state: OptimizationState) -> OptimizationState:
+    """The state after the descent on levels that a spec asks for."""
+    if not spec.optimize.polish:
+        return state
+    with meter("polishing", spec.optimize.polish) as progress:
+
+        def advance(move: int, loss: float) -> None:
+            progress.advance(move, f"loss {loss:.4f}")
+
+        parameters = descend(spec, problem, sources, state.parameters, spec.optimize.polish, advance)
+    return state._replace(parameters=parameters)
 
 
 def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:

@@ -23,8 +23,9 @@ from jaxtyping import Array, Float
 
 from doedesign.design.design import Design
 from doedesign.design.etch_depths import height_histogram, optimal_levels, recipe_depths_m
-from doedesign.design.parametrize import Parameters, softness_at
+from doedesign.design.parametrize import Parameters
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
+from doedesign.design.quantisation import Rounding, rounding_at
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import STARTS, Spec
@@ -69,6 +70,7 @@ def initial_state(
             spec.optics.design_wavelength_m,
             spec.optimize.seed,
             lambda heights: judge_height(problem, scene, heights),
+            problem.parametrization.levels.step_m,
         )
         heights = start_heights(spec.optimize.start, spec.optimize.start_options, setup)
     else:
@@ -88,12 +90,12 @@ def initial_state(
 
 def first_parameters(spec: Spec, radians: Array) -> Parameters:
     """Parameters before the first step; depths are among them if they are to be chosen and rounding depends on them."""
-    learns_depths = spec.process.chooses_depths and spec.optimize.quantisation != "none"
+    learns_depths = spec.process.chooses_depths and spec.optimize.quantisation not in ("none", "at_end")
     return Parameters(radians, jnp.zeros(spec.process.masks, jnp.float32) if learns_depths else None)
 
 
-def _loss(parameters: Parameters, problem: Problem, look: StepSources, softness: Array) -> tuple[Array, Array]:
-    return losses(problem, view_of(problem, problem.parametrization.height_of(parameters, softness), look))
+def _loss(parameters: Parameters, problem: Problem, look: StepSources, rounding: Rounding) -> tuple[Array, Array]:
+    return losses(problem, view_of(problem, problem.parametrization.height_of(parameters, rounding), look))
 
 
 def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
@@ -103,7 +105,7 @@ def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
     """
     optimiser = optimiser_of(spec)
 
-    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
+    def update(inputs: tuple[Problem, StepSources, Rounding], state: tuple[Any, optax.OptState]) -> Any:
         parameters, adam = state
         (loss, terms), gradient = jax.value_and_grad(_loss, has_aux=True)(parameters, *inputs)
         updates, adam = optimiser.update(gradient, adam)
@@ -112,10 +114,11 @@ def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
     return compiled_step(update)
 
 
-def step_inputs(spec: Spec, problem: Problem, scene: SourceSet, step: int) -> tuple[Problem, StepSources, Array]:
-    """Problem, sources and softness of a step, which its update takes besides the state."""
-    softness = softness_at(spec.optimize.quantisation, step, spec.optimize.steps)
-    return problem, scene.look(spec.optimize.seed, step), jnp.float32(softness)
+def step_inputs(spec: Spec, problem: Problem, scene: SourceSet, step: int) -> tuple[Problem, StepSources, Rounding]:
+    """Problem, sources and rounding of a step, which its update takes besides the state."""
+    optimize = spec.optimize
+    rounding = rounding_at(optimize.quantisation, optimize.seed, step, optimize.steps)
+    return problem, scene.look(optimize.seed, step), rounding
 
 
 def steps(

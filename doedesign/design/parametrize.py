@@ -4,15 +4,12 @@ The parameters are phases at the design wavelength in radians, one per cell (fre
 unbounded. Their height is taken modulo the full staircase, L steps, which is close to one wave there. Every colour
 sees that same height, so a wrap is a real step for the others, and the optimiser pays for it.
 
-Quantisation in the loop. The forward value is a height the process can make, so what is optimised is what is drawn.
-"straight_through" passes the gradient as if there were no rounding (Y. Bengio et al., arXiv:1308.3432). "annealed"
-blends from the continuous to the quantised height while the cubic schedule of L. Li et al., CVPR 2022
-(quantisation-aware deep optics), runs from a tenth to nine tenths of the steps. "none" leaves heights continuous.
+How heights are rounded in the loop is a strategy's (`doedesign.design.quantisation`).
 
 The depths of the etches may be parameters, too. Cells then take the nearest of the levels that these depths make.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from doedesign.design.quantisation import Rounding, blended_level, stochastic_level
 from fab.levels import Levels
 from sim.material import full_wave_height_m
 
 # A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
-DEPTH_SCALE = 0.1
+DEPTH_SCALE = 0.02
 
 
 class Parameters(NamedTuple):
@@ -45,11 +43,16 @@ class LevelParametrization(eqx.Module):
 
     metres_per_radian: float = eqx.field(static=True)
     levels: Levels = eqx.field(static=True)
+    quantisation: str = eqx.field(static=True, default="straight_through")
 
     @staticmethod
-    def at(material: str, design_wavelength_m: float, levels: Levels) -> "LevelParametrization":
-        """The staircase of a substrate at a design wavelength."""
-        return LevelParametrization(full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels)
+    def at(
+        material: str, design_wavelength_m: float, levels: Levels, quantisation: str = "straight_through"
+    ) -> "LevelParametrization":
+        """The staircase of a substrate at a design wavelength, with a strategy of `doedesign.design.quantisation`."""
+        return LevelParametrization(
+            full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels, quantisation
+        )
 
     def continuous_m(self, radians: Float[Array, "*s"]) -> Float[Array, "*s"]:
         """Wrapped height before quantisation, 0 up to L steps, metres."""
@@ -63,15 +66,17 @@ class LevelParametrization(eqx.Module):
         return jnp.where(nearest >= self.levels.count, 0.0, nearest)
 
     def height_m(
-        self, radians: Float[Array, "*s"], softness: Float[Array, ""], depths_m: Float[Array, " k"] | None = None
+        self, radians: Float[Array, "*s"], rounding: Rounding, depths_m: Float[Array, " k"] | None = None
     ) -> Float[Array, "*s"]:
-        """Height that is optimised: quantised at softness 0, continuous at 1, blended between.
+        """Height that is optimised: quantised at softness 0, continuous at 1, blended between, or as chance has it.
 
-        The gradient with respect to `radians` is that of the continuous height at softness 0 and 1 (straight-through),
+        Without chance, the gradient with respect to `radians` is that of the continuous height at softness 0 and 1,
         and the blend's own otherwise. `depths_m` are the depths of the etches, mask 0 first, if they are not those of
         the staircase; the gradient with respect to them is that of the levels' heights, at the same nearest level.
         """
-        height = self.continuous_m(radians)
+        height, softness = self.continuous_m(radians), rounding.softness
+        if rounding.key is not None:
+            return self._at_random(height, rounding)
         if depths_m is None and self.levels.is_binary:
             stepped = _add_tangent(jax.lax.stop_gradient(self.level(height) * self.levels.step_m), height)
             blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
@@ -88,10 +93,18 @@ class LevelParametrization(eqx.Module):
         blended = softness * height + (1.0 - softness) * stepped
         return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
 
-    def height_of(self, parameters: Parameters, softness: Float[Array, ""]) -> Float[Array, "*s"]:
+    def height_of(self, parameters: Parameters, rounding: Rounding) -> Float[Array, "*s"]:
         """`height_m` of all that an optimisation moves."""
         ratio = parameters.log_depth_ratio
-        return self.height_m(parameters.radians, softness, None if ratio is None else self.depths_m(ratio))
+        return self.height_m(parameters.radians, rounding, None if ratio is None else self.depths_m(ratio))
+
+    def _at_random(self, height_m: Float[Array, "*s"], rounding: Rounding) -> Float[Array, "*s"]:
+        """Heights of levels drawn at random, on even steps, which go round: level L is level 0 of the next wave."""
+        level = height_m / self.levels.step_m
+        if self.quantisation == "gumbel":
+            return jnp.mod(blended_level(level, rounding), self.levels.count) * self.levels.step_m
+        drawn = jnp.mod(stochastic_level(jax.lax.stop_gradient(level), rounding), self.levels.count)
+        return _add_tangent(drawn * self.levels.step_m, height_m)
 
     def _nearest(self, height_m: Float[Array, "*s"], depths_m: Float[Array, " k"]) -> Int[Array, "*s"]:
         """Nearest level of a wrapped height if the etches have these depths (`fab.levels.wrapped_cells`)."""
@@ -137,14 +150,3 @@ def _add_tangent(stepped_m: Array, height_m: Array) -> Array:
 @_add_tangent.defjvp
 def _add_tangent_tangent(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     return primals[0], tangents[0] + tangents[1]
-
-
-def softness_at(quantisation: Literal["straight_through", "annealed", "none"], step: int, steps: int) -> float:
-    """Softness of the staircase at a step: 0 is what will be drawn."""
-    if quantisation == "straight_through":
-        return 0.0
-    if quantisation == "none":
-        return 1.0
-    start, end = 0.1 * steps, 0.9 * steps
-    remaining = np.clip((end - step) / max(end - start, 1), 0.0, 1.0)
-    return float(remaining**3)

@@ -138,14 +138,16 @@ def plans_of(spec: Spec) -> Problem:
     camera, process = camera_from_spec(spec), spec.process
     # Depths that are to be chosen begin at 2^k steps.
     levels = levels_from_spec(process, Levels(process.levels, process.level_step_m))
-    radial = spec.optimize.parametrization == "radial"
+    optimize, radial = spec.optimize, spec.optimize.parametrization == "radial"
     depths_m = (*spec.scene.near_m, *spec.scene.far_m)
     flat = optic_as_drawn(camera, np.zeros(camera.grid.shape), depths_m=depths_m)
     optic = RingOptic(camera, jnp.zeros(ring_count(camera))) if radial else flat
     propagation = "far_field" if radial else spec.propagation
     sampling = 1.0 if _is_sparse(spec) else None
     return Problem(
-        parametrization=LevelParametrization.at(camera.material, spec.optics.design_wavelength_m, levels),
+        parametrization=LevelParametrization.at(
+            camera.material, spec.optics.design_wavelength_m, levels, optimize.quantisation
+        ),
         terms=(),
         plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),
         optic=optic,

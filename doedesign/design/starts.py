@@ -24,13 +24,23 @@ _WHERE = "optimize.start_options"
 
 
 class StartSetup(NamedTuple):
-    """Design task of a start: whether its heights are a profile over rings instead of a map, and their loss."""
+    """Design task of a start.
+
+    Attributes:
+        camera: optics and sensor.
+        radial: whether its heights are a profile over rings instead of a map.
+        wavelength_m: the design wavelength, metres.
+        seed: of everything random.
+        loss: loss of heights.
+        level_step_m: distance of the levels to which heights will be rounded, metres; 0 if they will not.
+    """
 
     camera: Camera
     radial: bool
     wavelength_m: float
     seed: int = 0
     loss: Callable[[Heights], float] = lambda _: 0.0
+    level_step_m: float = 0.0
 
     @property
     def wave_m(self) -> float:
@@ -63,14 +73,19 @@ def zeroth_orders(setup: StartSetup, ridge: Ridge) -> Float[np.ndarray, " w"]:
     1 - 4 p (1 - p) sin²(phi / 2) for a duty p and ridges of phase phi = 2 pi (n-1) h / lambda, the square of the mean
     of its two waves (J. W. Goodman, *Introduction to Fourier Optics*, §4.4).
     """
-    material, (height_m, duty) = setup.camera.material, ridge
+    return _order_shares(_waves_of_colours(setup), ridge)
 
-    def order(wavelength_m: float) -> float:
-        half_phase = np.pi * height_m / full_wave_height_m(material, wavelength_m)
-        return 1 - 4 * duty * (1 - duty) * float(np.sin(half_phase)) ** 2
 
-    colours = setup.camera.colours
-    return np.array([np.dot(c.weights, [order(w) for w in c.wavelengths_m]) / sum(c.weights) for c in colours])
+def _waves_of_colours(setup: StartSetup) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For every colour the height of a wave at each of its wavelengths, metres, and the wavelength's share."""
+    material, colours = setup.camera.material, setup.camera.colours
+    waves = [np.array([full_wave_height_m(material, w) for w in colour.wavelengths_m]) for colour in colours]
+    return [(wave, np.array(c.weights) / sum(c.weights)) for wave, c in zip(waves, colours, strict=True)]
+
+
+def _order_shares(waves: list[tuple[np.ndarray, np.ndarray]], ridge: Ridge) -> Float[np.ndarray, " w"]:
+    depth = 4 * ridge.duty * (1 - ridge.duty)
+    return np.array([1 - depth * share @ np.sin(np.pi * ridge.height_m / wave_m) ** 2 for wave_m, share in waves])
 
 
 def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
@@ -84,9 +99,11 @@ def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
     if len(setup.camera.colours) == 1:
         return Ridge(setup.wave_m * float(np.arccos(np.sqrt(far_energy))) / np.pi, 0.5)
 
+    waves, wave_m = _waves_of_colours(setup), setup.wave_m
+
     def miss(values: np.ndarray, _gradient: np.ndarray) -> float:
-        ridge = Ridge(float(values[0]) * setup.wave_m, float(values[1]))
-        return float(np.sum((zeroth_orders(setup, ridge) - far_energy) ** 2))
+        ridge = Ridge(float(values[0]) * wave_m, float(values[1]))
+        return float(np.sum((_order_shares(waves, ridge) - far_energy) ** 2))
 
     best = np.array([0.5, 0.25])
     for algorithm, count in ((nlopt.GN_DIRECT_L, 400), (nlopt.LN_SBPLX, 400)):
@@ -136,14 +153,17 @@ def ring(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     """Circular `grating` of `period`, equally bright in all colours (`balanced_ridge`), that the optimiser can leave.
 
     `height` and `duty` may be given in place of `far_energy`. A perfect grating is a stationary point in many
-    directions; a little `roughness`, in waves, lets the optimiser leave it. The quarter wave below keeps the floor of
-    the grating away from the wrap at zero.
+    directions; a little `roughness`, in waves, lets the optimiser leave it. The floor of the grating is the level next
+    to a quarter wave, away from the wrap at zero and from where two levels meet.
     """
     ridge = balanced_ridge(setup, _number(options, "far_energy", 0.25, 0.0, 1.0))
     ridge = Ridge(_length(options, "height", ridge.height_m), _number(options, "duty", ridge.duty, 0.0, 1.0))
     heights = grating(setup, ridge, _length(options, "period", ring_period_m(setup.camera)))
     noise = np.random.default_rng(setup.seed).standard_normal(heights.shape)
-    return heights + setup.wave_m * (0.25 + _number(options, "roughness", 0.02, 0.0, 1.0) * noise)
+    floor_m, step_m = setup.wave_m / 4, setup.level_step_m
+    if step_m:
+        floor_m = step_m * round(floor_m / step_m - 1e-3)  # of two levels the lower one
+    return heights + floor_m + setup.wave_m * _number(options, "roughness", 0.02, 0.0, 1.0) * noise
 
 
 def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:

@@ -13,7 +13,7 @@ from doedesign.spec.targets.areas import area_problems
 from doedesign.spec.targets.focus import focus_problems
 from doedesign.spec.targets.spots import spot_problems
 from doedesign.spec.training import training_problems
-from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, nearest
+from doedesign.spec.values import BEAM_FILES, NEAR_OBJECTIVES, RANDOM_QUANTISATIONS, nearest
 from doedesign.spec.values.table import toml_key
 from fab.aperture import MaskAperture
 from fab.errors import InputError
@@ -33,7 +33,7 @@ _BEAM_KEYS = {
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
-    rules = (*rules, _limits, _training, spot_problems, area_problems, focus_problems)
+    rules = (*rules, _quantisation, _limits, _training, spot_problems, area_problems, focus_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -262,6 +262,18 @@ def _fresnel_sampling(spec: Spec) -> Iterator[InputError]:
     )
 
 
+def _quantisation(spec: Spec) -> Iterator[InputError]:
+    process, quantisation = spec.process, spec.optimize.quantisation
+    if quantisation in RANDOM_QUANTISATIONS and process.etch_depths_m is not None:
+        rule = f'"{quantisation}" draws levels of equal steps'
+        cure = "Leave process.etch_depths out, or use another quantisation."
+        yield InputError("optimize.quantisation", rule, "etch depths of their own", cure)
+    if spec.optimize.polish and (quantisation == "none" or process.etch_depths_m is not None):
+        rule, cure = "a descent on levels needs levels of equal steps", "Leave polish out."
+        got = "continuous heights" if quantisation == "none" else "etch depths of their own"
+        yield InputError("optimize.polish", rule, got, cure)
+
+
 def _objectives(spec: Spec) -> Iterator[InputError]:
     if not (spec.objectives or spec.aims) and spec.optimize.steps > 0:
         rule = "an optimisation must have something to improve"
@@ -284,7 +296,11 @@ def _cases(spec: Spec, index: int) -> Iterator[InputError]:
             yield InputError(f"objective[{index}].colours", rule, f'"{name}"', cure)
     if not objective.depths_m:
         return
-    looks = {"far_spot": ("far",), "target_pattern": ("far",), "near_spread": ("near",), "handcrafted": ("near", "far")}
+    looks = {
+        **dict.fromkeys(("far_spot", "spot_energy", "equal_colours", "target_pattern"), ("far",)),
+        "near_spread": ("near",),
+        "handcrafted": ("near", "far"),
+    }
     depths = {"near": scene.near_m, "far": scene.far_m}
     wanted = looks.get(objective.name, ())
     allowed = [depth for side in wanted or depths for depth in depths[side]]

@@ -217,11 +217,14 @@ class OptimizeSpec(SpecTable, frozen=True):
         steps: optimisation steps; 0 evaluates the start.
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
         seed: seed of everything random.
-        quantisation: levels in the loop: "straight_through", "annealed" or "none".
+        quantisation: levels in the loop: "straight_through", "annealed", "gumbel", "stochastic" or "at_end"; "none"
+            leaves heights continuous (`doedesign.design.quantisation`).
         sampling: "sparse" takes one FFT of the bare grid per PSF and moves the image by a random fraction of a
             pixel at every step, so that what one step misses averages out; "exact" integrates every pixel to 0.2 %
             at several times the work, with the image on the axis (for patterns that must fall on certain pixels).
             Both keep the cells' sinc about the axis for near sources, which the reported PSFs do not.
+        polish: moves of a descent on levels after the steps (`doedesign.design.descent`); each is kept only if the loss
+            falls, and costs as much as the steps that see every depth twice.
         checkpoint_every: steps between checkpoints.
     """
 
@@ -231,8 +234,9 @@ class OptimizeSpec(SpecTable, frozen=True):
     steps: Steps = 200
     learning_rate: Positive = 0.1
     seed: Seed = 0
-    quantisation: Literal["straight_through", "annealed", "none"] = "straight_through"
+    quantisation: Literal["straight_through", "annealed", "gumbel", "stochastic", "at_end", "none"] = "straight_through"
     sampling: Literal["sparse", "exact"] = "sparse"
+    polish: Steps = optional(0)
     checkpoint_every: Count = 25
 
 

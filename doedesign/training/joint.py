@@ -25,8 +25,8 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import sensor_from_spec
 from doedesign.capture.scenes import Batch
-from doedesign.design.parametrize import softness_at
 from doedesign.design.problem import plans_of
+from doedesign.design.quantisation import ROUNDED, Rounding, rounding_at
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
@@ -149,11 +149,11 @@ class Trainer(eqx.Module):
         seen, keys = self._seen(batch, train.seed, train.field == "random", shared=self.mesh is not None)
         if self.mesh is not None:
             seen, keys = parts_of((seen, keys), self.mesh)
-        softness = jnp.float32(softness_at(self.spec.optimize.quantisation, state.step, train.steps))
+        rounding = rounding_at(self.spec.optimize.quantisation, train.seed, state.step, train.steps)
         learnt = (state.network, state.free)
         moves = (rates.network > 0, rates.optics > 0)
         moments = (state.network_moments, state.optics_moments)
-        constants = trainer, seen, keys, softness, jnp.asarray(rates, jnp.float32), moves
+        constants = trainer, seen, keys, rounding, jnp.asarray(rates, jnp.float32), moves
         (network, free), moments, loss, terms = _update()(constants, (learnt, moments))
         cure = "Lower train.learning_rate or train.optics_learning_rate."
         line = history_line("train", state.step, loss, terms, rates._asdict(), cure)
@@ -291,49 +291,51 @@ def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
 
 @partial(eqx.filter_value_and_grad, has_aux=True)
 def _slopes(
-    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array
+    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, rounding: Rounding
 ) -> tuple[Array, Array]:
     """The loss and its terms, with the gradient by all that moves."""
     network, free = eqx.combine(moving, still)
     train = trainer.spec.train
-    found = shots(seen, trainer.doe, free, softness, trainer.bench, keys)
+    found = shots(seen, trainer.doe, free, rounding, trainer.bench, keys)
     half, checkpointed = train.precision == "mixed", train.checkpointing
     picture = network(found.capture, found.far, found.near, half=half, checkpointed=checkpointed)
     reference, mask = srgb_from_linear(jnp.asarray(seen.scene.background)), seen.scene.obstructions[0].mask
     return losses(picture, reference, jnp.asarray(mask), train, trainer.perceptual)
 
 
-def _mean_slopes(moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, softness: Array) -> Any:
+def _mean_slopes(
+    moving: Any, still: Any, trainer: Trainer, seen: TrainingScene, keys: Array, rounding: Rounding
+) -> Any:
     """`_slopes`, averaged over all devices of the trainer."""
     if trainer.mesh is None:
-        return _slopes(moving, still, trainer, seen, keys, softness)
+        return _slopes(moving, still, trainer, seen, keys, rounding)
     arrays, rest = eqx.partition((still, trainer), eqx.is_array)
 
-    def local(moving: Any, arrays: Any, seen: TrainingScene, keys: Array, softness: Array) -> Any:
+    def local(moving: Any, arrays: Any, seen: TrainingScene, keys: Array, rounding: Rounding) -> Any:
         still, trainer = eqx.combine(arrays, rest)
-        found = _slopes(moving, still, trainer, seen, keys, softness)
+        found = _slopes(moving, still, trainer, seen, keys, rounding)
         return jax.tree.map(lambda leaf: jax.lax.pmean(leaf, AXIS), found)
 
     here, shared = PartitionSpec(AXIS), PartitionSpec()
     specs = (shared, shared, here, here, shared)
     call = jax.shard_map(local, mesh=trainer.mesh, in_specs=specs, out_specs=shared, check_vma=False)
-    return call(moving, arrays, seen, keys, softness)
+    return call(moving, arrays, seen, keys, rounding)
 
 
 _Learnt = tuple[Network, Any]
-_Constants = tuple[Trainer, TrainingScene, Array, Array, Array, tuple[bool, bool]]
+_Constants = tuple[Trainer, TrainingScene, Array, Rounding, Array, tuple[bool, bool]]
 
 
 def _take(constants: _Constants, changing: tuple[_Learnt, tuple[Any, Any]]) -> Any:
     """One step in arrays."""
-    trainer, seen, keys, softness, rates, moves = constants
+    trainer, seen, keys, rounding, rates, moves = constants
     learnt, moments = changing
     chosen = tuple(
         jax.tree.map(lambda leaf, move=move: move and eqx.is_inexact_array(leaf), part)
         for part, move in zip(learnt, moves, strict=True)
     )
     moving, still = eqx.partition(learnt, chosen)
-    (loss, terms), slopes = _mean_slopes(moving, still, trainer, seen, keys, softness)
+    (loss, terms), slopes = _mean_slopes(moving, still, trainer, seen, keys, rounding)
     fresh = [
         adam_step(part, slope, moment, rate) if move else (part, moment)
         for part, slope, moment, rate, move in zip(learnt, slopes, moments, rates, moves, strict=True)
@@ -349,5 +351,5 @@ def _update() -> Callable[[_Constants, tuple[_Learnt, tuple[Any, Any]]], Any]:
 
 @eqx.filter_jit
 def _look(network: Network, free: Any, trainer: Trainer, seen: TrainingScene, keys: Array) -> tuple[Capture, Array]:
-    found = shots(seen, trainer.doe, free, jnp.float32(0.0), trainer.bench, keys)
+    found = shots(seen, trainer.doe, free, ROUNDED, trainer.bench, keys)
     return found, network(found.capture, found.far, found.near)

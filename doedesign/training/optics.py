@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel
 from doedesign.design.parametrize import LevelParametrization
+from doedesign.design.quantisation import Rounding
 from sim.imaging.scene import Scene
 from sim.optic import ON_AXIS, HeightOptic, RingOptic, colour_energies
 from sim.psf_bank import BankOptic
@@ -39,15 +40,15 @@ class TrainingDoe(eqx.Module):
         """A point source, for every line; ValueError for one off the axis of a DOE of rings."""
         return tuple(self.optic.source(line, depth_m, field_rad) for line in self.optic.lines)
 
-    def psf(self, free: Array | None, softness: Array, sources: tuple[Any, ...]) -> Float[Array, "c y x"]:
+    def psf(self, free: Array | None, rounding: Rounding, sources: tuple[Any, ...]) -> Float[Array, "c y x"]:
         """PSF of every colour, energy per pixel.
 
         Args:
             free: the parameters; None for a DOE that stays as it is.
-            softness: of the quantisation (`doedesign.design.parametrize.softness_at`).
+            rounding: of the quantisation (`doedesign.design.quantisation.rounding_at`).
             sources: see `sources`.
         """
-        optic = self.optic if free is None else self.learnt.with_heights(self.learning.height_m(free, softness))
+        optic = self.optic if free is None else self.learnt.with_heights(self.learning.height_m(free, rounding))
         return colour_energies(optic, self.plans, sources)
 
     @property
@@ -82,18 +83,18 @@ def shots(
     seen: TrainingScene,
     doe: TrainingDoe,
     free: Array | None,
-    softness: Array,
+    rounding: Rounding,
     bench: CaptureModel,
     keys: Key[Array, " b"],
 ) -> Capture:
     """Photograph a batch, one scene after the other: every array of `seen`, and `keys`, has a first axis for it.
 
-    Through a DOE with these parameters and softness (`TrainingDoe.psf`), with noise of these keys.
+    Through a DOE with these parameters and rounding (`TrainingDoe.psf`), with noise of these keys.
     """
 
     def shot(given: tuple[TrainingScene, Key[Array, ""]]) -> Capture:
         one, key = given
-        far, near = (doe.psf(free, softness, sources) for sources in (one.far, one.near))
+        far, near = (doe.psf(free, rounding, sources) for sources in (one.far, one.near))
         return Capture(bench.developed(jax.tree.map(jnp.asarray, one.scene), far, near, key), far, near)
 
     if len(keys) == 1:

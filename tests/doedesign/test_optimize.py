@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from doedesign import optimization
+from doedesign.design.descent import descend, looks_of
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
 from doedesign.design.problem import losses, problem_of, view_of
 from doedesign.runs.folder import begin_run, claim_run
@@ -38,7 +39,14 @@ def run(
 
 
 @pytest.mark.parametrize("parametrization", ["freeform", pytest.param("radial", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("quantisation", ["straight_through", "annealed", pytest.param("none", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "quantisation",
+    [
+        "straight_through",
+        "annealed",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("none", "gumbel", "stochastic")),
+    ],
+)
 def test_loss_falls(parametrization: str, quantisation: str) -> None:
     overrides = [*SMALL, f"optimize.parametrization={parametrization}", f"optimize.quantisation={quantisation}"]
     _, history = run(load_spec(EXAMPLES / "quick.toml", [*overrides, "optimize.steps=30"]))
@@ -134,3 +142,41 @@ def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.
     assert optimization.steps_within(other, 10.0, tmp_path / "run") == 80
     with pytest.raises(InputError, match="something to improve"):
         optimization.steps_within(load_spec(EXAMPLES / "quick.toml", ["objective=[]", "optimize.steps=0"]), 10.0)
+
+
+def test_a_descent_on_levels_lowers_the_loss_and_repeats() -> None:
+    """Judged where it looks, a descent never ends higher; every cell ends on a level, and none went round."""
+    spec = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.steps=4"])
+    problem, scene = problem_of(spec, {})
+    *_, (state, _) = steps(spec, problem, scene, initial_state(spec, problem, scene, {}, unread))
+    staircase, losses_seen = problem.parametrization, []
+    before = np.asarray(staircase.level(staircase.continuous_m(state.parameters.radians)))
+    found = [
+        descend(spec, problem, scene, state.parameters, 6, lambda move, loss: losses_seen.append((move, loss)))
+        for _ in range(2)
+    ]
+    np.testing.assert_array_equal(found[0].radians, found[1].radians)
+    once = [loss for _, loss in losses_seen[:6]]
+    assert [move for move, _ in losses_seen] == [1, 2, 3, 4, 5, 6] * 2
+    assert once == sorted(once, reverse=True)
+    assert once[-1] < once[0]
+    heights = np.asarray(staircase.continuous_m(found[0].radians)) / staircase.levels.step_m
+    assert np.allclose(heights, np.round(heights), atol=1e-4)
+    moved = np.round(heights) - before
+    assert 0 < np.abs(moved).max() <= 6
+    looks = looks_of(scene, spec.optimize.seed)
+    assert len(looks) == 2 * max(len(scene.near[0]), len(scene.far[0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["optimize.polish=3", "optimize.quantisation=none"], "a descent on levels needs levels of equal steps"),
+        (["optimize.polish=-1"], "optimize.polish"),
+        (["optimize.quantisation=gumbel", 'process.etch_depths="optimize"'], '"gumbel" draws levels of equal steps'),
+        (["optimize.quantisation=sometimes"], "optimize.quantisation"),
+    ],
+)
+def test_rounding_that_cannot_be_is_told(change: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        load_spec(EXAMPLES / "quick.toml", change)

@@ -167,7 +167,7 @@ def test_overrides_change_single_values():
     )
     assert (spec.process.levels, spec.process.level_step_m) == (8, 150e-9)
     assert [colour.name for colour in spec.optics.colours] == ["532nm"]
-    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5, 1.0]
+    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5, 1.0, 2.0]
     assert dict(spec.optimize.start_options) == {"far_energy": 0.3}
     assert spec.sensor.defocus_m == -20e-6
 
@@ -176,7 +176,7 @@ def test_overrides_change_single_values():
     ("override", "message"),
     [
         ("process.levels", 'an override must be KEY=VALUE, but got "process.levels"'),
-        ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 3"),
+        ("objective.7.weight=1", "`7` must be an entry of what the spec holds there, but got a list of 4"),
         ("name.first=1", "`first` must be an entry of what the spec holds there, but got a single value"),
         ("process.levls=8", "overrides: process.levls: must be a known key of [process], but got `levls`. Did"),
         ("process.levels=8\nname='x'", "overrides: process.levels: must be a whole number"),

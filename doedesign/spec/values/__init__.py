@@ -35,6 +35,8 @@ OBJECTIVES = (
     "handcrafted",
     "target_pattern",
 )
+# The ways to round in the loop (`doedesign.design.quantisation`) that draw levels at random.
+RANDOM_QUANTISATIONS = ("gumbel", "stochastic")
 NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 
 # The built-in starts with their options; each is a function of the same name in `doedesign.design.starts`.
