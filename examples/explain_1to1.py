@@ -60,15 +60,21 @@ from fab.units import UM
 
 HERE = Path(__file__).parent
 
-# Changes to that spec. A few small steps from a grating of rings leave a ring; many large ones spread the light.
+TERMS = 'objective=[{{name="far_spot"}}, {{name="near_spread", weight={}}}, {{name="window_loss", weight={}}}]'
+# Changes to that spec. A few small steps from a grating of rings, which keeps a fifth of the light at 550 nm, leave a
+# ring; many large ones from one that keeps a quarter spread the light.
 RING = (
-    "optimize.start_options={far_energy=0.2}",
+    'optimize.start_options={height="421 nm", duty=0.5}',
     "optimize.learning_rate=0.05",
     "optimize.steps=40",
-    "objective.1.weight=5",
-    "objective.2.weight=4",
+    TERMS.format(5, 4),
 )
-EVEN = ("optimize.learning_rate=0.1", "optimize.steps=100", "objective.1.weight=3.2", "objective.2.weight=3.5")
+EVEN = (
+    'optimize.start_options={height="399 nm", duty=0.5}',
+    "optimize.learning_rate=0.1",
+    "optimize.steps=100",
+    TERMS.format(3.2, 3.5),
+)
 
 
 def design(scale: int = 4, changes: Sequence[str] = RING, runs: Path = Path("runs")) -> Run:

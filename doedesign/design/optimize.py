@@ -34,6 +34,8 @@ from fab.level_map import LevelMap
 from fab.levels import Levels
 from sim.aperture import open_cells
 
+_WARMING = 20  # steps over which the step size grows, at most
+
 
 class OptimizationState(NamedTuple):
     """Everything a step changes: the parameters, Adam's moments of them, and the number of steps done."""
@@ -49,8 +51,13 @@ class OptimizationState(NamedTuple):
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
-    """Adam whose step size falls to a twentieth along a cosine, so that levels settle."""
-    schedule = optax.cosine_decay_schedule(spec.optimize.learning_rate, max(spec.optimize.steps, 1), alpha=0.05)
+    """Adam whose step size grows from a tenth over the first steps and falls to a twentieth along a cosine.
+
+    The first steps of Adam follow the sign of the slope alone: large ones would add a lens of their own to the plate,
+    whose focus no later step takes away. The small ones at the end let levels settle.
+    """
+    rate, count = spec.optimize.learning_rate, max(spec.optimize.steps, 1)
+    schedule = optax.warmup_cosine_decay_schedule(rate / 10, rate, min(_WARMING, count // 4), count, rate / 20)
     return optax.adam(schedule)
 
 

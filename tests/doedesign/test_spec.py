@@ -167,7 +167,7 @@ def test_overrides_change_single_values():
     )
     assert (spec.process.levels, spec.process.level_step_m) == (8, 150e-9)
     assert [colour.name for colour in spec.optics.colours] == ["532nm"]
-    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5, 1.0, 2.0]
+    assert [objective.weight for objective in spec.objectives] == [1.0, 2.5, 0.8, 30.0]
     assert dict(spec.optimize.start_options) == {"far_energy": 0.3}
     assert spec.sensor.defocus_m == -20e-6
 

@@ -173,11 +173,11 @@ def test_a_whole_spec_reads_back(tmp_path: Path):
 def test_limits_of_the_automotive_example():
     limits = load_spec(AUTOMOTIVE).limits
     assert [(limit.quantity, limit.min, limit.max) for limit in limits] == [
-        ("zeroth_order", None, 0.05),
-        ("ring_to_disc", 2.0, None),
+        ("zeroth_order", None, 0.25),
+        ("ring_to_disc", 1.2, None),
     ]
     spec = load_spec(AUTOMOTIVE, ["limit.1.colour=656nm", "limit.1.depth=5 cm", "limit.1.max=9.0"])
-    assert spec.limits[1] == LimitSpec(quantity="ring_to_disc", min=2.0, max=9.0, colour="656nm", depth_m=0.05)
+    assert spec.limits[1] == LimitSpec(quantity="ring_to_disc", min=1.2, max=9.0, colour="656nm", depth_m=0.05)
 
 
 def test_a_limit_may_hold_at_infinity(tmp_path: Path):
