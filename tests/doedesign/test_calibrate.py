@@ -268,7 +268,7 @@ def test_the_exact_gradient_agrees_and_polishes_nothing_away(objective: FitObjec
     linear = at.linearised(at.difference_jacobian(np.full(len(scores), 0.005)))
     expected = 2 * (scores - sum(linear.descents))
     np.testing.assert_allclose(gradient, expected, rtol=0.01, atol=0.01 * np.abs(expected).max())
-    plain, polished = search(objective), search(objective, polish=4)
+    plain, polished = search(objective), search(objective, polish=2)
     assert polished.at.cost <= plain.at.cost
     moved = objective.values(polished.at.scores) - objective.values(plain.at.scores)
     assert (np.abs(moved) < posterior_of(plain).sigma).all()
