@@ -4,7 +4,7 @@
 
 Every design is judged by PSFs that integrate every pixel, at all depths and colours, not by what its optimiser looked
 at. A move of the descent on levels sees every depth twice; designs that end with one have as many fewer steps before.
-Six minutes on two cores for examples/quick.toml.
+Five minutes on two cores for examples/quick.toml.
 """
 
 import argparse

@@ -92,29 +92,45 @@ def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
     """Ridge whose 0th order holds `far_energy` of every colour, as evenly as height and duty allow.
 
     One colour: half of the period, and the height of that order at the design wavelength. Several: the least sum of
-    squared misses, with heights up to one wave, by DIRECT-L (global, no gradient) and then Sbplx, both of NLopt.
+    squared misses, with heights up to one wave, by NLopt.
     """
-    import nlopt
-
     if len(setup.camera.colours) == 1:
         return Ridge(setup.wave_m * float(np.arccos(np.sqrt(far_energy))) / np.pi, 0.5)
 
     waves, wave_m = _waves_of_colours(setup), setup.wave_m
 
-    def miss(values: np.ndarray, _gradient: np.ndarray) -> float:
+    def miss(values: np.ndarray) -> float:
         ridge = Ridge(float(values[0]) * wave_m, float(values[1]))
         return float(np.sum((_order_shares(waves, ridge) - far_energy) ** 2))
 
-    best = np.array([0.5, 0.25])
-    for algorithm, count in ((nlopt.GN_DIRECT_L, 400), (nlopt.LN_SBPLX, 400)):
-        search = nlopt.opt(algorithm, 2)
-        search.set_min_objective(miss)
-        search.set_lower_bounds([0.0, 0.0])
-        search.set_upper_bounds([1.0, 0.5])
-        search.set_initial_step(0.01)
-        search.set_maxeval(count)
+    waves_high, duty = _least(miss, (0.0, 0.0), (1.0, 0.5), 0.01, (400, 400))
+    return Ridge(waves_high * wave_m, duty)
+
+
+def _least(
+    loss: Callable[[np.ndarray], float],
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+    step: float,
+    evaluations: tuple[int, int],
+) -> list[float]:
+    """Where a loss of a few values is least, from the middle of their range.
+
+    DIRECT-L (global, no gradient; D. R. Jones et al. 1993, as in NLopt) and then Sbplx from its best point, beginning
+    with a `step`; each with so many evaluations.
+    """
+    import nlopt
+
+    best = (np.array(low) + np.array(high)) / 2
+    for algorithm, count in zip((nlopt.GN_DIRECT_L, nlopt.LN_SBPLX), evaluations, strict=True):
+        search = nlopt.opt(algorithm, len(low))
+        search.set_min_objective(lambda values, _gradient: loss(values))
+        search.set_lower_bounds(low)
+        search.set_upper_bounds(high)
+        search.set_initial_step(step)
+        search.set_maxeval(max(count, 1))
         best = search.optimize(best)
-    return Ridge(float(best[0]) * setup.wave_m, float(best[1]))
+    return [float(value) for value in best]
 
 
 def grating(setup: StartSetup, ridge: Ridge, period_m: float) -> Heights:
@@ -169,29 +185,19 @@ def ring(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
 def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     """Fresnel lens of `focal_length`, or whose focal length gives the least loss in `evaluations` of it.
 
-    The paper's "Fresnel" baseline. The power is searched between minus and plus 40 edge waves with DIRECT-L (global,
-    no gradient; D. R. Jones et al. 1993, as in NLopt) for most of the evaluations, then with Sbplx from the best point.
+    The paper's "Fresnel" baseline. The power is searched between minus and plus 40 edge waves by NLopt, globally for
+    most of the evaluations, then from the best point.
     """
-    import nlopt
-
     if "focal_length" in options:
         return lens(setup, 1.0 / _length(options, "focal_length", 1.0))
     evaluations = int(_number(options, "evaluations", 30, 3, 10_000))
     limit = 40 * 2 * setup.wavelength_m / setup.camera.opening.reach_m**2
 
-    def loss(power: np.ndarray, _gradient: np.ndarray) -> float:
+    def loss(power: np.ndarray) -> float:
         return setup.loss(lens(setup, float(power[0]) * limit))
 
-    best = np.zeros(1)
-    for algorithm, count in ((nlopt.GN_DIRECT_L, evaluations * 2 // 3), (nlopt.LN_SBPLX, evaluations // 3)):
-        search = nlopt.opt(algorithm, 1)
-        search.set_min_objective(loss)
-        search.set_lower_bounds(-1.0)
-        search.set_upper_bounds(1.0)
-        search.set_initial_step(0.02)
-        search.set_maxeval(max(count, 1))
-        best = search.optimize(best)
-    return lens(setup, float(best[0]) * limit)
+    (power,) = _least(loss, (-1.0,), (1.0,), 0.02, (evaluations * 2 // 3, evaluations // 3))
+    return lens(setup, power * limit)
 
 
 def axicon(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
