@@ -70,28 +70,27 @@ class LevelParametrization(eqx.Module):
     ) -> Float[Array, "*s"]:
         """Height that is optimised: quantised at softness 0, continuous at 1, blended between, or as chance has it.
 
-        Without chance, the gradient with respect to `radians` is that of the continuous height at softness 0 and 1,
-        and the blend's own otherwise. `depths_m` are the depths of the etches, mask 0 first, if they are not those of
-        the staircase; the gradient with respect to them is that of the levels' heights, at the same nearest level.
+        Without Gumbel's blend, the gradient with respect to `radians` is that of the continuous height. `depths_m` are
+        the depths of the etches, mask 0 first, if they are not those of the staircase; the gradient with respect to
+        them is that of the levels' heights, at the same nearest level.
         """
         height, softness = self.continuous_m(radians), rounding.softness
         if rounding.key is not None:
             return self._at_random(height, rounding)
         if depths_m is None and self.levels.is_binary:
-            stepped = _add_tangent(jax.lax.stop_gradient(self.level(height) * self.levels.step_m), height)
-            blended = softness * height + (1.0 - softness) * jax.lax.stop_gradient(stepped)
-            return jnp.where(softness > 0, blended, stepped)
-        depths = jnp.asarray(self.levels.depths_m, jnp.float32) if depths_m is None else depths_m
-        level = self._nearest(height, depths)
-        if self.levels.is_full:
-            stepped = sum(jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths))
+            stepped = jax.lax.stop_gradient(self.level(height) * self.levels.step_m)
         else:
-            stepped = sum(
-                depth * rise[level]
-                for depth, rise in zip(depths, self._closed(jax.lax.stop_gradient(depths)).T, strict=True)
-            )
-        blended = softness * height + (1.0 - softness) * stepped
-        return jnp.where(softness > 0, blended, _add_tangent(stepped, height))
+            stepped = self._stepped(height, jnp.asarray(self.levels.depths_m) if depths_m is None else depths_m)
+        blended = softness * jax.lax.stop_gradient(height) + (1.0 - softness) * stepped
+        return _add_tangent(jnp.where(softness > 0, blended, stepped), height)
+
+    def _stepped(self, height_m: Float[Array, "*s"], depths_m: Float[Array, " k"]) -> Float[Array, "*s"]:
+        """Height of the nearest level, with its gradient with respect to the depths alone."""
+        level = self._nearest(height_m, depths_m)
+        if self.levels.is_full:
+            return sum((jnp.where(level >> k & 1, depth, 0.0) for k, depth in enumerate(depths_m)), jnp.zeros(()))
+        rises = self._closed(jax.lax.stop_gradient(depths_m)).T
+        return sum((d * rise[level] for d, rise in zip(depths_m, rises, strict=True)), jnp.zeros(()))
 
     def height_of(self, parameters: Parameters, rounding: Rounding) -> Float[Array, "*s"]:
         """`height_m` of all that an optimisation moves."""
