@@ -13,15 +13,14 @@ import numpy as np
 from doedesign.design.accuracy import accuracies, in_words
 from doedesign.design.descent import descend
 from doedesign.design.design import Design
-from doedesign.design.etch_depths import height_histogram, light_cost
+from doedesign.design.levels.etch_depths import height_histogram, light_cost
 from doedesign.design.metrics import design_metrics, drawn_patterns
 from doedesign.design.objectives import Objective, Term, source_digests
 from doedesign.design.optimize import (
     OptimizationState,
+    empty_state,
     finished_design,
-    first_parameters,
     initial_state,
-    optimiser_of,
     steps,
 )
 from doedesign.design.problem import Problem, SourceSet, problem_of
@@ -205,17 +204,17 @@ def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:
 def _resume(
     run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    parameters = first_parameters(run.spec, jnp.zeros(problem.optic.shape, jnp.float32))
-    template = jax.eval_shape(lambda: (parameters, optimiser_of(run.spec).init(parameters)))
-    leaves, tree = jax.tree.flatten(template)
+    empty = empty_state(run.spec, problem)
+    leaves, tree = jax.tree.flatten((empty.parameters, empty.adam, empty.printed))
     stored = load_checkpoint(run, leaves)
     if stored is None:
         log.info(f'starting from "{run.spec.optimize.start}"')
         return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []
     arrays, step, history = stored
     log.info(f"resuming after step {step}")
-    parameters, adam = jax.tree.unflatten(tree, [jnp.asarray(array) for array in arrays])
-    return OptimizationState(parameters, adam, step), history
+    parameters, adam, printed = jax.tree.unflatten(tree, arrays)
+    parameters, adam = jax.tree.map(jnp.asarray, (parameters, adam))
+    return OptimizationState(parameters, adam, step, printed), history
 
 
 def _aimed_task(spec: Spec) -> Any:
@@ -279,7 +278,7 @@ def _iterate(
 
 
 def _etch_metrics(camera: Camera, design: Design) -> dict[str, Any]:
-    """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.etch_depths`)."""
+    """The chosen depths, and what rounding to them costs beside 2^k steps (`doedesign.design.levels.etch_depths`)."""
     binary = Levels(design.levels.count, design.levels.step_m)
     area = open_cells(camera.grid, camera.opening)
     heights = height_histogram(np.asarray(design.continuous_m), area, binary.period_m, camera)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from doedesign.design.parametrize import Parameters
+from doedesign.design.levels.parametrize import Parameters
 from doedesign.design.problem import Problem, SourceSet, losses, view_of
 from doedesign.spec import Spec
 
@@ -54,7 +54,7 @@ def descend(
     level = np.asarray(staircase.level(staircase.continuous_m(parameters.radians))).astype(np.int32)
 
     def judge(level: np.ndarray) -> tuple[float, np.ndarray]:
-        height = jnp.asarray(level * np.float32(step_m), jnp.float32)
+        height = jnp.asarray(level * np.float32(step_m), jnp.float32)  # of the pixels that are drawn
         found = [_judged(problem, height, look) for look in looks]
         return float(np.mean([loss for loss, _ in found])), np.mean([slope for _, slope in found], axis=0)
 
@@ -80,4 +80,5 @@ def descend(
 
 @eqx.filter_jit
 def _judged(problem: Problem, height_m: Float[Array, "*s"], look: Any) -> tuple[Array, Float[Array, "*s"]]:
-    return jax.value_and_grad(lambda h: losses(problem, view_of(problem, h, look))[0])(height_m)
+    cells = problem.parametrization.cells
+    return jax.value_and_grad(lambda h: losses(problem, view_of(problem, cells(h), look))[0])(height_m)

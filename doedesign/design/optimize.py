@@ -5,8 +5,11 @@ fraction of a pixel; all follow from the seed and the step number, so a run that
 with the same bytes as one that was not.
 
 Where the depths of the etches are to be chosen, they are further parameters of the same optimisation
-(`doedesign.design.parametrize.LevelParametrization.depths_m`): which level a cell takes is straight-through as ever,
-and how high that level stands has a true gradient.
+(`doedesign.design.levels.parametrize.LevelParametrization.depths_m`): which level a cell takes is straight-through as
+ever, and how high that level stands has a true gradient.
+
+Where masks have to obey rules, the second half of the steps looks at level maps that do
+(`doedesign.design.levels.printable`).
 """
 
 import contextlib
@@ -19,13 +22,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from doedesign.design.design import Design
-from doedesign.design.etch_depths import height_histogram, optimal_levels, recipe_depths_m
-from doedesign.design.parametrize import Parameters
+from doedesign.design.levels.etch_depths import height_histogram, optimal_levels, recipe_depths_m
+from doedesign.design.levels.parametrize import Parameters
+from doedesign.design.levels.printable import PULL, PrintableLevels, first_printed, heights_m
+from doedesign.design.levels.quantisation import Rounding, rounding_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
-from doedesign.design.quantisation import Rounding, rounding_at
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import STARTS, Spec
@@ -38,16 +42,25 @@ _WARMING = 20  # steps over which the step size grows, at most
 
 
 class OptimizationState(NamedTuple):
-    """Everything a step changes: the parameters, Adam's moments of them, and the number of steps done."""
+    """Everything a step changes.
+
+    Attributes:
+        parameters: what is optimised.
+        adam: Adam's moments of it.
+        step: number of steps done.
+        printed: `[y, x]` levels that the last step looked at, of a design whose masks obey rules; blank before the
+            first such step, and None for other designs.
+    """
 
     parameters: Parameters
     adam: optax.OptState
     step: int
+    printed: UInt8[np.ndarray, "y x"] | None = None
 
     @property
     def arrays(self) -> list[np.ndarray]:
         """Arrays that a checkpoint keeps."""
-        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam))]
+        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam, self.printed))]
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
@@ -91,8 +104,31 @@ def initial_state(
             rule = "the start of a radial design must be a raster of rings one cell wide"
             cure = 'Use parametrization = "freeform", or another start.'
             raise InputError(str(path), rule, "a map with other structure", cure)
+    heights = problem.parametrization.drawn(heights)
     parameters: Any = first_parameters(spec, jnp.asarray(problem.parametrization.radians_of(heights)))
-    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0)
+    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, blank_of(spec, problem))
+
+
+def empty_state(spec: Spec, problem: Problem) -> OptimizationState:
+    """State of the same shapes and types as every other one of a spec."""
+    block = problem.parametrization.block
+    drawn = tuple(count // block for count in problem.optic.shape)
+    parameters: Any = first_parameters(spec, jnp.zeros(drawn, jnp.float32))
+    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, blank_of(spec, problem))
+
+
+def printable_levels(spec: Spec, problem: Problem) -> PrintableLevels | None:
+    """Rules that the masks of a spec obey, or None."""
+    feature_m, weight = spec.optimize.min_feature_m, spec.optimize.wall_weight
+    if feature_m is None:
+        return None
+    return PrintableLevels.on(problem.camera.grid, spec.doe.relief, problem.parametrization, feature_m, weight)
+
+
+def blank_of(spec: Spec, problem: Problem) -> UInt8[np.ndarray, "y x"] | None:
+    """Levels without etches of a spec whose masks obey rules; None for others."""
+    rules = printable_levels(spec, problem)
+    return None if rules is None else rules.blank.level
 
 
 def first_parameters(spec: Spec, radians: Array) -> Parameters:
@@ -121,6 +157,34 @@ def make_update(spec: Spec) -> Callable[[Any, Any], Any]:
     return compiled_step(update)
 
 
+def make_printed_update(spec: Spec) -> Callable[[Any, Any], Any]:
+    """Return the compiled update of a step that looks at given levels; as `make_update`, with their heights before.
+
+    Phases are pulled toward the levels. The update takes (problem, sources, heights `[y, x]` in metres) and the state
+    (parameters, adam), and returns the new state, the loss, its terms, and the levels nearest to the new phases.
+    """
+    optimiser = optimiser_of(spec)
+
+    def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
+        problem, look, height_m = inputs
+        (parameters, adam), parametrization = state, problem.parametrization
+
+        def loss_of(drawn_m: Array) -> tuple[Array, Array]:
+            return losses(problem, view_of(problem, parametrization.cells(drawn_m), look))
+
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(height_m)
+        slope: Any = Parameters(gradient * parametrization.metres_per_radian)
+        updates, adam = optimiser.update(slope, adam)
+        moved: Any = optax.apply_updates(parameters, updates)
+        wave = parametrization.levels.period_m / parametrization.metres_per_radian
+        away = height_m / parametrization.metres_per_radian - moved.radians
+        radians = moved.radians + PULL * (jnp.mod(away + wave / 2, wave) - wave / 2)
+        wanted = parametrization.level(parametrization.continuous_m(radians)).astype(jnp.uint8)
+        return (Parameters(radians), adam), loss, terms, wanted
+
+    return compiled_step(update)
+
+
 def step_inputs(spec: Spec, problem: Problem, scene: SourceSet, step: int) -> tuple[Problem, StepSources, Rounding]:
     """Problem, sources and rounding of a step, which its update takes besides the state."""
     optimize = spec.optimize
@@ -141,10 +205,18 @@ def steps(
         InputError: the loss is no longer finite.
     """
     update, names = make_update(spec), [term.name for term in problem.terms]
+    rules, printed_update = printable_levels(spec, problem), make_printed_update(spec)
     for step in range(state.step, spec.optimize.steps):
         inputs = step_inputs(spec, problem, scene, step)
-        (parameters, adam), loss, terms = update(inputs, (state.parameters, state.adam))
-        state = OptimizationState(parameters, adam, step + 1)
+        before = state.parameters, state.adam
+        if rules is None or step < first_printed(spec.optimize.steps):
+            (parameters, adam), loss, terms = update(inputs, before)
+            state = OptimizationState(parameters, adam, step + 1, state.printed)
+        else:
+            level = _printed(rules, problem, spec, state)
+            height = jnp.asarray(heights_m(level, problem.parametrization))
+            (parameters, adam), loss, terms, wanted = printed_update((problem, inputs[1], height), before)
+            state = OptimizationState(parameters, adam, step + 1, rules.nearer(level, np.asarray(wanted)))
         if not np.isfinite(float(loss)):
             cure = "Lower the learning rate."
             raise InputError(f"optimize, step {step}", "the loss must stay finite", float(loss), cure)
@@ -157,12 +229,27 @@ def finished_design(
 ) -> Design:
     """Return the design of the parameters: every cell at its nearest level, and the heights before rounding."""
     parametrization, camera = problem.parametrization, problem.camera
-    continuous = problem.optic.raster(np.asarray(parametrization.continuous_m(state.parameters.radians)))
+    drawn = parametrization.continuous_m(state.parameters.radians)
+    continuous = problem.optic.raster(np.asarray(parametrization.cells(drawn)))
     levels = _chosen_levels(spec, problem, state, continuous) if spec.process.chooses_depths else parametrization.levels
     level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
+    if (rules := printable_levels(spec, problem)) is not None:
+        level = np.asarray(parametrization.cells(jnp.asarray(_printed(rules, problem, spec, state))))
     level_map = LevelMap(level, levels, camera.grid, spec.doe.relief, spec.name)
     near_m, far_m = spec.scene.near_m, spec.scene.far_m
     return Design(level_map, camera, near_m, far_m, continuous_m=continuous, spec=spec, history=tuple(history))
+
+
+def _printed(
+    rules: PrintableLevels, problem: Problem, spec: Spec, state: OptimizationState
+) -> UInt8[np.ndarray, "y x"]:
+    """Levels of a state that can be printed: those of the last step, or the nearest to the phases."""
+    if state.printed is not None and state.step > first_printed(spec.optimize.steps):
+        return state.printed
+    parametrization = problem.parametrization
+    return rules.first(
+        np.asarray(parametrization.level(parametrization.continuous_m(state.parameters.radians)), np.uint8)
+    )
 
 
 def _chosen_levels(

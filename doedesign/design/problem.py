@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from doedesign.build import camera_from_spec, levels_from_spec
+from doedesign.design.levels.parametrize import LevelParametrization
 from doedesign.design.objectives import Objective, PsfSet, Term, terms_from_spec
-from doedesign.design.parametrize import LevelParametrization
 from doedesign.spec import Spec
 from fab.levels import Levels
 from sim.camera import Camera
@@ -146,7 +146,11 @@ def plans_of(spec: Spec) -> Problem:
     sampling = 1.0 if _is_sparse(spec) else None
     return Problem(
         parametrization=LevelParametrization.at(
-            camera.material, spec.optics.design_wavelength_m, levels, optimize.quantisation
+            camera.material,
+            spec.optics.design_wavelength_m,
+            levels,
+            optimize.quantisation,
+            round((optimize.drawn_pixel_m or spec.doe.pitch_m) / spec.doe.pitch_m),
         ),
         terms=(),
         plans=tuple(optic.plan(line, np.inf, propagation, sampling) for line in optic.lines),

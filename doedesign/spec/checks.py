@@ -33,7 +33,7 @@ _BEAM_KEYS = {
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
-    rules = (*rules, _quantisation, _limits, _training, spot_problems, area_problems, focus_problems)
+    rules = (*rules, _quantisation, _printing, _limits, _training, spot_problems, area_problems, focus_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 
@@ -272,6 +272,44 @@ def _quantisation(spec: Spec) -> Iterator[InputError]:
         rule, cure = "a descent on levels needs levels of equal steps", "Leave polish out."
         got = "continuous heights" if quantisation == "none" else "etch depths of their own"
         yield InputError("optimize.polish", rule, got, cure)
+
+
+def _printing(spec: Spec) -> Iterator[InputError]:
+    """Rules for the keys that say what masks may hold."""
+    optimize, doe = spec.optimize, spec.doe
+    if optimize.min_feature_m is not None:
+        refused = (
+            ("polish", optimize.polish > 0, "moves of cells would break it", "Leave polish out."),
+            ("quantisation", optimize.quantisation == "none", "masks have levels", "Choose a quantisation."),
+            (
+                "parametrization",
+                optimize.parametrization == "radial",
+                "rings break it at 45 degrees",
+                'Use "freeform".',
+            ),
+        )
+        for name, broken, rule, cure in refused:
+            if broken:
+                got = f"{getattr(optimize, name)}"
+                yield InputError(f"optimize.{name}", f"with a min_feature, {rule}", got, cure)
+        if spec.process.chooses_depths:
+            cure = "Give them, or leave min_feature out."
+            yield InputError("process.etch_depths", "with a min_feature, the depths must be known", '"optimize"', cure)
+    elif optimize.wall_weight:
+        cure = 'Add min_feature = "1 um", or leave it out.'
+        yield InputError("optimize.wall_weight", "goes with a min_feature", optimize.wall_weight, cure)
+    if optimize.drawn_pixel_m is None:
+        return
+    block = round(optimize.drawn_pixel_m / doe.pitch_m)
+    if block < 1 or abs(optimize.drawn_pixel_m - block * doe.pitch_m) > 1e-6 * doe.pitch_m:
+        rule, got = f"must be a whole number of cells of {format_length(doe.pitch_m)}", optimize.drawn_pixel_m
+        cure = f'For example "{format_length(2 * doe.pitch_m)}".'
+        yield InputError("optimize.drawn_pixel", rule, format_length(got), cure)
+    elif any(count % block for count in doe.shape):
+        rule = f"must divide the {' x '.join(map(str, doe.shape))} cells"
+        yield InputError("optimize.drawn_pixel", rule, f"{block} cells", "Change doe.samples and doe.aperture.")
+    elif optimize.parametrization == "radial":
+        yield InputError("optimize.drawn_pixel", "rings are drawn of cells", '"radial"', 'Use "freeform".')
 
 
 def _objectives(spec: Spec) -> Iterator[InputError]:

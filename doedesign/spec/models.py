@@ -34,6 +34,7 @@ from doedesign.spec.values import (
     ColourName,
     Count,
     FarDepth,
+    NotNegative,
     Options,
     OptionsTable,
     Pitch,
@@ -52,7 +53,7 @@ from doedesign.spec.values.aperture import ApertureSizes, MaskRows, Samples, sha
 from doedesign.spec.values.table import SpecTable, optional
 from doedesign.spec.wafer import WaferSpec
 from fab.aperture import Aperture, aperture_from
-from fab.units import DEGREES, NM, UM, PlaceUnit, parse_length
+from fab.units import DEGREES, MM, NM, UM, PlaceUnit, parse_length
 from sim.camera import Light, Polarised
 from sim.material import MATERIALS
 
@@ -218,13 +219,20 @@ class OptimizeSpec(SpecTable, frozen=True):
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
         seed: seed of everything random.
         quantisation: levels in the loop: "straight_through", "annealed", "gumbel", "stochastic" or "at_end"; "none"
-            leaves heights continuous (`doedesign.design.quantisation`).
+            leaves heights continuous (`doedesign.design.levels.quantisation`).
         sampling: "sparse" takes one FFT of the bare grid per PSF and moves the image by a random fraction of a
             pixel at every step, so that what one step misses averages out; "exact" integrates every pixel to 0.2 %
             at several times the work, with the image on the axis (for patterns that must fall on certain pixels).
             Both keep the cells' sinc about the axis for near sources, which the reported PSFs do not.
         polish: moves of a descent on levels after the steps (`doedesign.design.descent`); each is kept only if the loss
             falls, and costs as much as the steps that see every depth twice.
+        min_feature_m: narrowest line and space of every mask, as a rule that the result never breaks; corners of lines
+            do not touch either. The second half of the steps looks at level maps that obey it
+            (`doedesign.design.levels.printable`). None for any.
+        wall_weight: with `min_feature`, cost of a wall as long as a cell and as deep as all levels together, in units
+            of 1 - cos of the phase error of a cell. The walls of every mask count.
+        drawn_pixel_m: side of the pixels that are drawn, a whole number of cells; None for one cell. Light is computed
+            on the cells.
         checkpoint_every: steps between checkpoints.
     """
 
@@ -237,6 +245,9 @@ class OptimizeSpec(SpecTable, frozen=True):
     quantisation: Literal["straight_through", "annealed", "gumbel", "stochastic", "at_end", "none"] = "straight_through"
     sampling: Literal["sparse", "exact"] = "sparse"
     polish: Steps = optional(0)
+    min_feature_m: Annotated[float, length(1 * NM, 1 * MM)] | None = optional()
+    wall_weight: NotNegative = optional(0.0)
+    drawn_pixel_m: Pitch | None = optional()
     checkpoint_every: Count = 25
 
 

@@ -25,12 +25,13 @@ from doedesign.build import camera_from_spec, process_from_spec
 from doedesign.capture.camera import CaptureModel, depth_range_m
 from doedesign.capture.from_spec import sensor_from_spec
 from doedesign.capture.scenes import Batch
+from doedesign.design.levels.quantisation import ROUNDED, Rounding, rounding_at
 from doedesign.design.problem import plans_of
-from doedesign.design.quantisation import ROUNDED, Rounding, rounding_at
 from doedesign.recon.network import Network, NetworkShape
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import Spec
 from doedesign.spec.training import TrainSpec
+from doedesign.spec.values.table import toml_key
 from doedesign.training.hosts import on_all, own_copy, parts_of
 from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.optics import Capture, TrainingDoe, TrainingScene, shots
@@ -113,6 +114,10 @@ class Trainer(eqx.Module):
         if mesh is not None and train.batch % mesh.size:
             rule = f"must be a multiple of the {mesh.size} devices"
             raise InputError(f"{source}: train.batch", rule, train.batch, "Change it, or take fewer devices.")
+        for key in ("min_feature_m", "drawn_pixel_m"):
+            if train.moves_optics and getattr(spec.optimize, key) is not None:
+                rule, got = "a plate of this design would not keep it while it is learnt", toml_key(key)
+                raise InputError(f"{source}: optimize.{got}", rule, got, 'Set train.freeze = "optics".')
         camera = replace(camera_from_spec(spec), window=spec.sensor.window | 1)
         if train.camera == "conventional":
             height_m = np.zeros(camera.grid.shape, np.float32)
@@ -248,10 +253,11 @@ def devices_mesh(count: int | None = None) -> Mesh | None:
 
 def _learnt_doe(spec: Spec, source: str) -> TrainingDoe:
     """A DOE that is learnt, or looked at off the axis, or with errors."""
+    drawn = spec.optimize.model_copy(update={"drawn_pixel_m": None})
     odd = spec.sensor.model_copy(update={"window": spec.sensor.window | 1})
     # Of a DOE with errors, the light of walls comes with its deviation from thin heights.
     light = spec.optics.model_copy(update={"light": "scalar"} if spec.train.fabricated else {})
-    problem = plans_of(spec.model_copy(update={"sensor": odd, "optics": light}))
+    problem = plans_of(spec.model_copy(update={"sensor": odd, "optics": light, "optimize": drawn}))
     optic = problem.optic
     if isinstance(optic, HeightOptic | EdgeOptic):  # one compiled step serves all depths and fields
         optic = replace(optic, source_kind=SeparableSource)

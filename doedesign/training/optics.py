@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from doedesign.capture.camera import CaptureModel
-from doedesign.design.parametrize import LevelParametrization
-from doedesign.design.quantisation import Rounding
+from doedesign.design.levels.parametrize import LevelParametrization
+from doedesign.design.levels.quantisation import Rounding
 from sim.imaging.scene import Scene
 from sim.optic import ON_AXIS, HeightOptic, RingOptic, colour_energies
 from sim.psf_bank import BankOptic
@@ -45,7 +45,7 @@ class TrainingDoe(eqx.Module):
 
         Args:
             free: the parameters; None for a DOE that stays as it is.
-            rounding: of the quantisation (`doedesign.design.quantisation.rounding_at`).
+            rounding: of the quantisation (`doedesign.design.levels.quantisation.rounding_at`).
             sources: see `sources`.
         """
         optic = self.optic if free is None else self.learnt.with_heights(self.learning.height_m(free, rounding))

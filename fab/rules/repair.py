@@ -37,7 +37,9 @@ _HARD = 1e6
 _GRAVITY = 1000
 # How often corners that touch in spite of it all are frozen anew.
 _ATTEMPTS = 4
-_WIDEST = 32
+WIDEST = 32
+_NO_WALLS = np.zeros(0)
+_SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,36 @@ def _phases(levels: Levels, waves_per_metre: float) -> NDArray[np.float64]:
     return 2 * math.pi * waves_per_metre * np.subtract.outer(levels.heights_m(), levels.heights_m())
 
 
+def _checked_waves(levels: Levels, waves_per_metre: float | None) -> float:
+    waves = 1 / levels.period_m if waves_per_metre is None else waves_per_metre
+    if not 0 < waves < math.inf:
+        raise InputError("waves per metre", "must be positive and finite", waves, "Give (n - 1) / wavelength.")
+    return waves
+
+
+def _task_of(
+    level_map: LevelMap, wanted: NDArray[np.uint8], rules: Rules, waves: float, wall: NDArray[np.float64]
+) -> RepairTask:
+    """A level map in work, and the levels that are wanted of it."""
+    levels, grid = level_map.levels, level_map.grid
+    line, space = (fewest_pixels(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
+    if max(line, space) > WIDEST:
+        rule = f"the narrowest line and space must not exceed {WIDEST} pixels"
+        raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")
+    # Moves and the runs beside them reach no farther than this.
+    pad, top = 2 * max(line, space) + 2, np.uint8(levels.count - 1)
+    # By what is etched, the top level first.
+    error = 1 - np.cos(_phases(levels, waves)[::-1, ::-1])
+    etched, target = (np.pad(top - level, pad) for level in (level_map.level, wanted))
+    free = np.pad(level_map.relief.inside(grid), pad)
+    return RepairTask(etched, target, free, error, pad, line, space, 1, wall)
+
+
+def _level_map_of(task: RepairTask, level_map: LevelMap) -> LevelMap:
+    inner = slice(task.pad, -task.pad)
+    return level_map.with_level(np.uint8(level_map.levels.count - 1) - task.etched[inner, inner])
+
+
 def repair(level_map: LevelMap, process: Process | Rules | str, waves_per_metre: float | None = None) -> Repair:
     """Change as few levels as possible, as little as possible, until no mask breaks a rule.
 
@@ -216,25 +248,13 @@ def repair(level_map: LevelMap, process: Process | Rules | str, waves_per_metre:
 def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repair:
     """Repair a level map that was checked; see `repair`."""
     level_map, rules = before.level_map, before.rules
-    levels, grid, wanted = level_map.levels, level_map.grid, level_map.level
-    waves = 1 / levels.period_m if waves_per_metre is None else waves_per_metre
-    if not 0 < waves < math.inf:
-        raise InputError("waves per metre", "must be positive and finite", waves, "Give (n - 1) / wavelength.")
-    line, space = (fewest_pixels(m, grid.pitch_m) for m in (rules.minimum_line_m, rules.minimum_space_m))
-    if max(line, space) > _WIDEST:
-        rule = f"the narrowest line and space must not exceed {_WIDEST} pixels"
-        raise InputError("rules", rule, f"{max(line, space)} pixels", "Design on a coarser raster.")
-    free, after = level_map.relief.inside(grid), before
+    levels, wanted = level_map.levels, level_map.level
+    waves = _checked_waves(levels, waves_per_metre)
+    free, after = level_map.relief.inside(level_map.grid), before
+    task = _task_of(level_map, wanted, rules, waves, _NO_WALLS)
     if not before.clean:
-        # Moves and the runs beside them reach no farther than this.
-        pad = 2 * max(line, space) + 2
-        top = levels.count - 1
-        # By what is etched, the top level first.
-        error = 1 - np.cos(_phases(levels, waves)[::-1, ::-1])
-        target = np.pad(np.uint8(top) - wanted, pad)
-        task = RepairTask(target.copy(), target, np.pad(free, pad), error, pad, line, space, 1)
         _repair_in_place(task)
-        after = check(level_map.with_level(np.uint8(top) - task.etched[pad:-pad, pad:-pad]), rules)
+        after = check(_level_map_of(task, level_map), rules)
     # How often which level took the place of which.
     number = after.level_map.level[free].astype(np.int64) * levels.count + wanted[free]
     pairs = np.bincount(number, minlength=levels.count**2)
@@ -248,3 +268,41 @@ def repaired(before: RulesReport, waves_per_metre: float | None = None) -> Repai
         broken_after=sum(plane.breaks for plane in after.planes),
     )
     return Repair(after.level_map, cost, after)
+
+
+def follow(
+    level_map: LevelMap,
+    wanted: NDArray[np.uint8],
+    rules: Rules,
+    waves_per_metre: float | None = None,
+    wall_weight: float = 0.0,
+) -> LevelMap:
+    """Move a level map toward the levels that are wanted, as far as it then breaks no rule that it kept before.
+
+    Every move sets a small rectangle to a level that is near it, and lowers the sum of the phase errors 1 - cos of all
+    pixels and of the cost of all walls. What two sweeps over the map do not reach stays for the next call.
+
+    Args:
+        level_map: the map before, best one that breaks no rule (`repair`).
+        wanted: `[y, x]` levels that are wanted.
+        rules: narrowest line and space, metres. Corners must not touch, whatever these are.
+        waves_per_metre: as for `repair`.
+        wall_weight: cost of a wall as long as a pixel and as deep as the period of the staircase, in units of 1 - cos.
+            Every mask has walls of its own: between levels 7 and 8 of 16 they are fifteen steps deep together.
+
+    Returns:
+        the map after; nothing has changed outside its relief.
+
+    Raises:
+        InputError: waves per metre that are not positive, or a minimum of more than 32 pixels.
+    """
+    levels, bits = level_map.levels, np.arange(level_map.levels.bits)
+    wall = _NO_WALLS
+    if wall_weight:
+        depths = np.array(levels.depths_m) / levels.period_m
+        wall = np.array([wall_weight * depths @ (masks >> bits & 1) for masks in range(2**levels.bits)])
+    task = _task_of(level_map, wanted, rules, _checked_waves(levels, waves_per_metre), wall)._replace(gravity=_GRAVITY)
+    for _ in range(_SWEEPS):
+        if not _sweep_all(task, _HARD, changed_too=True):
+            break
+    return _level_map_of(task, level_map)

@@ -1,8 +1,9 @@
 """Moves of a repair: rectangles of pixels that take another depth, and their effect on rules and light.
 
 The energy of a map is the weighted sum of the pixels by which runs are too short and of the corners that touch, over
-all bit planes at once, and of the error of every pixel. A depth is a number whose bits are the masks that etch. The
-functions look at no more than the surroundings of a rectangle, so moves far apart do not influence each other.
+all bit planes at once, of the error of every pixel, and of the cost of every wall. A depth is a number whose bits are
+the masks that etch. The functions look at no more than the surroundings of a rectangle, so moves far apart do not
+influence each other.
 """
 
 from typing import NamedTuple
@@ -16,8 +17,9 @@ class RepairTask(NamedTuple):
     """A level map in work, on maps that are padded by `pad` pixels of blank glass.
 
     By which masks each pixel is `etched` and `wanted` to be, which are `free` to change, what depth a costs where b is
-    wanted (`error[a, b]`), the narrowest `line` and `space` in pixels, and how many kissing corners one missing pixel
-    of width is as bad as (`gravity`).
+    wanted (`error[a, b]`), the narrowest `line` and `space` in pixels, how many kissing corners one missing pixel
+    of width is as bad as (`gravity`), and what a wall as long as a pixel costs between depths a and b (`wall[a ^ b]`;
+    empty where walls cost nothing).
     """
 
     etched: NDArray[np.uint8]
@@ -28,6 +30,7 @@ class RepairTask(NamedTuple):
     line: int
     space: int
     gravity: int
+    wall: NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -108,11 +111,19 @@ def offends(task, y, x):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def loss(task, y0, x0, y1, x1):  # pragma: no cover - compiled
-    """Return the summed error of the pixels of a rectangle."""
+    """Return the summed error of the pixels of a rectangle, and the cost of the walls in and around it."""
+    etched, wall = task.etched, task.wall
     total = 0.0
     for y in range(y0, y1):
         for x in range(x0, x1):
-            total += task.error[task.etched[y, x], task.wanted[y, x]]
+            total += task.error[etched[y, x], task.wanted[y, x]]
+    if wall.size:
+        for y in range(y0, y1):
+            for x in range(x0, x1 + 1):
+                total += wall[etched[y, x] ^ etched[y, x - 1]]
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1):
+                total += wall[etched[y, x] ^ etched[y - 1, x]]
     return total
 
 
@@ -181,11 +192,20 @@ def _improve(task, y, x, weight):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def sweep(task, first, last, weight, changed_too):  # pragma: no cover - compiled
-    """Take the best move of every offending pixel (and every changed one) of some rows; return how many were taken."""
+    """Take the best move of every offending pixel of some rows; return how many were taken.
+
+    With `changed_too` also of every pixel that is not as wanted, and of those at a wall where walls cost something.
+    """
+    etched = task.etched
     moved = 0
     for y in range(first, last):
-        for x in range(task.pad, task.etched.shape[1] - task.pad):
-            changed = changed_too and task.etched[y, x] != task.wanted[y, x]
-            if task.free[y, x] and (changed or offends(task, y, x)):
+        for x in range(task.pad, etched.shape[1] - task.pad):
+            if not task.free[y, x]:
+                continue
+            own = etched[y, x]
+            seen = changed_too and own != task.wanted[y, x]
+            if changed_too and task.wall.size and not seen:
+                seen = not own == etched[y, x - 1] == etched[y, x + 1] == etched[y - 1, x] == etched[y + 1, x]
+            if seen or offends(task, y, x):
                 moved += _improve(task, y, x, weight)
     return moved

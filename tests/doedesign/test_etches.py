@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.etch_depths import height_histogram, light_cost, optimal_levels, recipe_depths_m
+from doedesign.design.levels.etch_depths import height_histogram, light_cost, optimal_levels, recipe_depths_m
+from doedesign.design.levels.parametrize import DEPTH_SCALE, LevelParametrization
+from doedesign.design.levels.quantisation import ROUNDED, Rounding
 from doedesign.design.optimize import OptimizationState, finished_design, initial_state, steps
-from doedesign.design.parametrize import DEPTH_SCALE, LevelParametrization
 from doedesign.design.problem import losses, problem_of, view_of
-from doedesign.design.quantisation import ROUNDED, Rounding
 from doedesign.spec import Spec, load_spec
 from fab.grid import Grid
 from fab.levels import Levels, height_of, quantise, quantise_wrapped

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from doedesign.design.parametrize import LevelParametrization
-from doedesign.design.quantisation import Rounding, rounding_at
+from doedesign.design.levels.parametrize import LevelParametrization
+from doedesign.design.levels.quantisation import Rounding, rounding_at
 from fab.levels import Levels, height_of, quantise
 
 SIXTEEN = LevelParametrization.at("fused_silica", 550e-9, Levels(16, 75e-9))

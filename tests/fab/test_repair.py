@@ -13,7 +13,7 @@ from fab.layout.polygons import smallest_runs
 from fab.levels import Levels, planes
 from fab.rules import repair as repair_module
 from fab.rules.check import Rules, check
-from fab.rules.repair import repair
+from fab.rules.repair import follow, repair
 from tests.fab.maps import level_map_from
 
 UM = 1e-6
@@ -176,3 +176,57 @@ def test_impossible_demands_are_refused():
     for rate in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="waves per metre"):
             repair_map(random_map(), rate=rate)
+
+
+def depth_of_walls(level):
+    """Length times depth of all walls of all masks, pixels times steps, with code of its own."""
+    total = 0
+    for bit, plane in enumerate(planes(level, SIXTEEN)):
+        total += 2**bit * sum(
+            int(np.sum(plane.take(range(1, n), k) != plane.take(range(n - 1), k))) for k, n in enumerate(plane.shape)
+        )
+    return total
+
+
+def misses(level, wanted):
+    """Mean phase error 1 - cos."""
+    return np.mean(1 - np.cos(2 * np.pi * (level.astype(float) - wanted) / 16))
+
+
+@pytest.mark.parametrize(("line", "space"), [(1, 1), (2, 2), (2, 3)])
+def test_a_map_follows_another_and_breaks_no_rule(line, space):
+    wanted, rules = smooth_map(), Rules(line * UM, space * UM)
+    start = level_map_from(np.full(wanted.shape, 15, np.uint8), SIXTEEN, UM, math.inf)
+    moved, errors = start, [misses(start.level, wanted)]
+    for _ in range(6):
+        moved = follow(moved, wanted, rules, RATE)
+        errors.append(misses(moved.level, wanted))
+        assert check(moved, rules).clean
+    assert all(after <= before for before, after in pairwise(errors))
+    # A repair looks at the whole map with all its means; moves that must not break a rule come near it.
+    repaired = repair(start.with_level(wanted), rules, RATE).level_map.level
+    assert errors[-1] < errors[0] / 5
+    assert errors[-1] < 3 * misses(repaired, wanted)
+
+
+def test_walls_that_cost_are_fewer():
+    wanted, rules = smooth_map(), Rules(2 * UM, 2 * UM)
+    start = repair(level_map_from(wanted, SIXTEEN, UM, math.inf), rules, RATE).level_map
+    found = [follow(start, wanted, rules, RATE, weight).level for weight in (0.0, 0.3, 3.0)]
+    walls, errors = [depth_of_walls(one) for one in found], [misses(one, wanted) for one in found]
+    assert walls[0] > walls[1] > walls[2]
+    assert errors[1] < errors[2]
+    # No move pays more for light than it saves in walls, a wall of one step being a sixteenth of the weight; but moves
+    # of one pixel bar the way to others.
+    assert (errors[2] - errors[1]) * wanted.size < 1.2 * 3.0 / 16 * (walls[1] - walls[2])
+
+
+def test_what_follows_stays_blank_outside_the_relief():
+    wanted = random_map((64, 64))
+    start = level_map_from(np.full(wanted.shape, 15, np.uint8), SIXTEEN, UM, 60 * UM)
+    moved = follow(start, wanted, Rules(2 * UM, 2 * UM), RATE)
+    outside = ~start.grid.inside_circle(60 * UM)
+    assert np.all(moved.level[outside] == 15)
+    assert np.any(moved.level != 15)
+    with pytest.raises(InputError, match="waves per metre"):
+        follow(start, wanted, Rules(), 0.0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from doedesign.design.quantisation import CONTINUOUS, ROUNDED
+from doedesign.design.levels.quantisation import CONTINUOUS, ROUNDED
 from doedesign.training.joint import Trainer
 from doedesign.training.optics import TrainingDoe, shots
 from sim.optic import HeightOptic, RingOptic

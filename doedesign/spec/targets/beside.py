@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from doedesign.spec.values.table import toml_key
 from fab.errors import InputError
 from fab.units import format_length
 
@@ -11,7 +12,14 @@ if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
 # Keys of [optimize] that spots, areas and foci decide themselves, with their usual values.
-_OWN = (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through"), ("polish", 0))
+_OWN = (
+    ("parametrization", "freeform"),
+    ("start", "flat"),
+    ("quantisation", "straight_through"),
+    ("polish", 0),
+    ("min_feature_m", None),
+    ("drawn_pixel_m", None),
+)
 
 
 def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
@@ -32,7 +40,7 @@ def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
     for name, usual in _OWN:
         if (got := getattr(spec.optimize, name)) != usual:
             rule = "spots, areas and foci have starts and levels of their own"
-            yield InputError(f"optimize.{name}", rule, f'"{got}"', "Leave it out.")
+            yield InputError(f"optimize.{toml_key(name)}", rule, f'"{got}"', "Leave it out.")
 
 
 def in_focus(spec: "Spec") -> Iterator[InputError]:

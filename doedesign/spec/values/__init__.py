@@ -35,7 +35,7 @@ OBJECTIVES = (
     "handcrafted",
     "target_pattern",
 )
-# The ways to round in the loop (`doedesign.design.quantisation`) that draw levels at random.
+# The ways to round in the loop (`doedesign.design.levels.quantisation`) that draw levels at random.
 RANDOM_QUANTISATIONS = ("gumbel", "stochastic")
 NEAR_OBJECTIVES = ("near_spread", "handcrafted")
 

@@ -4,7 +4,7 @@ The parameters are phases at the design wavelength in radians, one per cell (fre
 unbounded. Their height is taken modulo the full staircase, L steps, which is close to one wave there. Every colour
 sees that same height, so a wrap is a real step for the others, and the optimiser pays for it.
 
-How heights are rounded in the loop is a strategy's (`doedesign.design.quantisation`).
+How heights are rounded in the loop is a strategy's (`doedesign.design.levels.quantisation`).
 
 The depths of the etches may be parameters, too. Cells then take the nearest of the levels that these depths make.
 """
@@ -15,9 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
-from doedesign.design.quantisation import Rounding, blended_level, stochastic_level
+from doedesign.design.levels.quantisation import Rounding, blended_level, stochastic_level
 from fab.levels import Levels
 from sim.material import full_wave_height_m
 
@@ -39,20 +39,39 @@ class Parameters(NamedTuple):
 
 
 class LevelParametrization(eqx.Module):
-    """Heights on a staircase from phases: one radian at the design wavelength is `metres_per_radian` high."""
+    """Heights on a staircase from phases: one radian at the design wavelength is `metres_per_radian` high.
+
+    What is drawn are pixels of `block` by `block` of the optic's cells.
+    """
 
     metres_per_radian: float = eqx.field(static=True)
     levels: Levels = eqx.field(static=True)
     quantisation: str = eqx.field(static=True, default="straight_through")
+    block: int = eqx.field(static=True, default=1)
 
     @staticmethod
     def at(
-        material: str, design_wavelength_m: float, levels: Levels, quantisation: str = "straight_through"
+        material: str,
+        design_wavelength_m: float,
+        levels: Levels,
+        quantisation: str = "straight_through",
+        block: int = 1,
     ) -> "LevelParametrization":
-        """The staircase of a substrate at a design wavelength, with a strategy of `doedesign.design.quantisation`."""
-        return LevelParametrization(
-            full_wave_height_m(material, design_wavelength_m) / (2 * np.pi), levels, quantisation
-        )
+        """The staircase of a substrate at a design wavelength.
+
+        Rounded by a strategy of `doedesign.design.levels.quantisation`, on pixels of `block` by `block` cells.
+        """
+        metres_per_radian = full_wave_height_m(material, design_wavelength_m) / (2 * np.pi)
+        return LevelParametrization(metres_per_radian, levels, quantisation, block)
+
+    def cells(self, drawn: Shaped[Array, "*s"]) -> Shaped[Array, "*t"]:
+        """Values of the optic's cells, of those of the pixels that are drawn."""
+        return drawn if self.block == 1 else jnp.repeat(jnp.repeat(drawn, self.block, 0), self.block, 1)
+
+    def drawn(self, cells: Float[np.ndarray, "*t"]) -> Float[np.ndarray, "*s"]:
+        """Values of the pixels that are drawn, each that of the cell in its middle."""
+        block = self.block
+        return cells if block == 1 else cells[block // 2 :: block, block // 2 :: block]
 
     def continuous_m(self, radians: Float[Array, "*s"]) -> Float[Array, "*s"]:
         """Wrapped height before quantisation, 0 up to L steps, metres."""
@@ -93,9 +112,9 @@ class LevelParametrization(eqx.Module):
         return sum((d * rise[level] for d, rise in zip(depths_m, rises, strict=True)), jnp.zeros(()))
 
     def height_of(self, parameters: Parameters, rounding: Rounding) -> Float[Array, "*s"]:
-        """`height_m` of all that an optimisation moves."""
+        """`height_m` of all that an optimisation moves, on the optic's cells."""
         ratio = parameters.log_depth_ratio
-        return self.height_m(parameters.radians, rounding, None if ratio is None else self.depths_m(ratio))
+        return self.cells(self.height_m(parameters.radians, rounding, None if ratio is None else self.depths_m(ratio)))
 
     def _at_random(self, height_m: Float[Array, "*s"], rounding: Rounding) -> Float[Array, "*s"]:
         """Heights of levels drawn at random, on even steps, which go round: level L is level 0 of the next wave."""
