@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from doedesign.design import analytic
 from doedesign.design.patterns import positive_length
+from doedesign.search import least
 from doedesign.spec import STARTS
 from fab.errors import InputError
 from fab.units import parse_angle
@@ -103,34 +104,8 @@ def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
         ridge = Ridge(float(values[0]) * wave_m, float(values[1]))
         return float(np.sum((_order_shares(waves, ridge) - far_energy) ** 2))
 
-    waves_high, duty = _least(miss, (0.0, 0.0), (1.0, 0.5), 0.01, (400, 400))
+    waves_high, duty = least(miss, (0.0, 0.0), (1.0, 0.5), (("direct", 400), ("sbplx", 400)), step=0.01)
     return Ridge(waves_high * wave_m, duty)
-
-
-def _least(
-    loss: Callable[[np.ndarray], float],
-    low: tuple[float, ...],
-    high: tuple[float, ...],
-    step: float,
-    evaluations: tuple[int, int],
-) -> list[float]:
-    """Where a loss of a few values is least, from the middle of their range.
-
-    DIRECT-L (global, no gradient; D. R. Jones et al. 1993, as in NLopt) and then Sbplx from its best point, beginning
-    with a `step`; each with so many evaluations.
-    """
-    import nlopt
-
-    best = (np.array(low) + np.array(high)) / 2
-    for algorithm, count in zip((nlopt.GN_DIRECT_L, nlopt.LN_SBPLX), evaluations, strict=True):
-        search = nlopt.opt(algorithm, len(low))
-        search.set_min_objective(lambda values, _gradient: loss(values))
-        search.set_lower_bounds(low)
-        search.set_upper_bounds(high)
-        search.set_initial_step(step)
-        search.set_maxeval(max(count, 1))
-        best = search.optimize(best)
-    return [float(value) for value in best]
 
 
 def grating(setup: StartSetup, ridge: Ridge, period_m: float) -> Heights:
@@ -196,7 +171,8 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     def loss(power: np.ndarray) -> float:
         return setup.loss(lens(setup, float(power[0]) * limit))
 
-    (power,) = _least(loss, (-1.0,), (1.0,), 0.02, (evaluations * 2 // 3, evaluations // 3))
+    stages = (("direct", evaluations * 2 // 3), ("sbplx", evaluations // 3))
+    (power,) = least(loss, (-1.0,), (1.0,), stages, step=0.02)
     return lens(setup, power * limit)
 
 
