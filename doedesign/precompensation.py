@@ -92,7 +92,8 @@ class _MaskRow(NamedTuple):
 
     def __str__(self) -> str:
         depths = f"{self.designed_nm:g} nm designed, {self.commanded_nm:g} commanded, {self.expected_nm:.4g} expected"
-        edges = f"drawn {self.edge_move_nm:g} nm further out, expected at {self.expected_edge_nm:.3g} nm"
+        way = "in" if self.edge_move_nm < 0 else "out"
+        edges = f"drawn {abs(self.edge_move_nm):g} nm further {way}, expected {self.expected_edge_nm:.3g} nm out"
         return f"mask {self.mask}: {depths}; edges {edges}"
 
 
@@ -174,7 +175,7 @@ class _Task:
                 progress.advance(next(tried), f"loss {found:.4f}")
                 return found
 
-            ends, stages = ((-_REACH,) * values, (_REACH,) * values), (("bobyqa", evaluations),) * (evaluations > 0)
+            ends, stages = ((-_REACH,) * values, (_REACH,) * values), (("sbplx", evaluations),) * (evaluations > 0)
             steps = least(judged, *ends, stages, step=1.0, start=(0.0,) * values, settled=_SETTLED)
         best, unit_m = self.commands(steps), pixel_edges(self.design.camera.grid).dbu_m
         moves_m = (float(f"{round(move / unit_m) * unit_m:.12g}") for move in best.moves_m)
