@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -195,6 +195,7 @@ def precompensate(
     *,
     process: Process | str | Path | None = None,
     random: Sequence[str] = (),
+    by: Literal["loss", "psfs"] = "loss",
     objectives: Mapping[str, Objective] | None = None,
     evaluations: int = EVALUATIONS,
     overwrite: bool = False,
@@ -213,6 +214,8 @@ def precompensate(
             the run's spec by default.
         random: errors that are drawn anew for every plate, such as "overlay", by the names that a calibration takes: an
             estimate of them is that of one plate, so they are those of the run's own process.
+        by: the least "loss" of the spec's objectives, spots, areas or foci, which may be less than the design's own; or
+            the least difference of the "psfs" from the design's, as for a spec that has none of them.
         objectives: objectives of the user's own, by the names that the spec gives them.
         evaluations: plates of the search; 0 leaves it at what undoes the mean of depths and line widths.
         overwrite: where the folder has another run, remove it with all that was made of it.
@@ -224,6 +227,8 @@ def precompensate(
         InputError: a run that cannot be read, a process of other levels, without errors to make up for or with errors
             beyond the model, or a folder that belongs to something else.
     """
+    if by not in ("loss", "psfs"):
+        raise InputError("by", 'must be "loss" or "psfs"', repr(by), "Choose one of them.")
     if not 0 <= evaluations <= _MOST:
         raise InputError("evaluations", f"must lie from 0 to {_MOST}", evaluations, f"{EVALUATIONS} are usual.")
     run = source if isinstance(source, Run) else open_run(Path(source))
@@ -245,6 +250,7 @@ def precompensate(
         "run": drawn.spec.name,
         "level_map_sha256": aim.digest,
         "process": spec_from_process(made_by, drawn.spec.process).model_dump(mode="json"),
+        "by": by,
         "evaluations": evaluations,
     }
     inputs = input_digests(files) | source_digests(drawn.spec, objectives or {})
@@ -260,7 +266,7 @@ def precompensate(
         cure = "Choose another output folder, or give `overwrite` to remove that run and all that was made of it."
         raise InputError(str(folder), "the folder must belong to this pre-compensation", "another run", cure)
     terms = terms_from_spec(drawn.spec, design.camera, files, objectives)
-    task = _Task(design, made_by, _loss_of(design, terms))
+    task = _Task(design, made_by, _loss_of(design, terms) if by == "loss" else _difference_from(design))
     commands = task.search(evaluations)
     compensated = _compensated(task, commands, _next_name(drawn))
     assert compensated.spec is not None
@@ -295,20 +301,27 @@ def _loss_of(design: Design, terms: tuple[Term, ...]) -> Callable[[FabricatedDoe
     if spec is not None and spec.aims:
         return partial(_miss, design, spec)
 
-    def energy(doe: CellOptic) -> Float[np.ndarray, "w d y x"]:
-        return psf(doe, depths=design.depths_m).energy
-
     if not terms:
-        wanted = energy(design.as_optic())
-        return lambda plate: float(np.mean((energy(plate) - wanted) ** 2) / np.mean(wanted**2))
-    lens = participation(jnp.asarray(energy(HeightOptic.of(camera))[:, :near]))
+        return _difference_from(design)
+    lens = participation(jnp.asarray(_energy(design, HeightOptic.of(camera))[:, :near]))
 
     def loss(plate: FabricatedDoe) -> float:
-        light = jnp.asarray(energy(plate))
+        light = jnp.asarray(_energy(design, plate))
         psfs = PsfSet(light[:, :near], light[:, near:], lens, camera)
         return float(sum(term.weight * term.value(psfs) for term in terms))
 
     return loss
+
+
+def _difference_from(design: Design) -> Callable[[FabricatedDoe], float]:
+    """Mean squared difference of a plate's PSFs from those of a design, over the mean square of these."""
+    wanted = _energy(design, design.as_optic())
+    return lambda plate: float(np.mean((_energy(design, plate) - wanted) ** 2) / np.mean(wanted**2))
+
+
+def _energy(design: Design, doe: CellOptic) -> Float[np.ndarray, "w d y x"]:
+    """PSFs of a DOE at the depths of a design."""
+    return psf(doe, depths=design.depths_m).energy
 
 
 def _miss(design: Design, spec: Spec, plate: FabricatedDoe) -> float:

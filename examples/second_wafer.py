@@ -4,13 +4,14 @@
 
 For every fab these commands run, each printed before it does:
 
-    doedesign optimize examples/quick.toml                                  # a design
-    doedesign masks runs/quick                                              # the first masks
-        ... the fab makes a wafer, and photographs are taken of its light ...
-    doedesign calibrate runs/quick photographs/measurement.toml --errors depth --errors cd --errors overlay
+    doedesign optimize examples/quick.toml
+    doedesign masks runs/quick
+        (the fab makes a wafer, and photographs are taken of its light)
+    doedesign calibrate runs/quick photographs/measurement.toml
+        --errors depth --errors cd --errors overlay_y --errors overlay_x
     doedesign precompensate runs/quick --process calibration/process-estimate.toml --random overlay
-    doedesign masks runs/quick_v2                                           # the second masks
-        ... the same fab makes another wafer ...
+    doedesign masks runs/quick_v2
+        (the same fab makes another wafer)
 
 The fab is hidden: the commands see its photographs alone. It shares no code with the process model that calibrates and
 compensates. Its masks are what a level map and the moves of edges in an order's manifest say; a plate is a raster in
@@ -45,6 +46,7 @@ from sim.material import refractive_index
 
 HERE = Path(__file__).parent
 FABS = 5
+ERRORS = ("depth", "cd", "overlay_y", "overlay_x")  # that the calibration looks for
 # Standard deviations of what a fab is off by on every wafer ...
 DEEP, OWN_DEEP = 0.04, 0.015  # share of all etches, and of each besides
 WIDE_M, OWN_WIDE_M = 150e-9, 50e-9  # growth of openings per edge, likewise
@@ -233,7 +235,7 @@ class Outcome(NamedTuple):
         return self.first / self.design - 1, self.second / self.design - 1
 
 
-def two_wafers(source: Path, order: Path, seed: int, out: Path, changes: tuple[str, ...] = ()) -> list[Outcome]:
+def two_wafers(source: Path, order: Path, seed: int, out: Path) -> tuple[Raster, Raster]:
     """Two wafers of one fab, the second from masks that allow for what the first one showed.
 
     Args:
@@ -241,21 +243,17 @@ def two_wafers(source: Path, order: Path, seed: int, out: Path, changes: tuple[s
         order: its masks.
         seed: of the fab.
         out: folder for what is made.
-        changes: further options of the calibration.
     """
     design = open_design(source, order)
     fab = HiddenFab.draw(seed, design.levels.bits)
     first = etched(design, fab.wafer(1))
     description = photographs(design, first, seed, out / "photographs")
-    errors = [word for source_ in ("depth", "cd", "overlay") for word in ("--errors", source_)]
-    run("calibrate", source, description, *errors, "--masks", order, "--out", out / "calibration", *changes)
+    errors = [word for name in ERRORS for word in ("--errors", name)]
+    run("calibrate", source, description, *errors, "--masks", order, "--out", out / "calibration")
     estimate = out / "calibration" / "process-estimate.toml"
     run("precompensate", source, "--process", estimate, "--random", "overlay", "--out", out / "run")
     run("masks", out / "run", "--out", out / "masks")
-    second = etched(open_design(out / "run", out / "masks"), fab.wafer(2))
-    wanted = ratios(design, etched(design, perfect(design.levels.bits)))
-    found = [ratios(design, plate) for plate in (first, second)]
-    return [Outcome(seed, name, ratio, *(each[name] for each in found)) for name, ratio in wanted.items()]
+    return first, etched(open_design(out / "run", out / "masks"), fab.wafer(2))
 
 
 def second_wafers(folder: Path, fabs: int = FABS, spec: Path = HERE / "quick.toml") -> list[Outcome]:
@@ -272,8 +270,11 @@ def second_wafers(folder: Path, fabs: int = FABS, spec: Path = HERE / "quick.tom
     with contextlib.chdir(folder):
         run("optimize", spec)
         run("masks", source)
+        design = open_design(source, order)
+        wanted = ratios(design, etched(design, perfect(design.levels.bits)))
         for seed in range(1, fabs + 1):
-            found += two_wafers(source, order, seed, Path(f"fab-{seed}"))
+            first, second = (ratios(design, plate) for plate in two_wafers(source, order, seed, Path(f"fab-{seed}")))
+            found += [Outcome(seed, name, wanted[name], first[name], second[name]) for name in wanted]
         lines = ["fab,colour,design,first_wafer,second_wafer"]
         lines += [f"{one.fab},{one.colour},{one.design:.4f},{one.first:.4f},{one.second:.4f}" for one in found]
         Path("second_wafer.csv").write_text("\n".join(lines) + "\n")

@@ -99,6 +99,7 @@ def precompensate(
     *,
     process: str | None = None,
     random: Texts = (),
+    by: Literal["loss", "psfs"] = "loss",
     evaluations: int = 120,
     out: Path | None = None,
     allow_code: Flag = False,
@@ -114,6 +115,7 @@ def precompensate(
         process: TOML file with a [process] table, such as process-estimate.toml of a calibration, or the name of a
             stock process; the run's own by default.
         random: Errors that are drawn anew for every plate, such as overlay; they are those of the run's own process.
+        by: The least loss of the spec's objectives, or the least difference of the PSFs from the design's.
         evaluations: Plates of the search; 0 only undoes the mean errors of depth and line width.
         out: Folder of the new run; runs/NAME_v2 by default.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
@@ -125,7 +127,7 @@ def precompensate(
 
     source = open_run(run)
     own = import_objectives(source.spec) if allow_code else None
-    settings: dict[str, Any] = {"random": random, "objectives": own, "evaluations": evaluations}
+    settings: dict[str, Any] = {"random": random, "by": by, "objectives": own, "evaluations": evaluations}
     folder = work(source, out, process=process, **settings, overwrite=overwrite).folder or Path()
     print_paths([folder], json_, table=str(folder / "precompensation.csv"))
 
