@@ -39,6 +39,7 @@ def optimize(
     *,
     out: Path | None = None,
     set_: Overrides = (),
+    start: str | None = None,
     budget: float | None = None,
     overwrite: Flag = False,
     allow_code: Flag = False,
@@ -49,6 +50,7 @@ def optimize(
     Args:
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
+        start: Start of the search in place of the spec's, short for --set optimize.start=NAME: flat, ring, nlopt ...
         budget: Seconds that the steps may take: as many as this machine makes of them, in place of optimize.steps.
         overwrite: Where the folder has the run of another spec, remove it and all that was made of it.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
@@ -58,6 +60,8 @@ def optimize(
     from doedesign.optimization import steps_within
     from doedesign.spec import load_spec
 
+    if start is not None:
+        set_ = (*set_, f"optimize.start={start}")
     read = load_spec(spec, set_)
     folder = out or Path("runs") / read.name
     own = import_objectives(read) if allow_code else None
