@@ -227,8 +227,6 @@ def precompensate(
         InputError: a run that cannot be read, a process of other levels, without errors to make up for or with errors
             beyond the model, or a folder that belongs to something else.
     """
-    if by not in ("loss", "psfs"):
-        raise InputError("by", 'must be "loss" or "psfs"', repr(by), "Choose one of them.")
     if not 0 <= evaluations <= _MOST:
         raise InputError("evaluations", f"must lie from 0 to {_MOST}", evaluations, f"{EVALUATIONS} are usual.")
     run = source if isinstance(source, Run) else open_run(Path(source))

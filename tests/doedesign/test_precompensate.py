@@ -8,6 +8,7 @@ import pytest
 
 import doedesign.optimization
 import doedesign.precompensation as precompensation
+from doedesign.optimization import optimize
 from doedesign.precompensation import precompensate
 from doedesign.prediction import predict
 from doedesign.runs.level_maps import open_design
@@ -15,9 +16,12 @@ from doedesign.spec import load_spec
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
-from fab.process import Normal, Process
+from fab.process import Normal, Process, Variation
 from sim.psf_bank import psf
 from tests.doedesign.small_runs import SPEC, call, finished_run
+from tests.doedesign.test_areas import SPEC as AREA
+from tests.doedesign.test_focus import SMALL as FOCUS
+from tests.doedesign.test_spots_run import SPEC as SPOTS
 from tests.pictures import leave_out_pictures, leave_out_pictures_of_orders
 
 # As far off as etches stopped by time and resist exposed too long are, and two masks that lie off.
@@ -178,6 +182,33 @@ def test_a_search_finds_more_than_undoing_the_means(tmp_path: Path):
         loss[evaluations] = 1 - next(row["far_spot"] for row in rows if "far_spot" in row)
     assert loss[60] < loss[0] - 1e-3
     assert found[60].levels.depths_m != found[0].levels.depths_m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "changes"),
+    [(SPOTS, ["optimize.steps=5"]), (AREA, ["optimize.steps=30"]), (FOCUS, ["optimize.steps=30"])],
+    ids=["spots", "area", "focus"],
+)
+def test_spots_areas_and_foci_judge_a_plate(text: str, changes: list[str], tmp_path: Path):
+    """The plate as drawn is better than one with etches too deep, which is better than with twice as much."""
+    (tmp_path / "aimed.toml").write_text(text)
+    design = optimize(load_spec(tmp_path / "aimed.toml", changes))
+    loss, process = precompensation._loss_of(design, ()), Process(design.levels)
+    plates = [design.fabricated(process, variation=Variation(common_depth_scale=deep)) for deep in (0.0, 0.1, 0.2)]
+    losses = [loss(plate) for plate in plates]
+    assert losses == sorted(losses)
+    assert losses[0] < losses[1] - 1e-3
+
+
+def test_psfs_may_judge_in_place_of_the_loss(tmp_path: Path):
+    """Where errors cancel, the least difference from the design is where they are undone, whatever the loss says."""
+    run, path = finished_run(tmp_path, SPEC), tmp_path / "estimate.toml"
+    path.write_text(ESTIMATE)
+    made = precompensate(run, tmp_path / "psfs", process=path, by="psfs", evaluations=20)
+    undone = precompensate(run, tmp_path / "undone", process=path, evaluations=0)
+    assert made.levels == undone.levels
+    assert made.edge_moves_m == undone.edge_moves_m
 
 
 def test_what_cannot_be_undone_is_said(run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
