@@ -175,6 +175,8 @@ class _Task:
                 progress.advance(next(tried), f"loss {found:.4f}")
                 return found
 
+            # On the quick example with masks that lie off, Sbplx took 57 s to a loss for which MMA, with the exact
+            # gradient, took 130 s; BOBYQA, COBYLA and SLSQP ended higher.
             ends, stages = ((-_REACH,) * values, (_REACH,) * values), (("sbplx", evaluations),) * (evaluations > 0)
             steps = least(judged, *ends, stages, step=1.0, start=(0.0,) * values, settled=_SETTLED)
         best, unit_m = self.commands(steps), pixel_edges(self.design.camera.grid).dbu_m

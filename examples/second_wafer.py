@@ -15,7 +15,7 @@ For every fab these commands run, each printed before it does:
 
 The fab is hidden: the commands see its photographs alone. It shares no code with the process model that calibrates and
 compensates. Its masks are what a level map and the moves of edges in an order's manifest say; a plate is a raster in
-double precision with a line wherever an edge of any mask can lie and four more in a cell, ten to twelve samples across,
+double precision with a line wherever an edge of any mask can lie and four more in a cell, twelve samples across,
 so that edges lie where they are and not at the next sample. Its light is a plain sum over all samples. The camera that
 photographs it is turned, stretched and noisy, and the fits are told of neither.
 
