@@ -17,6 +17,8 @@ the result:
     areas           areas of even light, by optimal transport and L-BFGS
     focus           foci on the axis and an extended depth of focus, by L-BFGS on rings
     refinement      `refine`: the cell of a periodic run, refined by rigorous light
+    precompensation `precompensate`: depths to command and edges to move, for a known process
+    search          few values of least loss
     optimization    `optimize`: a spec becomes a design, in memory or in a run folder
     runs            designs on the disk, and the PSFs of a run
     prediction      PSFs and figures of merit of a design as fabricated

@@ -23,6 +23,7 @@ from .lab.as_built import AsBuiltPrediction as AsBuiltPrediction
 from .lab.as_built import as_built as as_built
 from .lab.order import write_masks as write_masks
 from .optimization import optimize as optimize
+from .precompensation import precompensate as precompensate
 from .prediction import predict as predict
 from .recon.files import reconstruct_files as reconstruct_files
 from .recon.model import Model as Model

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -102,11 +103,12 @@ def optimize(
     if out is not None:
         return _optimize_in(Path(out), spec, files, overrides, objectives or {}, overwrite)
     if (aimed := _aimed_design(spec)) is not None:
-        return aimed
+        return replace(aimed, edge_moves_m=spec.wafer.edge_moves_m)
     problem, sources = problem_of(spec, files, objectives)
     state = initial_state(spec, problem, sources, files, _reader(spec))
     state, history = _iterate(steps(spec, problem, sources, state), spec, state, [])
-    return finished_design(spec, problem, _polished(spec, problem, sources, state), history)
+    design = finished_design(spec, problem, _polished(spec, problem, sources, state), history)
+    return replace(design, edge_moves_m=spec.wafer.edge_moves_m)
 
 
 def steps_within(

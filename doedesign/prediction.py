@@ -42,7 +42,8 @@ def predict(design: Design, process: Process, variation: Variation) -> Predictio
 
 def plate_rows(design: Design, surface: FabricatedDoe, bank: PsfBank) -> list[dict[str, Any]]:
     """Numbers of a DOE as fabricated, one row per depth and colour (`sim.metrics.METRICS`, table "fabricated")."""
-    nominal, found = as_drawn(design.camera, design.level_map, design.depths_m), on_target(design, surface)
+    nominal = as_drawn(design.camera, design.aim or design.level_map, design.depths_m)
+    found = on_target(design, surface)
     aimed = None if found is None else found.measures()
     return metric_rows(bank.metric_inputs(design.near_m, surface, nominal, aimed=aimed), "fabricated")
 

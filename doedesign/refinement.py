@@ -18,6 +18,7 @@ from doedesign.runs.folder import (
     finish_run,
     input_digests,
     load_checkpoint,
+    named,
     open_run,
     save_checkpoint,
 )
@@ -113,7 +114,7 @@ def refine(
     steps = steps if steps is not None else ROW_STEPS if 1 in cell.grid.shape else STEPS
     if not 1 <= steps <= _MOST_STEPS:
         raise InputError("steps", f"must lie from 1 to {_MOST_STEPS}", steps, f"{STEPS} are usual.")
-    spec = _named(cell.spec, f"{cell.spec.name}_refined")
+    spec = named(cell.spec, f"{cell.spec.name}_refined")
     folder = Path(out or Path("runs") / spec.name)
     if folder.resolve() == run.folder.resolve():
         raise InputError(str(folder), "a refined run needs a folder of its own", "that of the run", "Give another.")
@@ -228,14 +229,6 @@ def _task_of(cell: _Cell, terms: int, steps: int) -> RefinementTask:
     uniformity = cell.spec.spots.uniformity
     seed = cell.spec.optimize.seed
     return RefinementTask(solver, cell.spots, uniformity, ways, start, levels.count, strokes, steps, seed)
-
-
-def _named(spec: Spec, name: str) -> Spec:
-    """The spec under another name."""
-    if len(name) > 64:
-        cure = "Give the run a shorter name."
-        raise InputError(spec.name, "the name of a refined run must have 64 letters at most", len(name), cure)
-    return spec.model_copy(update={"name": name})
 
 
 def _table(cell: _Cell, task: RefinementTask, level: UInt8[np.ndarray, "y x"]) -> list[_Row]:

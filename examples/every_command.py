@@ -47,6 +47,8 @@ def commands(spec: Path, name: str) -> Iterator[list[str]]:
     yield ["reconstruct", str(run), str(items[0] / "capture.exr")]
     yield ["finetune", str(run), "--pairs", str(pairs_of(items, Path("pairs"))), "--steps", "10"]
     yield ["calibrate", str(run), str(measure(run, Path("measurement")))]
+    estimate = run / "calibration" / "process-estimate.toml"
+    yield ["precompensate", str(run), "--process", str(estimate), "--random", "overlay"]
     yield ["calibrate", str(run), "--ring-to-disc", "1", "--probe", "520 nm", "--depth", "10 mm", "--no-pairs"]
 
 

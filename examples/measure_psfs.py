@@ -78,7 +78,20 @@ def measure(run: Path, out: Path, seed: int = 1) -> Path:
     spec, design = load_measurement(MEASUREMENT), open_design(run)
     process = design.process()
     errors = hidden_errors(design, process, seed)
-    lights, rng = light_of(design, process, errors, spec), np.random.default_rng(seed)
+    made = photographed(light_of(design, process, errors, spec), spec, out, np.random.default_rng(seed))
+    write_atomic(out / "hidden.toml", variation_to_toml(errors, ["errors of the photographed plate"]).encode())
+    return made
+
+
+def photographed(lights: list[np.ndarray], spec: MeasurementSpec, out: Path, rng: np.random.Generator) -> Path:
+    """Write the frames of a measurement and its description into a folder; return the description.
+
+    Args:
+        lights: energy per pixel of every image, ``[y, x]``, row 0 at the lowest y.
+        spec: the measurement.
+        out: the folder.
+        rng: of the noise.
+    """
     shortest = min(seconds for image in spec.image for seconds in image.exposures)
     per_s = PEAK * (TOP - BLACK) * spec.gain / shortest / max(light.max() for light in lights)
     out.mkdir(parents=True, exist_ok=True)
@@ -86,7 +99,6 @@ def measure(run: Path, out: Path, seed: int = 1) -> Path:
         for name, dark, seconds in zip(image.files, image.dark, image.exposures, strict=True):
             imageio.imwrite(out / name, exposed((light * per_s + BACKGROUND_E_PER_S) * seconds, spec, rng))
             imageio.imwrite(out / dark, exposed(0 * light, spec, rng))
-    write_atomic(out / "hidden.toml", variation_to_toml(errors, ["errors of the photographed plate"]).encode())
     write_atomic(out / MEASUREMENT.name, MEASUREMENT.read_bytes())
     return out / MEASUREMENT.name
 

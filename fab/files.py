@@ -18,7 +18,7 @@ import shutil
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import FileIO
 from pathlib import Path
@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from fab.errors import InputError
 
 MANIFEST_NAME = "manifest.json"
+# A field with this mark is left out of records where it is empty, so that records without it stay what they are.
+IF_ANY: Mapping[str, bool] = {"if_any": True}
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 

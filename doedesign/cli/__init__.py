@@ -11,7 +11,7 @@ from cyclopts import App
 
 from doedesign import __version__
 from doedesign.cli.console import exit_code
-from doedesign.cli.design import masks, new, optimize, refine, verify
+from doedesign.cli.design import masks, new, optimize, precompensate, refine, verify
 from doedesign.cli.light import certify, psf, simulate
 from doedesign.cli.network import finetune, reconstruct, train
 from doedesign.cli.process import calibrate, tolerance
@@ -26,7 +26,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-_COMMANDS = (new, optimize, refine, masks, verify, psf, certify, tolerance, simulate, train, finetune)
+_COMMANDS = (new, optimize, refine, precompensate, masks, verify, psf, certify, tolerance, simulate, train, finetune)
 for _command in _COMMANDS:
     app.command(_command)
 app.command(calibrate, usage="Usage: doedesign calibrate [OPTIONS] RUN [MEASUREMENT]")

@@ -1,11 +1,11 @@
-"""From a spec to a design and its masks: new, optimize, refine, masks, verify."""
+"""From a spec to a design and its masks: new, optimize, refine, precompensate, masks, verify."""
 
 import json
 from pathlib import Path
 from typing import Any, Literal
 
 from doedesign.cli.console import print_paths, print_results, print_text, say
-from doedesign.cli.options import AsJson, Flag, Overrides, length_of
+from doedesign.cli.options import AsJson, Flag, Overrides, Texts, length_of
 from fab.errors import InputError
 
 
@@ -39,6 +39,7 @@ def optimize(
     *,
     out: Path | None = None,
     set_: Overrides = (),
+    start: str | None = None,
     budget: float | None = None,
     overwrite: Flag = False,
     allow_code: Flag = False,
@@ -49,6 +50,7 @@ def optimize(
     Args:
         spec: TOML spec, such as examples/automotive.toml.
         out: Run folder; runs/NAME by default.
+        start: Start of the search in place of the spec's, short for --set optimize.start=NAME: flat, ring, nlopt ...
         budget: Seconds that the steps may take: as many as this machine makes of them, in place of optimize.steps.
         overwrite: Where the folder has the run of another spec, remove it and all that was made of it.
         allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
@@ -58,6 +60,8 @@ def optimize(
     from doedesign.optimization import steps_within
     from doedesign.spec import load_spec
 
+    if start is not None:
+        set_ = (*set_, f"optimize.start={start}")
     read = load_spec(spec, set_)
     folder = out or Path("runs") / read.name
     own = import_objectives(read) if allow_code else None
@@ -92,6 +96,44 @@ def refine(
 
     folder = work(run, out, terms=terms, steps=steps, overwrite=overwrite).folder or Path()
     print_paths([folder], json_, metrics=str(folder / "metrics.json"))
+
+
+def precompensate(
+    run: Path,
+    *,
+    process: str | None = None,
+    random: Texts = (),
+    by: Literal["loss", "psfs"] = "loss",
+    evaluations: int = 120,
+    out: Path | None = None,
+    allow_code: Flag = False,
+    overwrite: Flag = False,
+    json_: AsJson = False,
+) -> None:
+    """Find the etch depths to command and the masks' edge moves with which a process makes the plate of a run.
+
+    Writes a run of its own with the same levels, for masks and all else; precompensation.csv says what was found.
+
+    Args:
+        run: Run folder; it stays as it is.
+        process: TOML file with a [process] table, such as process-estimate.toml of a calibration, or the name of a
+            stock process; the run's own by default.
+        random: Errors that are drawn anew for every plate, such as overlay; they are those of the run's own process.
+        by: The least loss of the spec's objectives, or the least difference of the PSFs from the design's.
+        evaluations: Plates of the search; 0 only undoes the mean errors of depth and line width.
+        out: Folder of the new run; runs/NAME_v2 by default.
+        allow_code: Import and run the objectives that the spec names "module:function". Only for specs you trust.
+        overwrite: Where the folder has another run, remove it and all that was made of it.
+    """
+    from doedesign.design.objectives import import_objectives
+    from doedesign.precompensation import precompensate as work
+    from doedesign.runs.folder import open_run
+
+    source = open_run(run)
+    own = import_objectives(source.spec) if allow_code else None
+    settings: dict[str, Any] = {"random": random, "by": by, "objectives": own, "evaluations": evaluations}
+    folder = work(source, out, process=process, **settings, overwrite=overwrite).folder or Path()
+    print_paths([folder], json_, table=str(folder / "precompensation.csv"))
 
 
 def masks(

@@ -38,6 +38,8 @@ class Design:
         far_m: distances of the scene, metres; `inf` for a star.
         edge_moves_m: how far the masks draw the edges of etched areas outward to make up for the line-width bias of the
             process, mask 0 first, metres; empty for nowhere.
+        aim: what the plate is to come out as, where the masks are drawn so that errors of the process lead there from
+            another level map; None where that is the level map itself.
         continuous_m: ``[y, x]`` heights before rounding to levels, metres, if they are at hand.
         spec: the spec it was optimised for, if there was one.
         history: one record per step of its optimisation, if at hand: `step`, `loss`, `terms` and their `names`.
@@ -49,6 +51,7 @@ class Design:
     near_m: tuple[float, ...]
     far_m: tuple[float, ...]
     edge_moves_m: tuple[float, ...] = ()
+    aim: LevelMap | None = None
     continuous_m: Float[np.ndarray, "y x"] | None = None
     spec: Spec | None = None
     history: tuple[Mapping[str, Any], ...] = ()

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from doedesign.design import analytic
 from doedesign.design.patterns import positive_length
+from doedesign.search import least
 from doedesign.spec import STARTS
 from fab.errors import InputError
 from fab.units import parse_angle
@@ -21,6 +22,7 @@ from sim.propagation.hankel import ring_count
 
 Heights = Float[np.ndarray, "*s"]
 _WHERE = "optimize.start_options"
+EDGE_WAVES = 40  # of the strongest lens that is searched
 
 
 class StartSetup(NamedTuple):
@@ -103,34 +105,8 @@ def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
         ridge = Ridge(float(values[0]) * wave_m, float(values[1]))
         return float(np.sum((_order_shares(waves, ridge) - far_energy) ** 2))
 
-    waves_high, duty = _least(miss, (0.0, 0.0), (1.0, 0.5), 0.01, (400, 400))
+    waves_high, duty = least(miss, (0.0, 0.0), (1.0, 0.5), (("direct", 400), ("sbplx", 400)), step=0.01)
     return Ridge(waves_high * wave_m, duty)
-
-
-def _least(
-    loss: Callable[[np.ndarray], float],
-    low: tuple[float, ...],
-    high: tuple[float, ...],
-    step: float,
-    evaluations: tuple[int, int],
-) -> list[float]:
-    """Where a loss of a few values is least, from the middle of their range.
-
-    DIRECT-L (global, no gradient; D. R. Jones et al. 1993, as in NLopt) and then Sbplx from its best point, beginning
-    with a `step`; each with so many evaluations.
-    """
-    import nlopt
-
-    best = (np.array(low) + np.array(high)) / 2
-    for algorithm, count in zip((nlopt.GN_DIRECT_L, nlopt.LN_SBPLX), evaluations, strict=True):
-        search = nlopt.opt(algorithm, len(low))
-        search.set_min_objective(lambda values, _gradient: loss(values))
-        search.set_lower_bounds(low)
-        search.set_upper_bounds(high)
-        search.set_initial_step(step)
-        search.set_maxeval(max(count, 1))
-        best = search.optimize(best)
-    return [float(value) for value in best]
 
 
 def grating(setup: StartSetup, ridge: Ridge, period_m: float) -> Heights:
@@ -175,11 +151,72 @@ def ring(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     ridge = balanced_ridge(setup, _number(options, "far_energy", 0.25, 0.0, 1.0))
     ridge = Ridge(_length(options, "height", ridge.height_m), _number(options, "duty", ridge.duty, 0.0, 1.0))
     heights = grating(setup, ridge, _length(options, "period", ring_period_m(setup.camera)))
+    return _loosened(setup, heights, options)
+
+
+def _loosened(setup: StartSetup, heights: Heights, options: Mapping[str, Any]) -> Heights:
+    """Heights on a floor of their own, with a little `roughness` (see `ring`)."""
     noise = np.random.default_rng(setup.seed).standard_normal(heights.shape)
     floor_m, step_m = setup.wave_m / 4, setup.level_step_m
     if step_m:
         floor_m = step_m * round(floor_m / step_m - 1e-3)  # of two levels the lower one
     return heights + floor_m + setup.wave_m * _number(options, "roughness", 0.02, 0.0, 1.0) * noise
+
+
+class RingLens(NamedTuple):
+    """A circular grating with a lens: few numbers, each within a range that does not depend on the camera.
+
+    Attributes:
+        period: logarithm to base 2 of the period over `ring_period_m`.
+        chirp: share by which the period is wider on the axis than half way to the rim.
+        height: of the ridges, in waves.
+        duty: their share of the period.
+        power: third root of the optical power, which at 1 takes a phase of `EDGE_WAVES` at the rim.
+    """
+
+    period: float
+    chirp: float
+    height: float
+    duty: float
+    power: float
+
+    def heights(self, setup: StartSetup) -> Heights:
+        """Its heights, metres."""
+        camera, radii = setup.camera, setup.radii_m()
+        share = radii / camera.opening.reach_m
+        place = radii / (ring_period_m(camera) * 2**self.period) * (1 + self.chirp * (share / 2 - 0.5))
+        ridges = np.where(np.mod(place, 1.0) < self.duty, self.height * setup.wave_m, 0.0)
+        power_per_m = self.power**3 * EDGE_WAVES * 2 * setup.wavelength_m / camera.opening.reach_m**2
+        return ridges + lens(setup, power_per_m) if self.power else ridges
+
+
+_LOWEST, _HIGHEST = RingLens(-1.0, -0.8, 0.0, 0.05, -1.0), RingLens(3.0, 0.8, 1.0, 0.95, 1.0)
+_SEARCHES = {
+    "crs": (("crs", 0.75), ("sbplx", 0.25)),
+    "mlsl": (("mlsl", 1.0),),
+    "isres": (("isres", 0.75), ("sbplx", 0.25)),
+}
+
+
+def nlopt(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
+    """The `RingLens` of least loss that NLopt finds with `algorithm` in `evaluations` of the loss.
+
+    A global search, controlled random ("crs"), by local searches from many starts ("mlsl") or by evolution ("isres"),
+    over the five numbers of a whole plate; the free-form search then begins at the best of them. `roughness` is as for
+    `ring`.
+    """
+    algorithm = options.get("algorithm", "crs")
+    if algorithm not in _SEARCHES:
+        rule, cure = f"must be one of {', '.join(_SEARCHES)}", "Choose one of them, or leave it out."
+        raise InputError(f"{_WHERE}.algorithm", rule, repr(algorithm), cure)
+    evaluations = int(_number(options, "evaluations", 400, 20, 100_000))
+    stages = [(name, round(share * evaluations)) for name, share in _SEARCHES[algorithm]]
+
+    def loss(values: np.ndarray) -> float:
+        return setup.loss(RingLens(*map(float, values)).heights(setup))
+
+    found = least(loss, _LOWEST, _HIGHEST, stages, step=0.1, seed=setup.seed)
+    return _loosened(setup, RingLens(*found).heights(setup), options)
 
 
 def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
@@ -191,12 +228,13 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     if "focal_length" in options:
         return lens(setup, 1.0 / _length(options, "focal_length", 1.0))
     evaluations = int(_number(options, "evaluations", 30, 3, 10_000))
-    limit = 40 * 2 * setup.wavelength_m / setup.camera.opening.reach_m**2
+    limit = EDGE_WAVES * 2 * setup.wavelength_m / setup.camera.opening.reach_m**2
 
     def loss(power: np.ndarray) -> float:
         return setup.loss(lens(setup, float(power[0]) * limit))
 
-    (power,) = _least(loss, (-1.0,), (1.0,), 0.02, (evaluations * 2 // 3, evaluations // 3))
+    stages = (("direct", evaluations * 2 // 3), ("sbplx", evaluations // 3))
+    (power,) = least(loss, (-1.0,), (1.0,), stages, step=0.02)
     return lens(setup, power * limit)
 
 

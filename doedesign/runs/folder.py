@@ -2,7 +2,7 @@
 
     runs/NAME/
         manifest.json           spec digest, inputs, version, digests of all results when done, and the depths of the
-                                etches if the run was to choose them
+                                etches if the run was to choose them, or that its plate should come out with
         spec.toml               the spec with every default and override filled in
         checkpoint.npz          parameters, Adam's moments and history; only while the run is unfinished
         level_map.npz           the design: level of every cell, staircase, grid and aperture (`fab.level_map`)
@@ -62,7 +62,7 @@ TRAINING = "doedesign training 1"  # a folder that `train` wrote, with a DOE of 
 RELEASED = "doedesign released model 1"  # a training that is given away, with its DOE
 CHECKPOINT = "checkpoint.npz"
 LEVEL_MAP, HEIGHT, CONTINUOUS = "level_map.npz", "height.exr", "height_continuous.exr"
-_DEPTHS = "etch_depths_m"
+_DEPTHS, AIM_DEPTHS = "etch_depths_m", "aim_depths_m"
 # Tables of a spec that may be changed for a finished DOE, where it is looked through and where a network is trained.
 CAPTURE_TABLES = ("scene", "sensor", "obstruction")
 TRAINING_TABLES = (*CAPTURE_TABLES, "network", "train")
@@ -85,6 +85,8 @@ class Run:
         done: whether the run is finished.
         inputs: of a claimed run, the digests of the files that the spec names, by key.
         overrides: of a claimed run, the changes that led to the spec, "table.key=value".
+        aim_depths_m: depths of the etches that the plate should come out with, metres, where those of the spec are
+            commanded otherwise; empty where they are the same.
     """
 
     folder: Path
@@ -92,6 +94,7 @@ class Run:
     done: bool
     inputs: Mapping[str, str] = field(default_factory=dict, compare=False)
     overrides: Sequence[str] = field(default=(), compare=False)
+    aim_depths_m: tuple[float, ...] = ()
 
     def path(self, name: str) -> Path:
         """Path of a file of the run."""
@@ -106,6 +109,7 @@ class _Manifest(BaseModel):
     spec_sha256: str
     inputs_sha256: dict[str, str] = {}
     etch_depths_m: Any = None
+    aim_depths_m: tuple[float, ...] = ()
     results_sha256: dict[str, str] = {}
 
 
@@ -255,6 +259,11 @@ def steps_of_run(folder: Path, spec: Spec) -> int | None:
     return steps if same else None
 
 
+def inputs_of_run(folder: Path) -> Mapping[str, str] | None:
+    """Digests of the input files of the run in a folder, by key; None for any other folder."""
+    return _read_manifest(folder).inputs_sha256 if (folder / MANIFEST_NAME).is_file() else None
+
+
 def begin_run(run: Run) -> None:
     """Write the manifest of a claimed run that begins, its spec, and its pictures."""
     for key, name in kept_pictures(run.spec).items():
@@ -314,7 +323,15 @@ def open_run(folder: Path) -> Run:
     if spec.process.chooses_depths:  # from now on as if the depths that it chose had been given
         process = spec_to_json(spec)["process"] | {_DEPTHS: manifest.etch_depths_m}
         spec = spec_from_json(spec_to_json(spec) | {"process": process}, str(folder / MANIFEST_NAME))
-    return Run(folder, spec, done=True)
+    return Run(folder, spec, done=True, aim_depths_m=manifest.aim_depths_m)
+
+
+def named(spec: Spec, name: str) -> Spec:
+    """The spec of a run under the name of one that is made from it."""
+    if len(name) > 64:
+        cure = "Give the run a shorter name."
+        raise InputError(spec.name, "the name of a run made from another must have 64 letters at most", name, cure)
+    return spec.model_copy(update={"name": name})
 
 
 def spec_with(run: Run, overrides: Sequence[str], free: Sequence[str]) -> Spec:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from math import isclose
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -113,17 +114,21 @@ def open_design(
     run = source if isinstance(source, Run) else open_run(Path(source))
     level_map = level_map_of_run(run, levels)
     folder = Path(masks or f"masks/{run.spec.name}")
-    moves_m: tuple[float, ...] = ()
+    moves_m = run.spec.wafer.edge_moves_m if levels is None else ()
     if levels is None and masks is not False and (masks or (folder / MANIFEST_NAME).is_file()):
         level_map = level_map.with_level(drawn_in_masks(folder, level_map))
         moves_m = tuple(mask.edge_move_nm * NM for mask in read_manifest(folder).masks)
-    continuous = run.path(CONTINUOUS)
+    continuous, aim = run.path(CONTINUOUS), None
+    if run.aim_depths_m and levels is None:
+        own = level_map.levels
+        aim = replace(level_map, levels=Levels(own.count, own.step_m, run.aim_depths_m))
     return Design(
         level_map,
         camera_from_spec(run.spec),
         run.spec.scene.near_m,
         run.spec.scene.far_m,
         edge_moves_m=moves_m if any(moves_m) else (),
+        aim=aim,
         continuous_m=read_any_height(continuous).height_m if continuous.is_file() else None,
         spec=spec_with(run, overrides, free),
         folder=run.folder,

@@ -221,8 +221,9 @@ def kept_pictures(spec: Spec) -> dict[str, str]:
 def read_toml(path: Path, what: str, example: str) -> dict[str, Any]:
     """Read the tables of a TOML file; `what` it should hold ("a spec") and an `example` of that are for messages."""
     cure = f"Give {what} such as {example}."
+    content = read_bytes(path, 1 << 24)
     try:
-        return tomllib.loads(read_bytes(path, 1 << 24).decode())
+        return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
         raise InputError(str(path), f"{what} must be UTF-8 text", f"a foreign byte at {error.start}", cure) from error
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits

@@ -362,6 +362,13 @@ def _process(spec: Spec) -> Iterator[InputError]:
         rule = f"the DOE must lie on the wafer of radius {format_length(radius_m)}"
         cure = "Move the die inward or choose a larger process.wafer_radius."
         yield InputError("process.die", rule, f"a DOE that reaches {rounded(reach_m)} from its middle", cure)
+    moves = spec.wafer.edge_moves_m
+    if moves and len(moves) != process.masks:
+        rule = f"must have one entry per mask, {process.masks} for {process.levels} levels"
+        yield InputError("wafer.edge_moves", rule, f"a list of {len(moves)}", "Add or remove entries.")
+    if moves and spec.wafer.compensate:
+        rule = "edges are moved by these lengths, or against the bias of the process (wafer.compensate)"
+        yield InputError("wafer.edge_moves", rule, "both", "Leave one of them out.")
 
 
 def _limits(spec: Spec) -> Iterator[InputError]:

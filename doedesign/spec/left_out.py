@@ -24,7 +24,7 @@ from doedesign.spec.values import STARTS, is_start
 from fab.units import MM, format_length, parse_angle, parse_length
 
 # Starts that are designs of their own, and which of them are lenses by one of their options.
-_CLASSIC = tuple(start for start in STARTS if start not in ("flat", "random", "ring"))
+_CLASSIC = tuple(start for start in STARTS if start not in ("flat", "random", "ring", "nlopt"))
 _LENSES = {"fresnel": "focal_length", "lens_array": "focal_length", "axilens": "near", "logarithmic_asphere": "near"}
 _AIMS = ("spots", "area", "focus")
 

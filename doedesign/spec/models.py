@@ -212,7 +212,7 @@ class OptimizeSpec(SpecTable, frozen=True):
     Attributes:
         parametrization: "freeform" (every cell) or "radial" (a profile over the radius).
         start: a built-in one, which with `steps = 0` is a design of its own: "flat", "random", "fresnel", "ring",
-            "axicon", "vortex", "blazed", "lens_array", "cubic", "axilens", "logarithmic_asphere"
+            "nlopt", "axicon", "vortex", "blazed", "lens_array", "cubic", "axilens", "logarithmic_asphere"
             (`doedesign.design.starts`); or the path of a height map relative to the spec file.
         start_options: keyword arguments of the start.
         steps: optimisation steps; 0 evaluates the start.

@@ -35,6 +35,8 @@ class WaferSpec(SpecTable, frozen=True):
         compensate: whether masks are drawn against the mean line-width bias of the process.
         line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out.
         order_control: whether some dies draw the planes in the opposite order of depths.
+        edge_moves_m: how far masks are drawn with the edges of etched areas further out, mask 0 first; in place of
+            `compensate`.
     """
 
     diameter_m: Size = optional(_USUAL.diameter_m)
@@ -50,6 +52,7 @@ class WaferSpec(SpecTable, frozen=True):
     compensate: Annotated[bool, Field(strict=True)] = optional(_USUAL.compensate)
     line_splits_m: tuple[Move, ...] = optional(_USUAL.line_splits_m)
     order_control: Annotated[bool, Field(strict=True)] = optional(_USUAL.order_control)
+    edge_moves_m: tuple[Move, ...] = optional(_USUAL.edge_moves_m)
 
 
 class WaferFile(SpecTable, frozen=True):

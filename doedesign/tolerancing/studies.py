@@ -301,6 +301,7 @@ def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate)
     level, levels = design.level_map.level, design.levels
     # Depths that follow from the step are left out, as they were before there were others.
     depths = {} if levels.is_binary else {"depths_m": list(levels.depths_m)}
+    aim = {} if design.aim is None else {"aim_depths_m": list(design.aim.levels.depths_m)}
     name = f"{evaluate.__module__}:{evaluate.__qualname__}"
     return {
         "format": FORMAT,
@@ -309,7 +310,7 @@ def _identity(design: "Design", process: Process, seed: int, evaluate: Evaluate)
             "name": design.name,
             "level_sha256": sha256_bytes(level.tobytes()),
             "shape": list(level.shape),
-            "levels": {"count": levels.count, "step_m": levels.step_m, **depths},
+            "levels": {"count": levels.count, "step_m": levels.step_m, **depths, **aim},
             "camera": _given(design.camera),
             "depths_m": ["inf" if math.isinf(depth) else depth for depth in (*design.near_m, *design.far_m)],
             "near": len(design.near_m),

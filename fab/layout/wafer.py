@@ -1,10 +1,11 @@
 """The wafer that a mask set is for: its glass, its mask blanks, and how it is filled."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from fab.errors import InputError
+from fab.files import IF_ANY
 from fab.layout.limits import MOST
 from fab.units import MM, UM, format_length
 
@@ -12,6 +13,7 @@ from fab.units import MM, UM, format_length
 _FLATS = {50.8: 15.88, 76.2: 22.22, 100.0: 32.5, 125.0: 42.5, 150.0: 57.5}
 _MOST_SPLITS = 32
 _NOTCH_M, _NOTCHED_M = 1 * MM, 199 * MM
+_FARTHEST_M = 100 * UM  # that an edge is moved
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Wafer:
         chrome: how the aperture's chrome is made.
         compensate: whether masks are drawn with their edges moved against the line-width bias that the process is
             known for (`Process.expected`).
+        edge_moves_m: how far masks are drawn with the edges of etched areas moved outward instead, mask 0 first,
+            metres.
         line_splits_m: for each entry some dies whose edges of etched areas are drawn so much further out, metres.
         order_control: whether some dies draw the planes in the opposite order of depths (`fab.layout.split`).
 
@@ -53,6 +57,7 @@ class Wafer:
     compensate: bool = False
     line_splits_m: tuple[float, ...] = ()
     order_control: bool = False
+    edge_moves_m: tuple[float, ...] = field(default=(), metadata=IF_ANY)
 
     def __post_init__(self) -> None:
         for name in ("diameter_m", "thickness_m", "blank_m"):
@@ -70,9 +75,15 @@ class Wafer:
         if len(self.line_splits_m) > _MOST_SPLITS:
             rule, got = f"must be at most {_MOST_SPLITS}", len(self.line_splits_m)
             raise InputError("wafer: line splits", rule, got, "Take fewer, since each is a drawing of its own.")
-        if any(not 1e-9 <= abs(move) <= 100 * UM for move in self.line_splits_m):
+        if any(not 1e-9 <= abs(move) <= _FARTHEST_M for move in self.line_splits_m):
             got = ", ".join(format_length(move) for move in self.line_splits_m)
             raise InputError("wafer: line splits", "must lie from 1 nm to 100 um, out or in", got, "Check their unit.")
+        if any(not abs(move) <= _FARTHEST_M for move in self.edge_moves_m):
+            got = ", ".join(map(format_length, self.edge_moves_m))
+            raise InputError("wafer: edge moves", "must be at most 100 um, out or in", got, "Check their unit.")
+        if self.edge_moves_m and self.compensate:
+            cure = "Leave one of them out."
+            raise InputError("wafer: edge moves", "edges are moved by these lengths, or against the bias", "both", cure)
         for name, most_m in (("lane_m", 10 * MM), ("edge_exclusion_m", self.diameter_m / 4)):
             if not 0 <= (value := getattr(self, name)) <= most_m:
                 rule = f"must lie from 0 to {format_length(most_m)}"

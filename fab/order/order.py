@@ -95,7 +95,16 @@ class Order:
         return photomasks_of(self.level_map.levels, process.order, process.tone, wafer.chrome, wafer.zero_layer)
 
     def edge_moves(self) -> tuple[int, ...]:
-        """Return how far the edges of every mask are moved outward against the bias of the process, database units."""
+        """Return how far the edges of every mask are moved outward, database units.
+
+        Raises:
+            InputError: lengths that are not one per mask.
+        """
+        if given := self.wafer.edge_moves_m:
+            if len(given) != self.process.masks:
+                rule = f"must be one length per mask, {self.process.masks}"
+                raise InputError("wafer: edge moves", rule, len(given), "Add or remove lengths.")
+            return tuple(round(move / self.dbu_m) for move in given)
         if not self.wafer.compensate:
             return (0,) * self.process.masks
         usual = self.process.expected()
@@ -151,7 +160,8 @@ class Order:
             "aperture": level_map.relief.record(),
             "depths": level_map.levels.depths_m,
             "chrome": asdict(self.chrome),
-            "wafer": asdict(self.wafer),
+            # Moves of edges, asked for or against the bias, stand with the process.
+            "wafer": {name: value for name, value in asdict(self.wafer).items() if name != "edge_moves_m"},
             "process": (process.order, process.tone, process.minimum_line_m, self.edge_moves()),
         }
         return sha256_bytes(canonical_json(_whole(drawn)))

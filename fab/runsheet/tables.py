@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from fab.aperture import Aperture
 from fab.errors import InputError
+from fab.files import IF_ANY
 from fab.layout.part import Photomask
 from fab.layout.wafer import Wafer
 from fab.level_map import LevelMap
@@ -85,10 +86,6 @@ class CertifiedOrder(NamedTuple):
     cut_scalar: float
     cut_edges: float
     cut_rigorous: float
-
-
-# A field with this mark is left out of records where it is empty, so that records without it stay what they are.
-IF_ANY: Mapping[str, bool] = {"if_any": True}
 
 
 @dataclass(frozen=True)

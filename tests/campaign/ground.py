@@ -88,6 +88,10 @@ COMMANDS = {
         ("calibrate", "run", "measurement.toml", *QUICK, *ONE_ERROR, "--evaluations", 2, "--out", "out"),
         ("run", "order", "measurement.toml", "image.tiff", "dark.tiff"),
     ),
+    "precompensate": Command(
+        ("precompensate", "run", "--process", "process.toml", "--evaluations", 2, "--out", "out"),
+        ("run", "process.toml"),
+    ),
     "explanations": Command(
         ("calibrate", "run", *QUICK, *ONE_ERROR, *RATIO, "--no-pairs", "--out", "out"),
         ("run", "order"),

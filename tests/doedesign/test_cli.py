@@ -152,6 +152,15 @@ def test_warnings_go_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert printed.out == ""
 
 
+def test_a_start_is_short_for_an_override(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    said: dict[str, object] = {}
+    monkeypatch.setattr("doedesign.optimization.optimize", lambda *_, **more: said.update(more))
+    asked = ["optimize", str(ROOT / "examples/quick.toml"), "--out", str(tmp_path / "run"), "--set", "optimize.seed=2"]
+    assert main([*asked, "--start", "nlopt"]) == 0
+    assert said["overrides"] == ("optimize.seed=2", "optimize.start=nlopt")
+    assert main([*asked, "--start", "no-such"]) == 2
+
+
 def failing_problem(*_: object) -> None:
     raise InputError("here", "stops", "it", "Go on.")
 

@@ -8,6 +8,7 @@ import pytest
 from doedesign.design.starts import (
     BUILT_IN,
     Ridge,
+    RingLens,
     StartSetup,
     balanced_ridge,
     flat,
@@ -139,6 +140,44 @@ def test_fresnel_finds_the_depth_that_is_asked_for() -> None:
     assert loss(found) < 0.9 * loss(ideal) < 0
 
 
+@pytest.mark.parametrize("algorithm", ["crs", "mlsl", "isres"])
+def test_nlopt_finds_the_grating_behind_a_loss(algorithm: str) -> None:
+    """The loss is the distance from a hidden plate of rings, in a smooth measure: the light of the first orders."""
+    small = replace(CAMERA, grid=Grid((60, 60), 2e-6), aperture=120e-6)
+    setup = SETUP._replace(camera=small)
+    rows = np.exp(-2j * np.pi * np.outer(np.fft.fftfreq(60)[:30:2], np.arange(60)))
+
+    def spectrum(heights: np.ndarray) -> np.ndarray:
+        return np.abs(rows @ np.exp(2j * np.pi * heights / setup.wave_m) @ rows.T) ** 2 / 60**4
+
+    wanted = spectrum(RingLens(0.3, 0.2, 0.4, 0.4, 0.0).heights(setup))
+    seen = []
+
+    def loss(heights: np.ndarray) -> float:
+        seen.append(float(np.sum((spectrum(heights) - wanted) ** 2)))
+        return seen[-1]
+
+    options = {"algorithm": algorithm, "evaluations": 200, "roughness": 0.0}
+    found = start_heights("nlopt", options, setup._replace(loss=loss))
+    assert len(seen) <= 200
+    # The start is the best of them, on a floor that changes no light; flat glass is a hundred times further off.
+    assert loss(found) == pytest.approx(min(seen), rel=1e-6)
+    assert min(seen) < 0.1 * loss(flat(setup, {}))
+    again = start_heights("nlopt", options, setup._replace(loss=loss))
+    assert np.array_equal(found, again)
+
+
+def test_lens_and_rings_stand_side_by_side() -> None:
+    """Without ridges the family is the Fresnel lens, and without power the grating."""
+    bare = RingLens(0.0, 0.0, 0.5, 0.5, 0.0)
+    assert np.array_equal(bare.heights(SETUP), grating(SETUP, Ridge(SETUP.wave_m / 2, 0.5), ring_period_m(CAMERA)))
+    # A phase of 5 waves at the rim, r² power / (2 lambda): the third root of 5 / 40.
+    power_per_m = 5 * 2 * GREEN / 0.4e-3**2
+    alone = bare._replace(height=0.0, power=(5 / 40) ** (1 / 3)).heights(SETUP)
+    # Where the phase wraps, the last digits decide on which side.
+    assert np.mean(np.isclose(alone, lens(SETUP, power_per_m), atol=1e-12)) > 0.999
+
+
 def test_the_starts_are_those_of_the_spec() -> None:
     assert BUILT_IN.keys() == STARTS.keys()
     for name, options in STARTS.items():
@@ -147,7 +186,7 @@ def test_the_starts_are_those_of_the_spec() -> None:
                 start_heights(name, {option: "much"}, SETUP)
 
 
-@pytest.mark.parametrize("name", ["flat", "random", "ring"])
+@pytest.mark.parametrize("name", ["flat", "random", "ring", "nlopt"])
 def test_radial_starts_are_profiles(name: str) -> None:
     found = start_heights(name, {}, SETUP._replace(radial=True))
     assert found.shape == (ring_count(CAMERA),)
@@ -160,6 +199,8 @@ def test_radial_starts_are_profiles(name: str) -> None:
         ("ring", {"far_energy": 1.5}, "from 0 to 1"),
         ("ring", {"period": "five"}, "must be a length"),
         ("random", {"feature": "-1 um"}, "must be positive"),
+        ("nlopt", {"algorithm": "direct"}, "must be one of crs, mlsl, isres"),
+        ("nlopt", {"evaluations": 5}, "from 20 to 100000"),
     ],
 )
 def test_wrong_options_are_named(name: str, options: dict[str, object], words: str) -> None:

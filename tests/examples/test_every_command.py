@@ -28,7 +28,7 @@ def test_the_script_leaves_no_command_out(tmp_path: Path, monkeypatch: pytest.Mo
         (item / f"{name}.exr").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(every_command, "measure", lambda run, out: out / "measurement.toml")
-    assert len(NAMES) == 13
+    assert len(NAMES) == 14
     assert {command[0] for command in every_command.commands(QUICK, "quick")} == NAMES
     assert len(list((tmp_path / "pairs").iterdir())) == 3
 
@@ -75,6 +75,7 @@ def test_every_command_runs_with_its_defaults(tmp_path: Path):
         # Found: 22 nm and 0.13 %, some standard deviations, which know of noise alone; the prior has 500 nm and 2 %.
         limit = 40e-9 if error["name"].partition("[")[0].endswith("_m") else 0.003
         assert error["value"] == pytest.approx(hidden.value(error["name"]), abs=limit)
+    assert (run.with_name("quick_v2") / "precompensation.csv").is_file()
     assert (run / "trained" / "network.npz").is_file()
     assert (run / "tolerance" / "results.json").is_file()
     assert (run / "finetuned" / "network.npz").is_file()

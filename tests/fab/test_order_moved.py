@@ -14,6 +14,8 @@ from fab.layout.geometry import Layer, Shapes, pixel_edges
 from fab.layout.wafer import Wafer
 from fab.levels import Levels
 from fab.manifest.records import read_manifest
+from fab.order.order import Order, plan_order
+from fab.order.request import order_from, request_of
 from fab.order.verify import verify
 from fab.order.write import write_order
 from fab.process import Normal, Process
@@ -75,3 +77,34 @@ def test_a_bias_wider_than_the_pixels_allow_is_refused(tmp_path):
     with pytest.raises(ValueError, match="edges must move by less than half the narrowest line and space"):
         write_order(tmp_path / "o", wide_map(level_map, levels, grid), process=process, wafer=Wafer(compensate=True))
     assert not (tmp_path / "o").exists()
+
+
+def test_edges_may_be_given_by_mask_whatever_the_process_is_known_for():
+    levels, grid = Levels(16, 75e-9), Grid((36, 30), 1.85e-6)
+    level_map = np.kron(np.random.default_rng(8).integers(0, 16, (12, 10)), np.ones((3, 3), int)).astype(np.uint8)
+    moves, process = (-100e-9, 60e-9, 200e-9, 0.0), Process(levels, spreads={"common_cd_bias_m": Normal(0.3e-6, 0.0)})
+
+    def planned(wafer: Wafer) -> Order:
+        return plan_order(wide_map(level_map, levels, grid, "small"), process=process, wafer=wafer)
+
+    order, plain = planned(Wafer(edge_moves_m=moves)), planned(Wafer())
+    assert [move * order.dbu_m for move in order.edge_moves()] == pytest.approx(moves)
+    assert order.geometry != plain.geometry
+    # Orders from before there was such a list are the same as ever.
+    assert "edge_moves_m" not in request_of(plain)["wafer"]
+    assert order_from(request_of(order), level_map, "here").edge_moves() == order.edge_moves()
+    with pytest.raises(ValueError, match="must be one length per mask, 4, but got 3"):
+        planned(Wafer(edge_moves_m=moves[:3])).edge_moves()
+
+
+@pytest.mark.parametrize(
+    ("wafer", "words"),
+    [
+        ({"edge_moves_m": (1e-7,) * 4, "compensate": True}, "or against the bias, but got both"),
+        ({"edge_moves_m": (2e-4,)}, "must be at most 100 um"),
+        ({"edge_moves_m": (float("nan"),)}, "must be at most 100 um"),
+    ],
+)
+def test_moves_that_cannot_be_are_refused(wafer, words):
+    with pytest.raises(ValueError, match=words):
+        Wafer(**wafer)

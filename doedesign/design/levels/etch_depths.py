@@ -89,9 +89,13 @@ def recipe_depths_m(depths_m: Sequence[float] | NDArray[np.floating], levels: Le
 
     They go from shallow to deep where every set of masks makes a level; elsewhere other levels would come of that.
     """
-    in_order = sorted(depths_m) if levels.is_full else depths_m
+    return tuple(map(recipe_depth_m, sorted(depths_m) if levels.is_full else depths_m))
+
+
+def recipe_depth_m(depth_m: float | np.floating) -> float:
+    """Return a depth as a recipe holds it, whole tenths of a nanometre."""
     # By way of text, so that 80.1 nm is the same number as in a spec.
-    return tuple(float(f"{round(float(depth) / NM, 1)!r}e-9") for depth in in_order)
+    return float(f"{round(float(depth_m) / NM, 1)!r}e-9")
 
 
 def optimal_levels(heights: HeightHistogram, start: Levels) -> Levels:

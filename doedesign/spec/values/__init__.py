@@ -45,6 +45,7 @@ STARTS = {
     "random": ("feature",),
     "fresnel": ("focal_length", "evaluations"),
     "ring": ("far_energy", "height", "duty", "period", "roughness"),
+    "nlopt": ("algorithm", "evaluations", "roughness"),
     "axicon": ("angle",),
     "vortex": ("charge",),
     "blazed": ("period", "azimuth"),
