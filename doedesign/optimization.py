@@ -206,17 +206,17 @@ def _reader(spec: Spec) -> Callable[[Path], np.ndarray]:
 def _resume(
     run: Run, problem: Problem, sources: SourceSet, files: dict[str, Path]
 ) -> tuple[OptimizationState, list[dict[str, Any]]]:
-    empty = empty_state(run.spec, problem)
-    leaves, tree = jax.tree.flatten((empty.parameters, empty.adam, empty.printed))
+    empty = empty_state(run.spec, problem, sources)
+    leaves, tree = jax.tree.flatten((empty.parameters, empty.adam, empty.printed, empty.robust))
     stored = load_checkpoint(run, leaves)
     if stored is None:
         log.info(f'starting from "{run.spec.optimize.start}"')
         return initial_state(run.spec, problem, sources, files, _reader(run.spec)), []
     arrays, step, history = stored
     log.info(f"resuming after step {step}")
-    parameters, adam, printed = jax.tree.unflatten(tree, arrays)
+    parameters, adam, printed, robust = jax.tree.unflatten(tree, arrays)
     parameters, adam = jax.tree.map(jnp.asarray, (parameters, adam))
-    return OptimizationState(parameters, adam, step, printed), history
+    return OptimizationState(parameters, adam, step, printed, robust), history
 
 
 def _aimed_task(spec: Spec) -> Any:
@@ -269,7 +269,7 @@ def _iterate(
     run: Run | None = None,
 ) -> tuple[_State, list[dict[str, Any]]]:
     """Do the steps that are left; in a run, keep a checkpoint every so many, and after the last one."""
-    last, every = spec.optimize.steps, spec.optimize.checkpoint_every
+    last, every = spec.all_steps, spec.optimize.checkpoint_every
     with meter("optimising", last, state.step) as progress:
         for state, record in work:
             history.append(record)

@@ -27,7 +27,7 @@ from doedesign.areas.shape import AreaTables
 from doedesign.build import process_from_spec, resolve_process, spec_from_process
 from doedesign.calibration.unknowns import chosen_names
 from doedesign.design.design import Design
-from doedesign.design.etch_depths import recipe_depth_m
+from doedesign.design.levels.etch_depths import recipe_depth_m
 from doedesign.design.objectives import Objective, PsfSet, Term, source_digests, terms_from_spec
 from doedesign.focus.depth import FocusTable
 from doedesign.optimization import write_results

@@ -226,6 +226,14 @@ def height_transmission(height_m: Float[Array, "y x"], waves_per_metre: Float[Ar
     return cis(height_m * waves_per_metre)
 
 
+@jax.jit
+def height_deviation(
+    transmission: Complex[Array, "y x"], height_m: Float[Array, "y x"], waves_per_metre: Float[Array, ""] | float
+) -> Complex[Array, "y x"]:
+    """Transmission of a DOE as fabricated over that of heights as drawn, metres (`HeightOptic.deviation`)."""
+    return transmission * jnp.conj(cis(height_m * waves_per_metre))
+
+
 class HeightOptic(CellOptic):
     """A DOE given by its height map, as a thin element.
 

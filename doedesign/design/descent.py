@@ -8,14 +8,11 @@ for by what one look misses.
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from doedesign.design.levels.parametrize import Parameters
-from doedesign.design.problem import Problem, SourceSet, losses, view_of
+from doedesign.design.problem import Problem, SourceSet, value_and_slope
 from doedesign.spec import Spec
 
 _FIRST_SHARE = 0.02  # of the cells, that the first move takes
@@ -55,8 +52,8 @@ def descend(
 
     def judge(level: np.ndarray) -> tuple[float, np.ndarray]:
         height = jnp.asarray(level * np.float32(step_m), jnp.float32)  # of the pixels that are drawn
-        found = [_judged(problem, height, look) for look in looks]
-        return float(np.mean([loss for loss, _ in found])), np.mean([slope for _, slope in found], axis=0)
+        found = [value_and_slope(problem, height, look) for look in looks]
+        return float(np.mean([loss for loss, _, _ in found])), np.mean([slope for _, _, slope in found], axis=0)
 
     best, slope = judge(level)
     share = _FIRST_SHARE
@@ -76,9 +73,3 @@ def descend(
             share /= 2
         advance(move + 1, best)
     return parameters._replace(radians=jnp.asarray(staircase.radians_of(level * step_m)))
-
-
-@eqx.filter_jit
-def _judged(problem: Problem, height_m: Float[Array, "*s"], look: Any) -> tuple[Array, Float[Array, "*s"]]:
-    cells = problem.parametrization.cells
-    return jax.value_and_grad(lambda h: losses(problem, view_of(problem, cells(h), look))[0])(height_m)

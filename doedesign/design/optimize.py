@@ -27,9 +27,10 @@ from jaxtyping import Array, Float, UInt8
 from doedesign.design.design import Design
 from doedesign.design.levels.etch_depths import height_histogram, optimal_levels, recipe_depths_m
 from doedesign.design.levels.parametrize import Parameters
-from doedesign.design.levels.printable import PULL, PrintableLevels, first_printed, heights_m
+from doedesign.design.levels.printable import PrintableLevels, first_printed, heights_m, pulled
 from doedesign.design.levels.quantisation import Rounding, rounding_at
 from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
+from doedesign.design.robust import RobustState, RobustTask
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
 from doedesign.spec import STARTS, Spec
@@ -50,17 +51,19 @@ class OptimizationState(NamedTuple):
         step: number of steps done.
         printed: `[y, x]` levels that the last step looked at, of a design whose masks obey rules; blank before the
             first such step, and None for other designs.
+        robust: what the steps of a robust design change; None for other designs.
     """
 
     parameters: Parameters
     adam: optax.OptState
     step: int
     printed: UInt8[np.ndarray, "y x"] | None = None
+    robust: RobustState | None = None
 
     @property
     def arrays(self) -> list[np.ndarray]:
         """Arrays that a checkpoint keeps."""
-        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam, self.printed))]
+        return [np.asarray(leaf) for leaf in jax.tree.leaves((self.parameters, self.adam, self.printed, self.robust))]
 
 
 def optimiser_of(spec: Spec) -> optax.GradientTransformation:
@@ -105,16 +108,25 @@ def initial_state(
             cure = 'Use parametrization = "freeform", or another start.'
             raise InputError(str(path), rule, "a map with other structure", cure)
     heights = problem.parametrization.drawn(heights)
-    parameters: Any = first_parameters(spec, jnp.asarray(problem.parametrization.radians_of(heights)))
-    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, blank_of(spec, problem))
+    return _state_of(spec, problem, scene, jnp.asarray(problem.parametrization.radians_of(heights)))
 
 
-def empty_state(spec: Spec, problem: Problem) -> OptimizationState:
+def empty_state(spec: Spec, problem: Problem, scene: SourceSet) -> OptimizationState:
     """State of the same shapes and types as every other one of a spec."""
     block = problem.parametrization.block
     drawn = tuple(count // block for count in problem.optic.shape)
-    parameters: Any = first_parameters(spec, jnp.zeros(drawn, jnp.float32))
-    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, blank_of(spec, problem))
+    return _state_of(spec, problem, scene, jnp.zeros(drawn, jnp.float32))
+
+
+def _state_of(spec: Spec, problem: Problem, scene: SourceSet, radians: Array) -> OptimizationState:
+    """State before the first step, of phases."""
+    parameters: Any = first_parameters(spec, radians)
+    rules = printable_levels(spec, problem)
+    robust = None
+    if spec.robust is not None:
+        robust = RobustTask.of(spec, problem, scene).initial_state(np.zeros(radians.shape, np.uint8))
+    printed = None if rules is None else rules.blank.level
+    return OptimizationState(parameters, optimiser_of(spec).init(parameters), 0, printed, robust)
 
 
 def printable_levels(spec: Spec, problem: Problem) -> PrintableLevels | None:
@@ -123,12 +135,6 @@ def printable_levels(spec: Spec, problem: Problem) -> PrintableLevels | None:
     if feature_m is None:
         return None
     return PrintableLevels.on(problem.camera.grid, spec.doe.relief, problem.parametrization, feature_m, weight)
-
-
-def blank_of(spec: Spec, problem: Problem) -> UInt8[np.ndarray, "y x"] | None:
-    """Levels without etches of a spec whose masks obey rules; None for others."""
-    rules = printable_levels(spec, problem)
-    return None if rules is None else rules.blank.level
 
 
 def first_parameters(spec: Spec, radians: Array) -> Parameters:
@@ -176,9 +182,7 @@ def make_printed_update(spec: Spec) -> Callable[[Any, Any], Any]:
         slope: Any = Parameters(gradient * parametrization.metres_per_radian)
         updates, adam = optimiser.update(slope, adam)
         moved: Any = optax.apply_updates(parameters, updates)
-        wave = parametrization.levels.period_m / parametrization.metres_per_radian
-        away = height_m / parametrization.metres_per_radian - moved.radians
-        radians = moved.radians + PULL * (jnp.mod(away + wave / 2, wave) - wave / 2)
+        radians = pulled(moved.radians, height_m, parametrization)
         wanted = parametrization.level(parametrization.continuous_m(radians)).astype(jnp.uint8)
         return (Parameters(radians), adam), loss, terms, wanted
 
@@ -211,17 +215,37 @@ def steps(
         before = state.parameters, state.adam
         if rules is None or step < first_printed(spec.optimize.steps):
             (parameters, adam), loss, terms = update(inputs, before)
-            state = OptimizationState(parameters, adam, step + 1, state.printed)
+            state = state._replace(parameters=parameters, adam=adam, step=step + 1)
         else:
             level = _printed(rules, problem, spec, state)
             height = jnp.asarray(heights_m(level, problem.parametrization))
             (parameters, adam), loss, terms, wanted = printed_update((problem, inputs[1], height), before)
-            state = OptimizationState(parameters, adam, step + 1, rules.nearer(level, np.asarray(wanted)))
+            printed = rules.nearer(level, np.asarray(wanted))
+            state = state._replace(parameters=parameters, adam=adam, step=step + 1, printed=printed)
         if not np.isfinite(float(loss)):
             cure = "Lower the learning rate."
             raise InputError(f"optimize, step {step}", "the loss must stay finite", float(loss), cure)
         record = {"step": step, "loss": float(loss), "terms": [float(term) for term in terms], "names": names}
         yield state, record
+    if spec.robust is None:
+        return
+    task, count = RobustTask.of(spec, problem, scene), spec.optimize.steps
+    robust = state.robust
+    if state.step == count or robust is None:
+        robust = task.initial_state(_last_level(spec, problem, state))
+    for robust, record in task.steps(robust, state.step - count):  # noqa: B020 - goes on from the one before
+        state = state._replace(robust=robust, step=record["step"] + 1)
+        yield state, record
+
+
+def _last_level(spec: Spec, problem: Problem, state: OptimizationState) -> UInt8[np.ndarray, "y x"]:
+    """Levels that a state draws, pixel by pixel."""
+    parametrization = problem.parametrization
+    if spec.robust is not None and state.robust is not None and state.step > spec.optimize.steps:
+        return state.robust.level
+    if (rules := printable_levels(spec, problem)) is not None:
+        return _printed(rules, problem, spec, state)
+    return np.asarray(parametrization.level(parametrization.continuous_m(state.parameters.radians))).astype(np.uint8)
 
 
 def finished_design(
@@ -229,12 +253,17 @@ def finished_design(
 ) -> Design:
     """Return the design of the parameters: every cell at its nearest level, and the heights before rounding."""
     parametrization, camera = problem.parametrization, problem.camera
-    drawn = parametrization.continuous_m(state.parameters.radians)
+    robust = state.robust if state.step > spec.optimize.steps else None
+    parameters = state.parameters if robust is None else robust.parameters
+    drawn = parametrization.continuous_m(parameters.radians)
     continuous = problem.optic.raster(np.asarray(parametrization.cells(drawn)))
-    levels = _chosen_levels(spec, problem, state, continuous) if spec.process.chooses_depths else parametrization.levels
-    level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
-    if (rules := printable_levels(spec, problem)) is not None:
-        level = np.asarray(parametrization.cells(jnp.asarray(_printed(rules, problem, spec, state))))
+    levels = parametrization.levels
+    if spec.process.chooses_depths:
+        levels = _chosen_levels(spec, problem, state, continuous)
+    if problem.optic.shape == continuous.shape and not spec.process.chooses_depths:
+        level = np.asarray(parametrization.cells(jnp.asarray(_last_level(spec, problem, state))))
+    else:
+        level = np.asarray(replace(parametrization, levels=levels).level(jnp.asarray(continuous))).astype(np.uint8)
     level_map = LevelMap(level, levels, camera.grid, spec.doe.relief, spec.name)
     near_m, far_m = spec.scene.near_m, spec.scene.far_m
     return Design(level_map, camera, near_m, far_m, continuous_m=continuous, spec=spec, history=tuple(history))

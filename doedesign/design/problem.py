@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -185,3 +186,17 @@ def _judge(problem: Problem, height_m: Array, look: StepSources) -> Array:
 def judge_height(problem: Problem, scene: SourceSet, height_m: Float[np.ndarray, "*s"]) -> float:
     """Loss of given heights at the first near and far depth, without gradient (for searches over few parameters)."""
     return float(_judge(problem, jnp.asarray(height_m, jnp.float32), scene.first_look()))
+
+
+@eqx.filter_jit
+def value_and_slope(
+    problem: Problem, drawn_m: Float[Array, "*s"], look: StepSources
+) -> tuple[Float[Array, ""], Float[Array, " term"], Float[Array, "*s"]]:
+    """Loss of heights (metres) of the pixels that are drawn, its terms, and its derivative with respect to them."""
+    cells = problem.parametrization.cells
+
+    def loss_of(height_m: Array) -> tuple[Array, Array]:
+        return losses(problem, view_of(problem, cells(height_m), look))
+
+    (loss, terms), slope = jax.value_and_grad(loss_of, has_aux=True)(drawn_m)
+    return loss, terms, slope

@@ -39,6 +39,7 @@ from doedesign.spec.order import OrderFile, OrderSpec
 from doedesign.spec.process import DefectsSpec, ErrorsSpec, LimitSpec, ProcessSpec
 from doedesign.spec.process_checks import process_problems, variation_problems
 from doedesign.spec.response import with_response
+from doedesign.spec.robust import RobustSpec
 from doedesign.spec.text import (
     process_to_toml,
     spec_digest,

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 from doedesign.spec.models import Spec
 from doedesign.spec.process_checks import process_problems
+from doedesign.spec.robust import robust_problems
 from doedesign.spec.targets.areas import area_problems
 from doedesign.spec.targets.focus import focus_problems
 from doedesign.spec.targets.spots import spot_problems
@@ -33,7 +34,8 @@ _BEAM_KEYS = {
 def find_problems(spec: Spec) -> list[InputError]:
     """Return every rule between values, each of them valid by itself, that a spec breaks."""
     rules = (_distance, _light, _doe, _sensor, _lens, _illumination, _scene, _fresnel_sampling, _objectives, _process)
-    rules = (*rules, _quantisation, _printing, _limits, _training, spot_problems, area_problems, focus_problems)
+    rules = (*rules, _quantisation, _printing, robust_problems, _limits, _training)
+    rules = (*rules, spot_problems, area_problems, focus_problems)
     return [problem for rule in rules for problem in rule(spec)]
 
 

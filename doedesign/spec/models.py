@@ -22,6 +22,7 @@ from pydantic import (
 
 from doedesign.spec.order import OrderSpec
 from doedesign.spec.process import LimitSpec, ProcessSpec
+from doedesign.spec.robust import RobustSpec
 from doedesign.spec.scene import IlluminationSpec, ObstructionSpec, SceneSpec, SensorSpec
 from doedesign.spec.targets.areas import AreaSpec
 from doedesign.spec.targets.focus import FocusSpec
@@ -303,9 +304,15 @@ class Spec(SpecTable, frozen=True):
     limits: tuple[LimitSpec, ...] = optional(())
     wafer: WaferSpec = optional(WaferSpec())
     order: OrderSpec = optional(OrderSpec())
+    robust: RobustSpec | None = optional()
     network: NetworkSpec = optional(NetworkSpec())
     train: TrainSpec = optional(TrainSpec())
     _file: Path | None = PrivateAttr(None)
+
+    @property
+    def all_steps(self) -> int:
+        """Steps of [optimize] and of [robust]."""
+        return self.optimize.steps + (0 if self.robust is None else self.robust.steps)
 
     @model_validator(mode="before")
     @classmethod

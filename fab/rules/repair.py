@@ -15,6 +15,7 @@ level. Last, pixels go back to the level that was asked for, or nearer to it, wh
 """
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -39,7 +40,6 @@ _GRAVITY = 1000
 _ATTEMPTS = 4
 WIDEST = 32
 _NO_WALLS = np.zeros(0)
-_SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -275,20 +275,20 @@ def follow(
     wanted: NDArray[np.uint8],
     rules: Rules,
     waves_per_metre: float | None = None,
-    wall_weight: float = 0.0,
+    wall_costs: Sequence[float] = (),
 ) -> LevelMap:
     """Move a level map toward the levels that are wanted, as far as it then breaks no rule that it kept before.
 
     Every move sets a small rectangle to a level that is near it, and lowers the sum of the phase errors 1 - cos of all
-    pixels and of the cost of all walls. What two sweeps over the map do not reach stays for the next call.
+    pixels and of the cost of all walls. What a sweep over the map does not reach stays for the next call.
 
     Args:
         level_map: the map before, best one that breaks no rule (`repair`).
         wanted: `[y, x]` levels that are wanted.
         rules: narrowest line and space, metres. Corners must not touch, whatever these are.
         waves_per_metre: as for `repair`.
-        wall_weight: cost of a wall as long as a pixel and as deep as the period of the staircase, in units of 1 - cos.
-            Every mask has walls of its own: between levels 7 and 8 of 16 they are fifteen steps deep together.
+        wall_costs: of every mask, the cost of a wall as long as a pixel, in units of 1 - cos; nothing where empty.
+            Every mask has walls of its own: between levels 7 and 8 of 16 all four have one.
 
     Returns:
         the map after; nothing has changed outside its relief.
@@ -298,11 +298,9 @@ def follow(
     """
     levels, bits = level_map.levels, np.arange(level_map.levels.bits)
     wall = _NO_WALLS
-    if wall_weight:
-        depths = np.array(levels.depths_m) / levels.period_m
-        wall = np.array([wall_weight * depths @ (masks >> bits & 1) for masks in range(2**levels.bits)])
+    if any(wall_costs):
+        opened = (np.arange(2**levels.bits)[:, None] >> bits) & 1
+        wall = np.asarray(opened @ np.array(wall_costs), np.float64)
     task = _task_of(level_map, wanted, rules, _checked_waves(levels, waves_per_metre), wall)._replace(gravity=_GRAVITY)
-    for _ in range(_SWEEPS):
-        if not _sweep_all(task, _HARD, changed_too=True):
-            break
+    _sweep_all(task, _HARD, changed_too=True)
     return _level_map_of(task, level_map)

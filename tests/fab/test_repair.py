@@ -212,7 +212,8 @@ def test_a_map_follows_another_and_breaks_no_rule(line, space):
 def test_walls_that_cost_are_fewer():
     wanted, rules = smooth_map(), Rules(2 * UM, 2 * UM)
     start = repair(level_map_from(wanted, SIXTEEN, UM, math.inf), rules, RATE).level_map
-    found = [follow(start, wanted, rules, RATE, weight).level for weight in (0.0, 0.3, 3.0)]
+    depths = np.array([1, 2, 4, 8]) / 16
+    found = [follow(start, wanted, rules, RATE, list(weight * depths)).level for weight in (0.0, 0.3, 3.0)]
     walls, errors = [depth_of_walls(one) for one in found], [misses(one, wanted) for one in found]
     assert walls[0] > walls[1] > walls[2]
     assert errors[1] < errors[2]

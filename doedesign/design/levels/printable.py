@@ -8,10 +8,12 @@ stray. A map that is repaired when all is done loses what this one finds.
 The cells may be coarser than those of the grid (`optimize.drawn_pixel`): rules are then those of the coarse cells.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 
 from doedesign.design.levels.parametrize import LevelParametrization
 from fab.aperture import Aperture, MaskAperture
@@ -36,13 +38,13 @@ class PrintableLevels:
         blank: a level map without etches, on the cells that are drawn.
         rules: narrowest line and space.
         waves_per_metre: waves of light per metre of height at the design wavelength.
-        wall_weight: cost of walls (`fab.rules.repair.follow`).
+        wall_costs: cost of the walls of every mask (`fab.rules.repair.follow`); empty where they cost nothing.
     """
 
     blank: LevelMap
     rules: Rules
     waves_per_metre: float
-    wall_weight: float = 0.0
+    wall_costs: tuple[float, ...] = ()
 
     @classmethod
     def on(
@@ -60,7 +62,8 @@ class PrintableLevels:
             relief: outline of the relief.
             parametrization: staircase, design wavelength, and size of the cells that are drawn.
             min_feature_m: narrowest line and space, metres; 0 forbids no more than corners that touch.
-            wall_weight: cost of walls.
+            wall_weight: cost of a wall as long as a pixel and as deep as the period of the staircase, in units of
+                1 - cos of the phase error of a pixel.
 
         Raises:
             InputError: a feature of more than 32 pixels.
@@ -77,7 +80,14 @@ class PrintableLevels:
             raise InputError("optimize.min_feature", rule, got, "Draw larger pixels (optimize.drawn_pixel).")
         blank = LevelMap(np.full(grid.shape, levels.count - 1, np.uint8), levels, grid, relief)
         waves = 1 / (2 * np.pi * parametrization.metres_per_radian)
-        return cls(blank, Rules(min_feature_m, min_feature_m), waves, wall_weight)
+        costs = tuple(wall_weight * depth_m / levels.period_m for depth_m in levels.depths_m) if wall_weight else ()
+        return cls(blank, Rules(min_feature_m, min_feature_m), waves, costs)
+
+    def with_costs(self, more: Sequence[float]) -> "PrintableLevels":
+        """The same with further costs of the walls of every mask."""
+        return replace(
+            self, wall_costs=tuple(a + b for a, b in zip(self.wall_costs or [0.0] * len(more), more, strict=True))
+        )
 
     def first(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
         """The nearest levels that break no rule."""
@@ -86,7 +96,16 @@ class PrintableLevels:
     def nearer(self, level: UInt8[np.ndarray, "y x"], wanted: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
         """Levels that break no rule, moved toward those that are wanted."""
         old = self.blank.with_level(level)
-        return follow(old, wanted, self.rules, self.waves_per_metre, self.wall_weight).level
+        return follow(old, wanted, self.rules, self.waves_per_metre, self.wall_costs).level
+
+
+def pulled(
+    radians: Float[Array, "y x"], height_m: Float[Array, "y x"], parametrization: LevelParametrization
+) -> Float[Array, "y x"]:
+    """Phases pulled toward those of heights, the nearer way round."""
+    wave = parametrization.levels.period_m / parametrization.metres_per_radian
+    away = height_m / parametrization.metres_per_radian - radians
+    return radians + PULL * (jnp.mod(away + wave / 2, wave) - wave / 2)
 
 
 def first_printed(steps: int) -> int:

@@ -1,0 +1,257 @@
+"""Robust design: steps that minimise the risk of plates as fabricated, not the loss of the plate as drawn.
+
+They begin at the level map that the other steps found. Of every round of steps the plates are drawn anew, in pairs with
+errors of opposite sign, and the worst one of the round before is looked at again; within a round all steps see the same
+ones. `sim.surface.as_fabricated` says what each does to the map: the deviation of its transmission from that of the
+heights, which holds for the steps of a round. The gradient of the losses is taken with that deviation, so that phases
+make up for what the errors do on average. What it cannot see are walls, where the errors act: they have a cost in the
+moves by which the level map follows the phases (`fab.rules.repair.follow`), by the light that they send astray.
+
+Sources: J. Jung et al., BOSON-1, arXiv:2411.08210 (worst cases in the loop); R. T. Rockafellar and S. Uryasev, J. Risk
+2, 21 (2000) (the mean of the worst, CVaR).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, UInt8
+
+from doedesign.build import process_from_spec
+from doedesign.design.levels.parametrize import LevelParametrization, Parameters
+from doedesign.design.levels.printable import PrintableLevels, heights_m, pulled
+from doedesign.design.problem import Problem, SourceSet, value_and_slope
+from doedesign.spec import RobustSpec, Spec
+from fab.draws import draw_at, varying
+from fab.errors import InputError
+from fab.process import Normal, Process, Variation
+from sim.optic import HeightOptic, height_deviation
+from sim.surface import as_fabricated
+
+ROUND = 8  # steps that look at the same plates
+_FOLLOWED = 4  # steps after which the level map follows the phases: what one look misses the next ones see
+_SOFT = 0.02  # of the limit, over which a plate turns from good to bad
+_SALT = 3  # of the random numbers, beside those of looks
+
+
+class RobustState(NamedTuple):
+    """Everything that a robust step changes, beside the number of steps.
+
+    Attributes:
+        parameters: phases.
+        adam: Adam's moments of them.
+        level: `[y, x]` levels that can be printed, of the pixels that are drawn.
+        seen: `[y, x]` levels whose plates as fabricated this round looks at.
+        worst: round and place in it of the worst plate of the round before; -1 in the first round.
+        losses: `[draw]` summed losses of this round.
+    """
+
+    parameters: Parameters
+    adam: Any
+    level: UInt8[np.ndarray, "y x"]
+    seen: UInt8[np.ndarray, "y x"]
+    worst: np.ndarray
+    losses: np.ndarray
+
+
+class RobustTask(NamedTuple):
+    """A robust design: what stays the same from step to step.
+
+    Attributes:
+        spec: the spec.
+        problem: its problem.
+        scene: its sources.
+        process: the process, whose errors plates have.
+        rules: rules of its masks, and the cost of their walls.
+    """
+
+    spec: Spec
+    problem: Problem
+    scene: SourceSet
+    process: Process
+    rules: PrintableLevels
+
+    @classmethod
+    def of(cls, spec: Spec, problem: Problem, scene: SourceSet) -> "RobustTask":
+        """The task of a spec with a table [robust].
+
+        Raises:
+            InputError: a process without errors.
+        """
+        process, pitch_m = process_from_spec(spec.process), problem.camera.grid.pitch_m
+        if not varying(process):
+            cure = 'For example process.stock = "contact_aligner".'
+            raise InputError("robust", "plates must differ", "a process without errors", cure)
+        parametrization, optimize = problem.parametrization, spec.optimize
+        costs = wall_costs(process, pitch_m * parametrization.block)
+        assert spec.robust is not None
+        by_errors = [spec.robust.walls * cost for cost in costs]
+        rules = PrintableLevels.on(
+            problem.camera.grid, spec.doe.relief, parametrization, optimize.min_feature_m or 0.0, optimize.wall_weight
+        ).with_costs(by_errors)
+        return cls(spec, problem, scene, process, rules)
+
+    @property
+    def robust(self) -> RobustSpec:
+        """The table [robust]."""
+        assert self.spec.robust is not None
+        return self.spec.robust
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam whose step size grows over a round and falls to a tenth along a cosine."""
+        rate, count = self.robust.learning_rate, max(self.robust.steps, 2)
+        schedule = optax.warmup_cosine_decay_schedule(rate / 5, rate, min(ROUND, count // 2), count, rate / 10)
+        return optax.adam(schedule)
+
+    def initial_state(self, level: UInt8[np.ndarray, "y x"]) -> RobustState:
+        """State before the first robust step, of levels of the pixels that are drawn."""
+        parametrization = self.problem.parametrization
+        level = self.rules.blank.with_level(level).level  # blank outside the relief
+        if self.spec.optimize.min_feature_m is not None:
+            level = self.rules.first(level)
+        radians = jnp.asarray(parametrization.radians_of(heights_m(level, parametrization)))
+        parameters: Any = Parameters(radians)
+        none, losses = np.full(2, -1, np.int32), np.zeros(self.robust.draws, np.float32)
+        return RobustState(parameters, self.optimiser.init(parameters), level, level, none, losses)
+
+    def variations(self, round_: int, worst: np.ndarray) -> list[Variation]:
+        """Errors of the plates of a round; the last one is the worst of the round before."""
+        drawn = [self._variation(round_, place) for place in range(self.robust.draws)]
+        if worst[0] >= 0 and len(drawn) > 2:
+            drawn[-1] = self._variation(int(worst[0]), int(worst[1]))
+        return drawn
+
+    def _variation(self, round_: int, place: int) -> Variation:
+        seed = [self.spec.optimize.seed, _SALT, round_, place // 2]
+        scores = np.random.default_rng(seed).standard_normal(len(varying(self.process)))
+        return draw_at(self.process, scores if place % 2 == 0 else -scores, place)
+
+    def plate(self, level: UInt8[np.ndarray, "y x"], variation: Variation) -> Problem:
+        """The problem with a plate as fabricated: its deviation from the heights of a level map."""
+        parametrization, optic = self.problem.parametrization, self.problem.optic
+        cells = np.asarray(parametrization.cells(jnp.asarray(level)))
+        camera = self.problem.camera
+        cells = np.where(self.spec.doe.relief.inside(camera.grid), cells, parametrization.levels.count - 1)
+        made = as_fabricated(cells.astype(np.uint8), camera, self.process, variation)
+        height = jnp.asarray(heights_m(cells, parametrization))
+        ratio = [
+            height_deviation(made.at(line.wavelength_m), height, camera.waves_per_metre(line.wavelength_m))
+            for line in camera.lines
+        ]
+        assert isinstance(optic, HeightOptic)
+        # Its transmission has the chrome already.
+        open_ = jnp.ones_like(optic.coverage)
+        return replace(self.problem, optic=replace(optic, deviation=jnp.stack(ratio), coverage=open_))
+
+    def steps(self, state: RobustState, done: int) -> Iterator[tuple[RobustState, dict[str, Any]]]:
+        """Run the robust steps that are left.
+
+        Args:
+            state: that before.
+            done: number of robust steps done.
+
+        Yields:
+            the state after each step, and the line of the history: the risk before it, and every term's mean over the
+            plates.
+
+        Raises:
+            InputError: errors beyond what the model describes, or a loss that is no longer finite.
+        """
+        optimiser, parametrization = self.optimiser, self.problem.parametrization
+        plates: list[Problem] = []
+        for step in range(done, self.robust.steps):
+            round_, place = divmod(step, ROUND)
+            if place == 0:
+                worst = np.array([round_ - 1, np.argmax(state.losses)] if round_ else [-1, -1], np.int32)
+                state = state._replace(seen=state.level, worst=worst, losses=np.zeros_like(state.losses))
+            if not plates or place == 0:
+                plates = [self.plate(state.seen, one) for one in self.variations(round_, state.worst)]
+            height = jnp.asarray(heights_m(state.level, parametrization))
+            look = self.scene.look(self.spec.optimize.seed, self.spec.optimize.steps + step)
+            found = [value_and_slope(plate, height, look) for plate in plates]
+            losses = np.array([float(loss) for loss, _, _ in found], np.float32)
+            if not np.all(np.isfinite(losses)):
+                cure = "Lower robust.learning_rate."
+                raise InputError(f"robust, step {step}", "losses must stay finite", losses.tolist(), cure)
+            risk, weights = risk_of(losses, self.robust)
+            slope = _weighted([gradient for _, _, gradient in found], weights)
+            parameters, adam = _moved(optimiser, parametrization, state.parameters, state.adam, slope, height)
+            level = state.level
+            if (step + 1) % _FOLLOWED == 0:
+                wanted = parametrization.level(parametrization.continuous_m(parameters.radians))
+                level = self.rules.nearer(level, np.asarray(wanted).astype(np.uint8))
+            state = RobustState(parameters, adam, level, state.seen, state.worst, state.losses + losses)
+            terms = np.mean([np.asarray(terms) for _, terms, _ in found], axis=0)
+            record = {"step": self.spec.optimize.steps + step, "loss": risk, "terms": terms.tolist()}
+            yield state, record | {"names": [term.name for term in self.problem.terms]}
+
+
+def wall_costs(process: Process, pixel_m: float) -> list[float]:
+    """Cost of a wall of every mask, as long as a pixel: the light that goes astray beside it.
+
+    The edges of a mask are off by overlay and line width; a strip as wide as the mean of that, sqrt(2 / pi) times its
+    root mean square for normal errors, has the phase of the mask's depth too much or too little, and 1 - cos of it
+    counts as in `fab.rules.repair`. The waves of depth are those of the period of the staircase.
+
+    Args:
+        process: the process.
+        pixel_m: side of a pixel, metres.
+    """
+    levels, costs = process.levels, []
+    for mask, depth_m in enumerate(levels.depths_m):
+        overlay = [process.spreads.get(f"overlay_{axis}_m[{mask}]", Normal()) for axis in "yx"]
+        width = [process.spreads.get(name, Normal()) for name in ("common_cd_bias_m", f"cd_bias_m[{mask}]")]
+        square = sum(one.mean**2 + one.sigma**2 for one in overlay) / 2
+        square += sum(one.sigma**2 for one in width) + sum(one.mean for one in width) ** 2
+        strip = min(np.sqrt(2 / np.pi * square) / pixel_m, 1.0)
+        costs.append(float(strip * (1 - np.cos(2 * np.pi * depth_m / levels.period_m))))
+    return costs
+
+
+def risk_of(losses: Float[np.ndarray, " draw"], robust: RobustSpec) -> tuple[float, Float[np.ndarray, " draw"]]:
+    """Risk of the losses of some plates, and its derivative with respect to each.
+
+    Args:
+        losses: `[draw]`.
+        robust: which risk (`RobustSpec.measure`).
+    """
+    count = len(losses)
+    if robust.measure == "cvar":
+        # The mean of the worst share; of the last plate that belongs to it, the part that does.
+        left = robust.share * count
+        weights = np.zeros(count)
+        for number in np.argsort(-losses, kind="stable"):
+            weights[number] = min(left, 1.0) / (robust.share * count)
+            left -= min(left, 1.0)
+        return float(weights @ losses), weights
+    if robust.measure == "yield":
+        assert robust.limit is not None
+        width = _SOFT * robust.limit
+        bad = 1 / (1 + np.exp(-(losses - robust.limit) / width))
+        return float(bad.mean()), bad * (1 - bad) / width / count
+    return float(losses.mean()), np.full(count, 1 / count)
+
+
+@jax.jit
+def _weighted(slopes: Sequence[Array], weights: Array) -> Array:
+    return sum((weight * slope for weight, slope in zip(weights, slopes, strict=True)), jnp.zeros(()))
+
+
+def _moved(
+    optimiser: optax.GradientTransformation,
+    parametrization: LevelParametrization,
+    parameters: Any,
+    adam: Any,
+    slope: Array,
+    height_m: Array,
+) -> tuple[Parameters, Any]:
+    """Phases and moments after a step, pulled toward the heights that were looked at."""
+    gradient: Any = Parameters(slope * parametrization.metres_per_radian)
+    updates, adam = optimiser.update(gradient, adam)
+    moved: Any = optax.apply_updates(parameters, updates)
+    return Parameters(pulled(moved.radians, height_m, parametrization)), adam

@@ -1,0 +1,162 @@
+"""Robust designs: steps that look at plates as fabricated."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from doedesign import optimization
+from doedesign.design.design import Design
+from doedesign.design.levels.printable import heights_m
+from doedesign.design.problem import Problem, SourceSet, problem_of, value_and_slope
+from doedesign.design.robust import ROUND, RobustTask, risk_of, wall_costs
+from doedesign.optimization import optimize
+from doedesign.spec import RobustSpec, load_spec
+from doedesign.spec.process import ErrorsSpec
+from fab.errors import InputError
+from fab.levels import Levels
+from fab.process import Normal, Process
+from sim.psf_bank import psf
+from sim.surface import as_fabricated
+from tests.doedesign.small_runs import SPEC
+
+SPREAD = SPEC.replace('name = "far_spot"\n', 'name = "far_spot"\n\n[[objective]]\nname = "near_spread"\nweight = 2.0\n')
+ROBUST = SPREAD.replace("steps = 0", "steps = 24\nlearning_rate = 0.5\nseed = 3\ncheckpoint_every = 1")
+ROBUST += "\n[robust]\nsteps = 16\nlearning_rate = 0.05\n"
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(ROBUST)
+    return path
+
+
+def task_of(spec: Path) -> tuple[RobustTask, Problem, SourceSet]:
+    read = load_spec(spec)
+    problem, scene = problem_of(read, {})
+    return RobustTask.of(read, problem, scene), problem, scene
+
+
+def test_risks_and_their_derivatives() -> None:
+    losses = np.array([1.0, 3.0, 2.0, 4.0])
+    assert risk_of(losses, RobustSpec())[0] == 2.5
+    worst = RobustSpec(measure="cvar", share=0.6)
+    # 2.4 plates of the worst: 4, 3 and four tenths of 2.
+    assert risk_of(losses, worst)[0] == pytest.approx((4 + 3 + 0.4 * 2) / 2.4, rel=1e-12)
+    bad = RobustSpec(measure="yield", limit=2.5)
+    assert risk_of(losses, bad)[0] == pytest.approx(0.5, abs=1e-4)  # edges are 0.05 wide, ten of them away
+    for robust in (RobustSpec(), worst, RobustSpec(measure="yield", limit=2.95)):
+        _, weights = risk_of(losses, robust)
+        for place in range(4):
+            moved = losses + 1e-6 * np.eye(4)[place]
+            slope = (risk_of(moved, robust)[0] - risk_of(losses, robust)[0]) / 1e-6
+            assert weights[place] == pytest.approx(slope, abs=1e-4)
+
+
+def test_walls_cost_the_light_that_goes_astray_beside_them() -> None:
+    """By many draws of the displacement of an edge, of a mask that etches a quarter wave."""
+    levels = Levels(4, 300e-9)
+    spreads = {
+        "overlay_x_m[0]": Normal(0.0, 0.4e-6),
+        "overlay_y_m[0]": Normal(0.0, 0.4e-6),
+        "cd_bias_m[1]": Normal(0.1e-6),
+    }
+    costs = wall_costs(Process(levels, spreads=spreads), 2e-6)
+    strips = np.abs(np.random.default_rng(0).normal(0, 0.4e-6, 200_000)) / 2e-6
+    # 1 - cos of a quarter of a wave is 1, of half a wave 2. Four standard deviations of the mean: 0.0005.
+    assert costs[0] == pytest.approx(strips.mean() * 1.0, abs=5e-4)
+    assert costs[1] == pytest.approx(np.sqrt(2 / np.pi) * 0.1e-6 / 2e-6 * 2, rel=1e-9)
+
+
+def test_plates_have_opposite_errors_and_the_worst_stays(spec: Path) -> None:
+    task, _, _ = task_of(spec)
+    drawn = task.variations(0, np.array([-1, -1]))
+    overlay = [np.mean([float(x) for x in one.overlay_x_m]) for one in drawn]
+    depth = [float(one.common_depth_scale) for one in drawn]
+    for values in (overlay, depth):
+        assert values[0] == -values[1] != 0
+        assert values[2] == -values[3] != values[0]
+    again = task.variations(1, np.array([0, 2]))
+    assert again[-1] == drawn[2]
+    assert again[0] != drawn[0]
+
+
+def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
+    """The PSF of heights times their deviation is that of the DOE as fabricated, from the axis of a far source."""
+    task, problem, _ = task_of(spec)
+    level = np.random.default_rng(1).integers(0, 4, (48, 48)).astype(np.uint8)
+    errors = task.variations(0, np.array([-1, -1]))[0]
+    level = task.rules.blank.with_level(level).level
+    plate = task.plate(level, errors)
+    optic = plate.optic.with_heights(jnp.asarray(heights_m(level, problem.parametrization)))
+    made = as_fabricated(level, problem.camera, task.process, errors)
+    ours, due = (np.asarray(psf(one, depths=(np.inf,)).energy) for one in (optic, made))
+    # Single precision of two ways to the same field.
+    np.testing.assert_allclose(ours, due, atol=2e-5 * due.max(), rtol=0)
+
+
+def test_the_risk_of_plates_falls(spec: Path) -> None:
+    task, problem, scene = task_of(spec)
+    nominal = optimize(load_spec(spec, ["optimize.steps=80", "robust.steps=0"]))
+    robust = optimize(load_spec(spec, ["optimize.steps=80", "robust.steps=48"]))
+    unseen = task._replace(spec=load_spec(spec, ["optimize.seed=99"]))
+    plates = unseen.variations(7, np.array([-1, -1]))
+
+    def mean_loss(design: Design) -> float:
+        level = design.level_map.level
+        height = jnp.asarray(heights_m(level, problem.parametrization))
+        looks = [scene.look(5, step) for step in range(4)]
+        return float(
+            np.mean([float(value_and_slope(unseen.plate(level, v), height, k)[0]) for v in plates for k in looks])
+        )
+
+    assert mean_loss(robust) < mean_loss(nominal)
+    assert len(robust.history) == 80 + 48
+    assert robust.history[-1]["names"] == robust.history[0]["names"] == ["far_spot", "near_spread"]
+
+
+def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = optimize(spec, tmp_path / "whole")
+    save, done = optimization.save_checkpoint, []
+
+    def stop_late(*given: object) -> None:
+        save(*given)  # pyright: ignore[reportArgumentType]
+        done.append(given)
+        if len(done) == 24 + ROUND + 3:  # in the middle of the second round
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimization, "save_checkpoint", stop_late)
+    with pytest.raises(KeyboardInterrupt):
+        optimize(spec, tmp_path / "again")
+    monkeypatch.undo()
+    again = optimize(spec, tmp_path / "again")
+    assert np.array_equal(whole.level_map.level, again.level_map.level)
+    assert whole.history == again.history
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["robust.measure=yield"], "needs the loss of a good plate"),
+        (["robust.draws=0"], "robust.draws"),
+        (["robust.share=0.0"], "robust.share"),
+        (["optimize.polish=2"], "moves of cells would undo it"),
+        (["optimize.quantisation=none"], "masks have levels"),
+        (["optimize.parametrization=radial"], "masks are of cells"),
+        (['process.etch_depths="optimize"'], "the depths must be known"),
+        (["optics.light=edges"], "light is scalar"),
+    ],
+)
+def test_what_cannot_be_is_told(spec: Path, change: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        load_spec(spec, change)
+
+
+def test_a_process_without_errors_has_no_risk(spec: Path) -> None:
+    read = load_spec(spec)
+    problem, scene = problem_of(read, {})
+    exact = read.process.model_copy(update={"errors": ErrorsSpec()})
+    with pytest.raises(InputError, match="plates must differ"):
+        RobustTask.of(read.model_copy(update={"process": exact}), problem, scene)
