@@ -1,0 +1,144 @@
+"""What does a robust design gain on the wafer? Designs with and without [robust], under errors that no step saw.
+
+    python examples/compare_robust.py [SPEC] [--steps 120] [--draws 32] [--processes contact_aligner direct_write]
+
+Every design is drawn by the same spec: as it is; with masks that obey `min_feature`; the same with walls that cost; and
+with robust steps beside. Then plates are drawn from every process, the first of which is the one the robust steps know,
+and judged by PSFs that integrate every pixel: the spec's own loss, the 0th order, and the ring:disc ratio of the worst
+colour and depth, with the value that 90 % of plates reach. Ten minutes on two cores for examples/quick.toml.
+"""
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from doedesign.cli import exit_code
+from doedesign.design.design import Design
+from doedesign.design.objectives import PsfSet
+from doedesign.design.problem import losses, problem_of
+from doedesign.optimization import optimize
+from doedesign.prediction import predict
+from doedesign.spec import load_spec
+from fab.files import write_atomic
+from fab.process import Process, Variation
+from sim.metrics import participation
+from sim.optic import HeightOptic
+from sim.psf_bank import psf
+
+HERE = Path(__file__).parent
+SEED = 4711  # of the plates, which no step draws from
+DESIGNS = {
+    "nominal": (),
+    "min_feature": ("optimize.min_feature=2 um",),
+    "walls that cost": ("optimize.min_feature=2 um", "optimize.wall_weight=0.3"),
+    "robust": ("optimize.min_feature=2 um", "robust.steps=40"),
+    "robust, cvar": ("optimize.min_feature=2 um", "robust.steps=40", "robust.measure=cvar"),
+}
+
+
+class Plates(NamedTuple):
+    """Some plates of a design and a process; the worst colour and depth of each, and the design as drawn."""
+
+    design: str
+    process: str
+    drawn_loss: float
+    mean_loss: float
+    worst_loss: float
+    drawn_zeroth_order: float
+    median_zeroth_order: float
+    drawn_ring_to_disc: float
+    ring_to_disc_of_90_percent: float
+    drawn_far_spot: float
+    median_far_spot: float
+
+
+def judge(design: Design, process: Process) -> Any:
+    """A function of errors: loss, 0th order, least ring:disc ratio and mean far spot of a plate."""
+    assert design.spec is not None
+    problem, near = problem_of(design.spec, {})[0], len(design.near_m)
+    lens = psf(HeightOptic.of(design.camera), depths=design.near_m)
+    plain = participation(jnp.asarray(lens.energy))
+
+    def look(errors: Variation) -> tuple[float, float, float, float]:
+        found = predict(design, process, errors)
+        energy = jnp.asarray(found.bank.energy)
+        loss = float(losses(problem, PsfSet(energy[:, :near], energy[:, near:], plain, design.camera))[0])
+        leaked = max(row["zeroth_order"] for row in found.rows)
+        ratio = min(row["ring_to_disc"] for row in found.rows if "ring_to_disc" in row)
+        spot = float(np.mean([row["far_spot"] for row in found.rows if "far_spot" in row]))
+        return loss, leaked, ratio, spot
+
+    return look
+
+
+def plates_of(name: str, design: Design, stock: str, draws: int) -> Plates:
+    """Judge plates of a stock process."""
+    process = design.process(stock)
+    look = judge(design, process)
+    drawn = look(Variation())
+    every = [look(design.plate_errors(process, seed=SEED, draw=f"normal/{i}")[0]) for i in range(draws)]
+    loss, leaked, ratio, spot = np.array(every).T
+    return Plates(
+        name,
+        stock,
+        drawn[0],
+        float(loss.mean()),
+        float(loss.max()),
+        drawn[1],
+        float(np.median(leaked)),
+        drawn[2],
+        float(np.percentile(ratio, 10)),
+        drawn[3],
+        float(np.median(spot)),
+    )
+
+
+def in_words(one: Plates) -> str:
+    """A line of the table."""
+    return (
+        f"{one.design:16} {one.process:16} loss {one.drawn_loss:.3f}, plates {one.mean_loss:.3f}, worst "
+        f"{one.worst_loss:.3f};  0th order {one.drawn_zeroth_order:6.1%} -> {one.median_zeroth_order:6.1%};  ring:disc "
+        f"{one.drawn_ring_to_disc:.2f} -> {one.ring_to_disc_of_90_percent:.2f};  far spot {one.drawn_far_spot:5.1%} -> "
+        f"{one.median_far_spot:5.1%}"
+    )
+
+
+def table(plates: Sequence[Plates]) -> str:
+    """The table as CSV."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(Plates._fields)
+    rows.writerows([value if isinstance(value, str) else f"{value:.6g}" for value in one] for one in plates)
+    return text.getvalue()
+
+
+def run(spec: Path, steps: int, draws: int, processes: Sequence[str], out: Path) -> list[Plates]:
+    """Design, judge, and write the table."""
+    found = []
+    for name, sets in DESIGNS.items():
+        known = [f"process.stock={processes[0]}", f"optimize.steps={steps}"]
+        design = optimize(load_spec(spec, [*known, *sets]))
+        for stock in processes:
+            found.append(plates_of(name, design, stock, draws))
+            print(in_words(found[-1]), flush=True)
+    write_atomic(out, table(found).encode())
+    print(f"written to {out}")
+    return found
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("spec", nargs="?", type=Path, default=HERE / "quick.toml")
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--draws", type=int, default=32)
+    parser.add_argument("--processes", nargs="+", default=["contact_aligner", "direct_write"])
+    parser.add_argument("--out", type=Path, default=Path("compare-robust.csv"))
+    given = parser.parse_args()
+    sys.exit(exit_code(lambda: run(given.spec, given.steps, given.draws, given.processes, given.out) and None))
