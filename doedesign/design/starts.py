@@ -103,11 +103,11 @@ def balanced_ridge(setup: StartSetup, far_energy: float) -> Ridge:
         ridge = Ridge(float(values[0]) * wave_m, float(values[1]))
         return float(np.sum((_order_shares(waves, ridge) - far_energy) ** 2))
 
-    waves_high, duty = _least(miss, (0.0, 0.0), (1.0, 0.5), 0.01, (400, 400))
+    waves_high, duty = least(miss, (0.0, 0.0), (1.0, 0.5), 0.01, (400, 400))
     return Ridge(waves_high * wave_m, duty)
 
 
-def _least(
+def least(
     loss: Callable[[np.ndarray], float],
     low: tuple[float, ...],
     high: tuple[float, ...],
@@ -116,8 +116,14 @@ def _least(
 ) -> list[float]:
     """Where a loss of a few values is least, from the middle of their range.
 
-    DIRECT-L (global, no gradient; D. R. Jones et al. 1993, as in NLopt) and then Sbplx from its best point, beginning
-    with a `step`; each with so many evaluations.
+    DIRECT-L (global, no gradient; D. R. Jones et al. 1993, as in NLopt) and then Sbplx from its best point.
+
+    Args:
+        loss: the loss of the values.
+        low: least values.
+        high: largest values.
+        step: first step of Sbplx.
+        evaluations: of either search.
     """
     import nlopt
 
@@ -196,7 +202,7 @@ def fresnel(setup: StartSetup, options: Mapping[str, Any]) -> Heights:
     def loss(power: np.ndarray) -> float:
         return setup.loss(lens(setup, float(power[0]) * limit))
 
-    (power,) = _least(loss, (-1.0,), (1.0,), 0.02, (evaluations * 2 // 3, evaluations // 3))
+    (power,) = least(loss, (-1.0,), (1.0,), 0.02, (evaluations * 2 // 3, evaluations // 3))
     return lens(setup, power * limit)
 
 

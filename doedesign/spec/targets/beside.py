@@ -11,7 +11,13 @@ if TYPE_CHECKING:
     from doedesign.spec.models import Spec
 
 # Keys of [optimize] that spots, areas and foci decide themselves, with their usual values.
-_OWN = (("parametrization", "freeform"), ("start", "flat"), ("quantisation", "straight_through"), ("polish", 0))
+_OWN = (
+    ("parametrization", "freeform"),
+    ("start", "flat"),
+    ("quantisation", "straight_through"),
+    ("colours", "together"),
+    ("polish", 0),
+)
 
 
 def beside_problems(spec: "Spec", table: str) -> Iterator[InputError]:
