@@ -1,13 +1,14 @@
 """How good is a plate to see through? Sharp spot, near concentration and light in the window, beside classic plates.
 
-    python examples/pareto.py [SPEC] [--spots 0.25 0.4 0.6] [--evaluations 60] [--out FOLDER]
+    python examples/pareto.py [SPEC] [--spots 0.25 0.4 0.6] [--evaluations 40] [--out FOLDER]
 
 For every spot energy asked for, the spec's free form is designed and put beside what formulas give: a flat plate, a
 random one, the Fresnel lens of the least loss, the ring that the free form starts from, and the best circular grating,
 whose height, duty and period NLopt searches for the same loss. The best grating keeps its height to the nanometre,
 which no etch would; all others have the levels of the spec. For the least spot there is a second free form, which like
 gratings may lose light: beyond the window it costs a quarter. Everything is judged by PSFs that integrate every pixel,
-at all depths and colours. Half an hour on two cores for examples/automotive.toml, two minutes for examples/quick.toml.
+at all depths and colours. Half an hour on two cores for examples/automotive.toml, two minutes for examples/quick.toml;
+plates that the table of FOLDER already has are not made again.
 """
 
 import argparse
@@ -40,6 +41,7 @@ from sim.psf_bank import PsfBank, psf
 
 HERE = Path(__file__).parent
 FREE_FORM, LOSING, GRATING, RING = "free form", "free form, losing light", "best grating", "ring"
+TABLE, WORDS = "pareto.csv", ("kind", "made_with")
 SAME = ("random", "flat")  # whatever is asked for
 KINDS = {  # marks of the picture
     FREE_FORM: ("o", SERIES[0]),
@@ -84,9 +86,9 @@ def asking(path: Path, spot: float, *sets: str) -> Spec:
 
 
 def best_grating(spec: Spec, evaluations: int) -> dict[str, str | float]:
-    """Options of the ring of the least loss at all depths, as the optimiser samples it, by NLopt."""
+    """Options of the ring of the least loss at the first near and far depth, as the optimiser samples it, by NLopt."""
     problem, scene = problem_of(spec, {})
-    scene, longest_m = scene._replace(whole=True), 2.5 * ring_period_m(problem.camera)
+    longest_m = 2.5 * ring_period_m(problem.camera)
     setup = StartSetup(problem.camera, False, spec.optics.design_wavelength_m)
 
     def loss(values: np.ndarray) -> float:
@@ -98,17 +100,15 @@ def best_grating(spec: Spec, evaluations: int) -> dict[str, str | float]:
     return {**lengths, "duty": round(duty, 4), "roughness": 0.0}
 
 
-def plates(path: Path, spot: float, evaluations: int, losing: bool) -> Iterator[tuple[str, Design, float]]:
-    """All plates for a spot energy, perhaps one losing light, with their kinds and the seconds they took."""
+def plates(path: Path, spot: float, evaluations: int, kinds: Sequence[str]) -> Iterator[tuple[str, Design, float]]:
+    """Plates of some kinds for a spot energy, with their kinds and the seconds they took."""
     at_start = ("optimize.steps=0", "optimize.polish=0")
-    for kind in KINDS:
+    for kind in kinds:
         begun = time.perf_counter()
         spec = asking(path, spot, *at_start)
         if kind == FREE_FORM:
             spec = asking(path, spot)
         elif kind == LOSING:
-            if not losing:
-                continue
             index = [objective.name for objective in spec.objectives].index("window_loss")
             spec = asking(path, spot, f"objective[{index}].weight={spec.objectives[index].weight / 4}")
         elif kind == GRATING:
@@ -183,6 +183,14 @@ def table(found: Sequence[Plate]) -> str:
     return text.getvalue()
 
 
+def kept(path: Path) -> list[Plate]:
+    """The plates of a table that was written before; none if there is none."""
+    if not path.is_file():
+        return []
+    rows = csv.DictReader(path.read_text().splitlines())
+    return [Plate(**{key: text if key in WORDS else float(text) for key, text in row.items()}) for row in rows]
+
+
 def plot(found: Sequence[Plate], curve: tuple[np.ndarray, np.ndarray], title: str) -> object:
     """Concentration of near light and light in the window against the sharp spot."""
     with panels(None, (8.4, 3.6), f"{title}: a sharp spot for the scene, spread light for what is near") as figure:
@@ -207,19 +215,21 @@ def plot(found: Sequence[Plate], curve: tuple[np.ndarray, np.ndarray], title: st
 
 def run(path: Path, spots: Sequence[float], evaluations: int, out: Path) -> list[Plate]:
     """Design, judge, and write the table and the picture."""
-    spec, found = load_spec(path), []
+    out.mkdir(parents=True, exist_ok=True)
+    spec, found = load_spec(path), kept(out / TABLE)
     camera, near = camera_from_spec(spec), len(spec.scene.near_m)
     lens = psf(HeightOptic.of(camera), depths=(*spec.scene.near_m, *spec.scene.far_m))
     banks: dict[str, PsfBank] = {}
     for spot in sorted(spots):
-        for kind, design, seconds in plates(path, spot, evaluations, losing=spot == min(spots)):
+        have = [one.kind for one in found if one.asked == spot]
+        kinds = [kind for kind in KINDS if kind not in have and (kind != LOSING or spot == min(spots))]
+        for kind, design, seconds in plates(path, spot, evaluations, kinds):
             bank = banks.get(kind) or psf(HeightOptic.of(camera, design.nominal_height_m), depths=design.depths_m)
             if kind in SAME:
                 banks[kind] = bank
             found.append(judged(kind, asking(path, spot), design, seconds, bank, lens))
             print(in_words(found[-1]), flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "pareto.csv", table(found).encode())
+            write_atomic(out / TABLE, table(found).encode())
     save(plot(found, bound(lens, near), spec.name), out / "pareto.png")  # pyright: ignore[reportArgumentType]
     print(f"written to {out}/pareto.csv and .png")
     return found
@@ -229,7 +239,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("spec", nargs="?", type=Path, default=HERE / "automotive.toml")
     parser.add_argument("--spots", type=float, nargs="+", default=[0.25, 0.4, 0.6])
-    parser.add_argument("--evaluations", type=int, default=60)
+    parser.add_argument("--evaluations", type=int, default=40)
     parser.add_argument("--out", type=Path, default=Path("pareto"))
     given = parser.parse_args()
     sys.exit(exit_code(lambda: run(given.spec, given.spots, given.evaluations, given.out)))
