@@ -107,7 +107,8 @@ def seconds(course: Course) -> Iterator[float | Outcome]:
         yield (step + 1) / spec.optimize.steps
     steps_s = float(np.median(taken)) * len(taken)
     compiling_s = sum(one - np.median(taken) for one in taken[:3])
-    yield Outcome(finished_design(spec, problem, OptimizationState(*state, spec.optimize.steps)), steps_s, compiling_s)
+    last = OptimizationState(state[0], state[1], spec.optimize.steps)
+    yield Outcome(finished_design(spec, problem, last), steps_s, float(compiling_s))
 
 
 def in_turns(given: list[Course]) -> list[Outcome]:

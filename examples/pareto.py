@@ -5,10 +5,10 @@
 For every spot energy asked for, the spec's free form is designed and put beside what formulas give: a flat plate, a
 random one, the Fresnel lens of the least loss, the ring that the free form starts from, and the best circular grating,
 whose height, duty and period NLopt searches for the same loss. The best grating keeps its height to the nanometre,
-which no etch would; all others have the levels of the spec. For the least spot there is a second free form, which like
-gratings may lose light: beyond the window it costs a quarter. Everything is judged by PSFs that integrate every pixel,
-at all depths and colours. Half an hour on two cores for examples/automotive.toml, two minutes for examples/quick.toml;
-plates that the table of FOLDER already has are not made again.
+which no etch would; all others have the levels of the spec. A second free form may lose light as gratings do: beyond
+the window it costs a quarter. Everything is judged by PSFs that integrate every pixel, at all depths and colours. Half
+an hour on two cores for examples/automotive.toml, two minutes for examples/quick.toml; plates that the table of FOLDER
+already has are not made again.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -188,27 +188,35 @@ def kept(path: Path) -> list[Plate]:
     if not path.is_file():
         return []
     rows = csv.DictReader(path.read_text().splitlines())
-    return [Plate(**{key: text if key in WORDS else float(text) for key, text in row.items()}) for row in rows]
+    read: list[dict[str, Any]] = [
+        {key: text if key in WORDS else float(text) for key, text in row.items()} for row in rows
+    ]
+    return [Plate(**row) for row in read]
 
 
 def plot(found: Sequence[Plate], curve: tuple[np.ndarray, np.ndarray], title: str) -> object:
-    """Concentration of near light and light in the window against the sharp spot."""
-    with panels(None, (8.4, 3.6), f"{title}: a sharp spot for the scene, spread light for what is near") as figure:
-        axes = figure.subplots(1, 2)
+    """Concentration of near light, the same over its bound, and light in the window, against the sharp spot."""
+    labels = {
+        "concentration": "concentration of near light (plain lens: 1)",
+        "over_bound": "concentration over its bound",
+        "window_share": "light in the window",
+    }
+    words = f"{title}: a sharp spot for the scene, spread light for what is near"
+    with panels(None, (11.4, 3.8), words, "The bound is that of a plate that keeps all light in the window.") as figure:
+        axes = figure.subplots(1, 3)
         axes[0].plot(*curve, color=FAINT, label="bound: spot and even rest")
-        axes[0].set_yscale("log")
-        for axis, value in zip(axes, ("concentration", "window_share"), strict=True):
+        axes[1].axhline(1, color=FAINT)
+        for axis, (value, label) in zip(axes, labels.items(), strict=True):
             for kind, (mark, colour) in KINDS.items():
                 of = [one for one in found if one.kind == kind]
-                line = "-" if kind in (FREE_FORM, GRATING) else ""
+                line = "-" if kind in (FREE_FORM, LOSING, GRATING) else ""
                 places = [one.far_spot for one in of], [getattr(one, value) for one in of]
                 axis.plot(*places, marker=mark, color=colour, linestyle=line, label=kind)
-            axis.set_xlim(-0.02, 1.0)
-            axis.set_xlabel("light of the scene in its sharp spot")
+            axis.set(xlim=(-0.02, 1), xlabel="light of the scene in its sharp spot", ylabel=label)
             axis.grid()
-        axes[0].set_ylabel("concentration of near light (plain lens: 1)")
-        axes[1].set_ylabel("light in the window")
-        axes[1].set_ylim(0, 1)
+        axes[0].set_yscale("log")
+        axes[1].set_ylim(0.8, 1.5)  # of the Fresnel lens and the random plate, what stays far from any spot is left out
+        axes[2].set_ylim(0, 1)
         axes[0].legend()
     return figure
 
@@ -222,13 +230,13 @@ def run(path: Path, spots: Sequence[float], evaluations: int, out: Path) -> list
     banks: dict[str, PsfBank] = {}
     for spot in sorted(spots):
         have = [one.kind for one in found if one.asked == spot]
-        kinds = [kind for kind in KINDS if kind not in have and (kind != LOSING or spot == min(spots))]
-        for kind, design, seconds in plates(path, spot, evaluations, kinds):
+        for kind, design, seconds in plates(path, spot, evaluations, [kind for kind in KINDS if kind not in have]):
             bank = banks.get(kind) or psf(HeightOptic.of(camera, design.nominal_height_m), depths=design.depths_m)
             if kind in SAME:
                 banks[kind] = bank
             found.append(judged(kind, asking(path, spot), design, seconds, bank, lens))
             print(in_words(found[-1]), flush=True)
+            found.sort(key=lambda one: (one.asked, [*KINDS].index(one.kind)))
             write_atomic(out / TABLE, table(found).encode())
     save(plot(found, bound(lens, near), spec.name), out / "pareto.png")  # pyright: ignore[reportArgumentType]
     print(f"written to {out}/pareto.csv and .png")

@@ -28,7 +28,11 @@ def test_a_free_form_beats_every_plate_of_a_formula(tmp_path: Path, capsys: pyte
     text = text.replace("window = 128", "window = 96").replace("steps = 120", "steps = 45")
     spec = tmp_path / "small.toml"
     spec.write_text(text)
-    pareto.run(spec, (0.4,), 12, tmp_path / "out")
+    found = pareto.run(spec, (0.4,), 12, tmp_path / "out")
+    # A table of all plates is not made anew, and reads back as it was written, to five digits.
+    again = pareto.run(spec, (0.4,), 12, tmp_path / "out")
+    assert [one.kind for one in again] == [one.kind for one in found]
+    assert [one.loss for one in again] == pytest.approx([one.loss for one in found], rel=1e-4)
     rows = {row["kind"]: row for row in csv.DictReader((tmp_path / "out" / "pareto.csv").read_text().splitlines())}
     assert [*rows] == [*pareto.KINDS]
     loss = {kind: float(row["loss"]) for kind, row in rows.items()}
