@@ -157,7 +157,7 @@ def main() -> None:
     path, sets = (EXAMPLES / "automotive.toml", HALF)
     if parser.parse_args().quick:
         path, sets = EXAMPLES / "quick.toml", ()
-    report(path, sets, few=96, of_then=True)
+    report(path, sets, few=90, of_then=True)
     report(path, sets, few=48, of_then=False)
 
 
