@@ -8,6 +8,7 @@ TABLES = (
     "bench.edges",
     "bench.lens",
     "bench.step",
+    "bench.schedule",
     "bench.masks",
     "bench.rules",
     "bench.solids",

@@ -21,7 +21,7 @@ SPEC = Path(__file__).parent.parent / "examples" / "automotive.toml"
 
 def main(rounds: int = 9) -> None:
     """Print the table."""
-    spec = load_spec(SPEC)
+    spec = load_spec(SPEC, ["optimize.colours=together"])
     problem, scene = problem_of(spec, {})
     first = initial_state(spec, problem, scene, {}, lambda path: np.load(path, allow_pickle=False))
     update = make_update(spec)

@@ -135,13 +135,15 @@ def steps_within(
     if not (spec.objectives or spec.aims):
         raise InputError("budget", "there must be something to improve", "no objective", "Leave it out.")
     start, ends = time.perf_counter(), []
+    compiled = len(spec.optics.colours) if spec.optimize.colours == "in_turn" else 1  # steps that are compiled
     for _ in _trial(with_steps(spec, _MANY), objectives):
         ends.append(time.perf_counter())
-        if len(ends) > _TRIED or (len(ends) > 1 and ends[-1] - start > budget_s / 4):
+        tried = len(ends) - compiled
+        if tried >= _TRIED or (tried > 0 and ends[-1] - start > budget_s / 4):
             break
-    first, each = ends[0] - start, (ends[-1] - ends[0]) / (len(ends) - 1)
+    first, each = ends[compiled - 1] - start, (ends[-1] - ends[compiled - 1]) / (len(ends) - compiled)
     steps = max(1, int((budget_s - first) / each))
-    log.info(f"a step takes {each:.2g} s after {first:.2g} s for the first: {steps} steps in {budget_s:g} s")
+    log.info(f"a step takes {each:.2g} s after {first:.2g} s to begin with: {steps} steps in {budget_s:g} s")
     return steps
 
 

@@ -16,21 +16,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from doedesign.cli import exit_code
 from doedesign.design.descent import looks_of
 from doedesign.design.design import Design
-from doedesign.design.metrics import design_metrics
-from doedesign.design.objectives import PsfSet
+from doedesign.design.metrics import all_of, design_metrics
 from doedesign.design.problem import losses, problem_of
 from doedesign.optimization import optimize
 from doedesign.spec import Spec, load_spec
 from fab.figure import save
 from fab.files import write_atomic
 from sim.aperture import open_cells
-from sim.metrics import participation
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 
@@ -78,8 +75,7 @@ def judged(spec: Spec, levels: int, strategy: str, design: Design, seconds: floa
     near_m, far_m = spec.scene.near_m, spec.scene.far_m
     optic = HeightOptic.of(design.camera, design.nominal_height_m)
     bank, lens = (psf(each, depths=(*near_m, *far_m)) for each in (optic, HeightOptic.of(design.camera)))
-    energy, n = jnp.asarray(bank.energy), len(near_m)
-    view = PsfSet(energy[:, :n], energy[:, n:], participation(jnp.asarray(lens.energy))[:, :n], design.camera)
+    view = all_of(bank, lens, len(near_m))
     rows = design_metrics(optic, bank, near_m, lens)
 
     def mean(name: str) -> float:
@@ -95,7 +91,7 @@ def compare(spec: Path, levels: Sequence[int], steps: int) -> list[Outcome]:
     for count in levels:
         for name, (quantisation, polish) in STRATEGIES.items():
             sets = [f"process.levels={count}", f"process.level_step={WAVE_NM / count} nm"]
-            sets += [f"optimize.quantisation={quantisation}", f"optimize.polish={polish}"]
+            sets += [f"optimize.quantisation={quantisation}", f"optimize.polish={polish}", "optimize.colours=together"]
             read = load_spec(spec, [*sets, "optimize.steps=1"])
             cost = polish * len(looks_of(problem_of(read, {})[1], 0)) if polish else 0
             read = load_spec(spec, [*sets, f"optimize.steps={max(steps - cost, 1)}"])

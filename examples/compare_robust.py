@@ -16,19 +16,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from doedesign.cli import exit_code
 from doedesign.design.design import Design
-from doedesign.design.objectives import PsfSet
+from doedesign.design.metrics import all_of
 from doedesign.design.problem import losses, problem_of
 from doedesign.optimization import optimize
 from doedesign.prediction import predict
 from doedesign.spec import load_spec
 from fab.files import write_atomic
 from fab.process import Process, Variation
-from sim.metrics import participation
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
 
@@ -38,8 +36,8 @@ DESIGNS = {
     "nominal": (),
     "min_feature": ("optimize.min_feature=2 um",),
     "walls that cost": ("optimize.min_feature=2 um", "optimize.wall_weight=0.3"),
-    "robust": ("optimize.min_feature=2 um", "robust.steps=40"),
-    "robust, cvar": ("optimize.min_feature=2 um", "robust.steps=40", "robust.measure=cvar"),
+    "robust": ("optimize.min_feature=2 um", "robust.steps=120"),
+    "robust, cvar": ("optimize.min_feature=2 um", "robust.steps=120", "robust.measure=cvar"),
 }
 
 
@@ -63,13 +61,11 @@ def judge(design: Design, process: Process) -> Any:
     """A function of errors: loss, 0th order, least ring:disc ratio and mean far spot of a plate."""
     assert design.spec is not None
     problem, near = problem_of(design.spec, {})[0], len(design.near_m)
-    lens = psf(HeightOptic.of(design.camera), depths=design.near_m)
-    plain = participation(jnp.asarray(lens.energy))
+    lens = psf(HeightOptic.of(design.camera), depths=design.depths_m)
 
     def look(errors: Variation) -> tuple[float, float, float, float]:
         found = predict(design, process, errors)
-        energy = jnp.asarray(found.bank.energy)
-        loss = float(losses(problem, PsfSet(energy[:, :near], energy[:, near:], plain, design.camera))[0])
+        loss = float(losses(problem, all_of(found.bank.with_camera(design.camera), lens, near))[0])
         leaked = max(row["zeroth_order"] for row in found.rows)
         ratio = min(row["ring_to_disc"] for row in found.rows if "ring_to_disc" in row)
         spot = float(np.mean([row["far_spot"] for row in found.rows if "far_spot" in row]))

@@ -20,7 +20,8 @@ _GROWTH = 1.5  # of a move after one that was kept
 
 
 def looks_of(scene: SourceSet, seed: int) -> list[Any]:
-    """The sources that a judgement looks at: every depth twice, each with a displacement of its own."""
+    """The sources that a judgement looks at: all colours at every depth twice, each with a displacement of its own."""
+    scene = scene._replace(in_turn=False)
     count = 1 if scene.whole else max(len(scene.near[0]), len(scene.far[0]), 1)
     return [scene.look(seed, step) for step in range(2 * count)]
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import binary_erosion
 
-from doedesign.design.objectives import Term
+from doedesign.design.objectives import PsfSet, Term
 from doedesign.design.patterns import offset_m, positive_place, spot_centres_m
 from doedesign.spec import Spec
 from sim.camera import Camera
@@ -18,6 +19,7 @@ from sim.metrics import (
     energy_budget,
     mean_wavelength_m,
     metric_rows,
+    participation,
     radius_map_m,
     spot_radius_m,
     without_infinities,
@@ -39,6 +41,23 @@ def design_metrics(optic: CellOptic, bank: PsfBank, near_m: tuple[float, ...], l
         colour = optic.camera.colours[c]
         row["budget"] = energy_budget(optic, bank.energy[c, d], bank.depths_m[d], colour, pitch_m=pitch)._asdict()
     return rows
+
+
+def all_of(bank: PsfBank, lens: PsfBank, near: int) -> PsfSet:
+    """All PSFs of a bank as objectives take them: a loss of these misses nothing, where a step looks at some.
+
+    Args:
+        bank: PSFs on the axis, near depths first.
+        lens: those of the plain lens at the same depths.
+        near: how many of the depths are near.
+
+    Raises:
+        ValueError: the bank's camera is not known.
+    """
+    if bank.camera is None:
+        raise ValueError("`bank.camera` must be known for objectives, but it is None; give it by `bank.with_camera`")
+    energy = jnp.asarray(bank.energy)
+    return PsfSet(energy[:, :near], energy[:, near:], participation(jnp.asarray(lens.energy))[:, :near], bank.camera)
 
 
 class DrawnPattern(NamedTuple):

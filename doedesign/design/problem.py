@@ -33,12 +33,14 @@ class StepSources(NamedTuple):
         far: `[line][depth]` sources at far depths.
         lens: `[w, n]` participation of the plain lens at the near depths.
         offset_m: displacement (y, x) of the image on the sensor, or None to leave it on the axis.
+        colour: number of the one colour that is looked at, or None for all.
     """
 
     near: tuple[tuple[Any, ...], ...]
     far: tuple[tuple[Any, ...], ...]
     lens: Float[Array, "w n"]
     offset_m: Float[Array, "2"] | None
+    colour: int | None = None
 
 
 class Problem(eqx.Module):
@@ -67,6 +69,7 @@ class SourceSet(NamedTuple):
         lens: as there.
         displacement_m: largest displacement of the image, metres or 0.
         whole: whether every step looks at all depths.
+        in_turn: whether a step looks at one colour, the next step at the next.
     """
 
     near: tuple[tuple[Any, ...], ...]
@@ -74,6 +77,7 @@ class SourceSet(NamedTuple):
     lens: Float[np.ndarray, "w n"]
     displacement_m: float
     whole: bool = False
+    in_turn: bool = False
 
     def look(self, seed: int, step: int) -> StepSources:
         """Sources of a step: depths in shuffled rounds, so that each is seen equally often, or all of them.
@@ -91,19 +95,22 @@ class SourceSet(NamedTuple):
         if self.displacement_m > 0:
             shift = np.random.default_rng((seed, 2, step)).uniform(-1.0, 1.0, 2) * self.displacement_m
             offset = jnp.asarray(shift, jnp.float32)
-        return self._chosen(pick(len(self.near[0]), 0), pick(len(self.far[0]), 1), offset)
+        colour = step % len(self.lens) if self.in_turn else None
+        return self._chosen(pick(len(self.near[0]), 0), pick(len(self.far[0]), 1), offset, colour)
 
     def first_look(self) -> StepSources:
         """The first near and far depth, or all of them, with the image on the axis."""
         near, far = (list(range(len(side[0])))[: None if self.whole else 1] for side in (self.near, self.far))
         return self._chosen(near, far, None)
 
-    def _chosen(self, near: list[int], far: list[int], offset_m: Array | None) -> StepSources:
+    def _chosen(
+        self, near: list[int], far: list[int], offset_m: Array | None, colour: int | None = None
+    ) -> StepSources:
         near_sources, far_sources = (
             tuple(tuple(line[i] for i in chosen) for line in sources)
             for sources, chosen in ((self.near, near), (self.far, far))
         )
-        return StepSources(near_sources, far_sources, jnp.asarray(self.lens[:, near]), offset_m)
+        return StepSources(near_sources, far_sources, jnp.asarray(self.lens[:, near]), offset_m, colour)
 
 
 def problem_of(
@@ -123,7 +130,8 @@ def problem_of(
         bank = psf(HeightOptic.of(camera), depths=spec.scene.near_m)
         lens = np.asarray(participation(jnp.asarray(bank.energy)))
     whole = any(objective.compares for objective in spec.objectives)
-    return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0, whole)
+    in_turn = spec.optimize.colours == "in_turn"
+    return problem, SourceSet(near, far, lens, camera.pixel_m / 2 if _is_sparse(spec) else 0.0, whole, in_turn)
 
 
 def _is_sparse(spec: Spec) -> bool:
@@ -161,15 +169,17 @@ def plans_of(spec: Spec) -> Problem:
 
 def view_of(problem: Problem, height_m: Array, look: StepSources) -> PsfSet:
     """PSFs of a height map (or profile) for the sources of a step, as objectives see them."""
-    optic, camera = problem.optic.with_heights(height_m), problem.camera
+    optic, camera, lens = problem.optic.with_heights(height_m), problem.camera, look.lens
+    if look.colour is not None:
+        camera, lens = replace(camera, colours=(camera.colours[look.colour],)), lens[look.colour : look.colour + 1]
     # Only far-field plans are displaced: see `_is_sparse`.
     plans = problem.plans if look.offset_m is None else [displaced(plan, look.offset_m) for plan in problem.plans]
 
     def bank(sources: tuple[tuple[Any, ...], ...]) -> Array:
-        images = [colour_energies(optic, plans, list(one)) for one in zip(*sources, strict=True)]
+        images = [colour_energies(optic, plans, list(one), look.colour) for one in zip(*sources, strict=True)]
         return jnp.stack(images, 1) if images else jnp.zeros((len(camera.colours), 0, camera.window, camera.window))
 
-    return PsfSet(bank(look.near), bank(look.far), look.lens, camera)
+    return PsfSet(bank(look.near), bank(look.far), lens, camera)
 
 
 def losses(problem: Problem, view: PsfSet) -> tuple[Array, Array]:

@@ -32,8 +32,8 @@ from fab.process import Normal, Process, Variation
 from sim.optic import HeightOptic, height_deviation
 from sim.surface import as_fabricated
 
-ROUND = 8  # steps that look at the same plates
-_FOLLOWED = 4  # steps after which the level map follows the phases: what one look misses the next ones see
+ROUND = 12  # steps that look at the same plates
+_FOLLOWED = 6  # steps after which the level map follows the phases: what one look misses the next ones see
 _SOFT = 0.02  # of the limit, over which a plate turns from good to bad
 _SALT = 3  # of the random numbers, beside those of looks
 

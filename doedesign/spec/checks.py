@@ -323,6 +323,12 @@ def _objectives(spec: Spec) -> Iterator[InputError]:
             rule = f'"{objective.name}" looks at near depths, so scene.near must hold one'
             cure = "Add a depth to scene.near or remove the objective."
             yield InputError(f"objective[{index}].name", rule, "an empty scene.near", cure)
+        if spec.optimize.colours == "in_turn" and (
+            objective.name == "equal_colours" or objective.colours or objective.compares
+        ):
+            rule = "must look at any colour alone, where every step looks at one of them"
+            cure = 'Use optimize.colours = "together", or objectives for all colours and depths alike.'
+            yield InputError(f"objective[{index}]", rule, "one that compares or names them", cure)
         yield from _cases(spec, index)
 
 

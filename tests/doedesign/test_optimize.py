@@ -74,6 +74,31 @@ def test_gradient_of_the_whole_chain(parametrization: str) -> None:
     assert slope == pytest.approx(difference, rel=0.02, abs=1e-4)
 
 
+def test_the_loss_is_the_mean_of_what_steps_see_in_turn() -> None:
+    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    problem, scene = problem_of(spec, {})
+    assert [scene.look(0, step).colour for step in range(5)] == [0, 1, 2, 0, 1]
+    heights = jnp.asarray(np.random.default_rng(1).uniform(0, 1.2e-6, problem.optic.shape), jnp.float32)
+    look = scene.look(0, 0)
+    whole = losses(problem, view_of(problem, heights, look._replace(colour=None)))
+    parts = [losses(problem, view_of(problem, heights, look._replace(colour=colour))) for colour in range(3)]
+    # Sums of about 1e4 pixels in float32, in another order.
+    assert float(whole[0]) == pytest.approx(np.mean([float(loss) for loss, _ in parts]), rel=1e-5)
+    np.testing.assert_allclose(whole[1], np.mean([terms for _, terms in parts], axis=0), rtol=1e-5)
+    assert all(one.colour is None for one in looks_of(scene, 0))  # a descent on levels compares all colours
+
+
+def test_colours_that_are_compared_cannot_be_looked_at_in_turn() -> None:
+    for change in (
+        'objective[3]={ name = "equal_colours" }',
+        "objective[0].over=worst",
+        'objective[0].colours=["486nm"]',
+    ):
+        with pytest.raises(InputError, match="must look at any colour alone"):
+            load_spec(EXAMPLES / "quick.toml", [change])
+        load_spec(EXAMPLES / "quick.toml", [change, "optimize.colours=together"])
+
+
 @pytest.mark.slow
 def test_resumed_run_has_the_same_bits() -> None:
     spec = load_spec(EXAMPLES / "quick.toml", SMALL)
@@ -122,22 +147,28 @@ def test_looks_see_every_depth_equally_often() -> None:
 
 
 def test_a_budget_becomes_a_number_of_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that adds a tenth of a second per look, after a first step of two seconds; a run keeps its number."""
-    spec = load_spec(EXAMPLES / "quick.toml", SMALL)
+    """By a clock that adds a tenth of a second per look, after a first step of two seconds; a run keeps its number.
+
+    Where colours are looked at in turn, the first step of each takes two seconds.
+    """
+    together = [*SMALL, "optimize.colours=together"]
+    spec = load_spec(EXAMPLES / "quick.toml", together)
     times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
     monkeypatch.setattr(optimization, "_trial", lambda spec, objectives: iter(range(spec.optimize.steps)))
     monkeypatch.setattr(optimization.time, "perf_counter", lambda: next(times))
     assert optimization.steps_within(spec, 10.0) == 80  # (10 - 2) / 0.1
     times = iter([0.0, 2.0, 2.1, 2.2])
     assert optimization.steps_within(spec, 1.0) == 1  # too short a time for more
+    times = iter([0.0, 2.0, 4.0, 6.0, 6.1, 6.2, 6.3, 6.4])
+    assert optimization.steps_within(load_spec(EXAMPLES / "quick.toml", SMALL), 10.0) == 40  # (10 - 6) / 0.1
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="budget: must be positive seconds"):
             optimization.steps_within(spec, wrong)
-    begun = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.steps=7"])
+    begun = load_spec(EXAMPLES / "quick.toml", [*together, "optimize.steps=7"])
     with claim_run(tmp_path / "run", begun, {}) as run:
         begin_run(run)
     assert optimization.steps_within(spec, 10.0, tmp_path / "run") == 7
-    other = load_spec(EXAMPLES / "quick.toml", [*SMALL, "optimize.seed=3"])
+    other = load_spec(EXAMPLES / "quick.toml", [*together, "optimize.seed=3"])
     times = iter([0.0, 2.0, 2.1, 2.2, 2.3, 2.4, 2.5])
     assert optimization.steps_within(other, 10.0, tmp_path / "run") == 80
     with pytest.raises(InputError, match="something to improve"):

@@ -8,9 +8,10 @@ from doedesign.spec import NetworkSpec, TrainSpec, load_spec, spec_digest, spec_
 from fab.errors import InputError
 
 QUICK = Path(__file__).parents[2] / "examples" / "quick.toml"
-# Without a stock process and a word on training, and with the objectives that it had then.
+# Without a stock process and a word on training, and with the objectives and the steps that it had then.
 TERMS = 'objective=[{name = "far_spot"}, {name = "near_spread", weight = 2.0}, {name = "window_loss"}]'
-BARE = ('process={levels = 16, level_step = "75 nm"}', "train={}", TERMS, "optimize.learning_rate=0.1")
+STEPS = ("optimize.learning_rate=0.1", "optimize.steps=60", "optimize.colours=together")
+BARE = ('process={levels = 16, level_step = "75 nm"}', "train={}", TERMS, *STEPS)
 # SHA-256 of this spec before there were the two tables: what knows nothing of them stays what it was.
 BEFORE = "01bbd08ce007c615eb99b30ca0af1bbfc7e03867b95ae97464f90fc875f1bd6d"
 

@@ -16,6 +16,7 @@ _OWN = (
     ("parametrization", "freeform"),
     ("start", "flat"),
     ("quantisation", "straight_through"),
+    ("colours", "together"),
     ("polish", 0),
     ("min_feature_m", None),
     ("drawn_pixel_m", None),
