@@ -272,7 +272,9 @@ THREE = [
 
 def three_colours(*objectives: str) -> tuple[tuple[Any, ...], PsfSet, np.ndarray, np.ndarray]:
     """Terms of a spec of three colours and two depths on either side, and PSFs that hold random light."""
-    spec = load_spec(EXAMPLES / "quick.toml", [*THREE, f"objective=[{', '.join(objectives)}]"])
+    spec = load_spec(
+        EXAMPLES / "quick.toml", [*THREE, "optimize.colours=together", f"objective=[{', '.join(objectives)}]"]
+    )
     from doedesign.build import camera_from_spec
 
     camera, rng = camera_from_spec(spec), np.random.default_rng(3)

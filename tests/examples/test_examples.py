@@ -74,7 +74,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("samples = 320", "samples = 64"),
         ('aperture = "0.592 mm"', 'aperture = "0.1184 mm"'),
         ("window = 128", "window = 48"),
-        ("steps = 60", "steps = 3"),
+        ("steps = 120", "steps = 3"),
         ('["6 mm", "10 mm", "15 mm"]', '["6 mm"]'),
         ('["0.6 m", "1.2 m"]', '["inf"]'),
     ):

@@ -88,4 +88,5 @@ def test_a_run_is_made_small_and_stays_a_run(tmp_path: Path, monkeypatch: pytest
     assert "4 predicted plates" in told
     assert "| sharp spot at infinity | " in told
     assert "| 0th order | " in told
-    assert main(["psf", str(out), "--out", str(tmp_path / "psf")]) == 0
+    assert main(["psf", str(out)]) == 0
+    assert (out / "psf").is_dir()
