@@ -9,6 +9,7 @@ TABLES = (
     "bench.lens",
     "bench.step",
     "bench.schedule",
+    "bench.robust",
     "bench.masks",
     "bench.rules",
     "bench.solids",

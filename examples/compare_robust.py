@@ -32,12 +32,12 @@ from sim.psf_bank import psf
 
 HERE = Path(__file__).parent
 SEED = 4711  # of the plates, which no step draws from
+_WALLS = ("optimize.min_feature=2 um", "optimize.wall_weight=0.3")
 DESIGNS = {
     "nominal": (),
     "min_feature": ("optimize.min_feature=2 um",),
-    "walls that cost": ("optimize.min_feature=2 um", "optimize.wall_weight=0.3"),
-    "robust": ("optimize.min_feature=2 um", "robust.steps=120"),
-    "robust, cvar": ("optimize.min_feature=2 um", "robust.steps=120", "robust.measure=cvar"),
+    "walls that cost": _WALLS,
+    "robust": (*_WALLS, "robust.walls=0.0", "robust.steps=120"),
 }
 
 
