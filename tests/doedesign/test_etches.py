@@ -259,7 +259,7 @@ def test_a_design_without_rounding_gets_the_set_that_suits_its_heights() -> None
 @pytest.mark.slow
 def test_chosen_depths_serve_the_objective_better_than_even_steps() -> None:
     # Two levels have one depth, and it should be half a wave in the middle of the colours: 600 nm, not 480.
-    few = ["process.levels=2", "process.level_step=480 nm", "optimize.steps=30"]
+    few = ["process.levels=2", "process.level_step=480 nm", "optimize.steps=30", "optimize.colours=together"]
     found = {}
     for name, change in (("even", []), ("chosen", ["process.etch_depths=optimize"])):
         spec = load_spec(QUICK, [*SMALL, *few, *change])
