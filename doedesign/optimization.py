@@ -120,8 +120,8 @@ def steps_within(
 
     Args:
         spec: the spec; its own `optimize.steps` does not matter.
-        budget_s: seconds, the compilation of the first step included; a descent on levels and the look at the design
-            at the end come on top.
+        budget_s: seconds, the compilation of the first step included; robust steps, a descent on levels and the look at
+            the design at the end come on top.
         out: run folder; where it has a run of this spec with another number of steps, it keeps that one.
         objectives: as in `optimize`.
 

@@ -8,8 +8,6 @@ PSFs where it has none. The plate looked at is the one that the process makes wi
 """
 
 import contextlib
-import csv
-import io
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +47,7 @@ from doedesign.search import least
 from doedesign.spec import Spec, input_files
 from doedesign.spots.orders import OrderTable
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes, write_atomic
+from fab.files import canonical_json, csv_table, sha256_bytes, write_atomic
 from fab.layout.geometry import pixel_edges
 from fab.layout.polygons import smallest_runs
 from fab.levels import Levels, planes
@@ -372,7 +370,7 @@ def _write(
     record = [row._asdict() for row in masks]
     names = write_results(run, terms, compensated, {"precompensation": record})
     for name, rows in ((_MASKS, masks), (_LIGHT, light)):
-        write_atomic(run.path(name), _csv(rows).encode())
+        write_atomic(run.path(name), csv_table(rows).encode())
     aim = {AIM_DEPTHS: list(task.process.depths_m())}
     finish_run(run, [*names, _MASKS, _LIGHT], about={"precompensated": about, **aim})
 
@@ -391,12 +389,3 @@ def _light_rows(task: _Task, compensated: Design) -> list[_LightRow]:
         for quantity in three[0]
         if quantity not in ("colour", "depth_m")
     ]
-
-
-def _csv(rows: Sequence[_MaskRow] | Sequence[_LightRow]) -> str:
-    """A table with the names of its columns; numbers that there are none of are left out."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows[0]._fields)
-    writer.writerows([f"{value:.9g}" if isinstance(value, float) else value for value in row] for row in rows)
-    return text.getvalue()

@@ -1,7 +1,5 @@
 """Refinement of the cell of a periodic run by Maxwell's equations, into a run of its own."""
 
-import csv
-import io
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +28,7 @@ from doedesign.spots.refinement import RefinementTask, places_of, ranks
 from doedesign.spots.spots import Spots
 from doedesign.spots.superposition import spot_light
 from fab.errors import InputError
-from fab.files import canonical_json, sha256_bytes, write_atomic
+from fab.files import canonical_json, csv_table, sha256_bytes, write_atomic
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.rules.check import Rules, check
@@ -158,11 +156,7 @@ def _refine_in(run: Run, cell: _Cell, task: RefinementTask, about: dict[str, Any
         )
     design = _repeated(cell, run.spec, level, tuple(history))
     names = write_results(run, (), design, {"refinement": [row._asdict() for row in rows]})
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_Row._fields)
-    writer.writerows([f"{value:.9g}" if isinstance(value, float) else value for value in row] for row in rows)
-    write_atomic(run.path(_FILE), text.getvalue().encode())
+    write_atomic(run.path(_FILE), csv_table(rows).encode())
     finish_run(run, [*names, _FILE], about={"refined": about})
 
 

@@ -8,8 +8,6 @@ Five minutes on two cores for examples/quick.toml.
 """
 
 import argparse
-import csv
-import io
 import sys
 import time
 from collections.abc import Sequence
@@ -26,7 +24,7 @@ from doedesign.design.problem import losses, problem_of
 from doedesign.optimization import optimize
 from doedesign.spec import Spec, load_spec
 from fab.figure import save
-from fab.files import write_atomic
+from fab.files import csv_table, write_atomic
 from sim.aperture import open_cells
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
@@ -111,15 +109,6 @@ def in_words(one: Outcome) -> str:
     )
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """The table as CSV."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(Outcome._fields)
-    rows.writerows([one if isinstance(one, str | int) else f"{one:.6g}" for one in outcome] for outcome in outcomes)
-    return text.getvalue()
-
-
 def plot(outcomes: Sequence[Outcome]) -> object:
     """Loss beyond that of continuous heights, and length of edges, of every strategy against the number of levels."""
     from matplotlib.figure import Figure
@@ -149,7 +138,7 @@ def run(spec: Path, levels: Sequence[int], steps: int, out: Path) -> None:
     """Compare, and write the table and the picture."""
     outcomes = compare(spec, levels, steps)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomic(out / "quantization.csv", table(outcomes).encode())
+    write_atomic(out / "quantization.csv", csv_table(outcomes, 6).encode())
     save(plot(outcomes), out / "quantization.png")  # pyright: ignore[reportArgumentType]
     print(f"written to {out}/quantization.csv and .png")
 

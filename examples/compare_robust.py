@@ -9,8 +9,6 @@ colour and depth, with the value that 90 % of plates reach. Ten minutes on two c
 """
 
 import argparse
-import csv
-import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +23,7 @@ from doedesign.design.problem import losses, problem_of
 from doedesign.optimization import optimize
 from doedesign.prediction import predict
 from doedesign.spec import load_spec
-from fab.files import write_atomic
+from fab.files import csv_table, write_atomic
 from fab.process import Process, Variation
 from sim.optic import HeightOptic
 from sim.psf_bank import psf
@@ -106,15 +104,6 @@ def in_words(one: Plates) -> str:
     )
 
 
-def table(plates: Sequence[Plates]) -> str:
-    """The table as CSV."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(Plates._fields)
-    rows.writerows([value if isinstance(value, str) else f"{value:.6g}" for value in one] for one in plates)
-    return text.getvalue()
-
-
 def run(spec: Path, steps: int, draws: int, processes: Sequence[str], out: Path) -> list[Plates]:
     """Design, judge, and write the table."""
     found = []
@@ -124,7 +113,7 @@ def run(spec: Path, steps: int, draws: int, processes: Sequence[str], out: Path)
         for stock in processes:
             found.append(plates_of(name, design, stock, draws))
             print(in_words(found[-1]), flush=True)
-    write_atomic(out, table(found).encode())
+    write_atomic(out, csv_table(found, 6).encode())
     print(f"written to {out}")
     return found
 

@@ -13,7 +13,6 @@ already has are not made again.
 
 import argparse
 import csv
-import io
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -34,7 +33,7 @@ from doedesign.search import least
 from doedesign.spec import Spec, load_spec
 from fab.errors import InputError
 from fab.figure import FAINT, INK, SERIES, panels, save
-from fab.files import write_atomic
+from fab.files import csv_table, write_atomic
 from fab.units import NM, UM
 from sim.metrics import metric_rows
 from sim.optic import HeightOptic
@@ -176,15 +175,6 @@ def in_words(one: Plate) -> str:
     )
 
 
-def table(found: Sequence[Plate]) -> str:
-    """The table as CSV."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(Plate._fields)
-    rows.writerows([one if isinstance(one, str) else f"{one:.5g}" for one in plate] for plate in found)
-    return text.getvalue()
-
-
 def kept(path: Path) -> list[Plate]:
     """The plates of a table that was written before; none if there is none."""
     if not path.is_file():
@@ -239,7 +229,7 @@ def run(path: Path, spots: Sequence[float], evaluations: int, out: Path) -> list
             found.append(judged(kind, asking(path, spot), design, seconds, bank, lens))
             print(in_words(found[-1]), flush=True)
             found.sort(key=lambda one: (one.asked, [*KINDS].index(one.kind)))
-            write_atomic(out / TABLE, table(found).encode())
+            write_atomic(out / TABLE, csv_table(found, 5).encode())
     save(plot(found, bound(lens, near), spec.name), out / "pareto.png")  # pyright: ignore[reportArgumentType]
     print(f"written to {out}/pareto.csv and .png")
     return found

@@ -7,9 +7,11 @@ What the operating system refuses is an `InputError` that names the path.
 """
 
 import contextlib
+import csv
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import math
 import os
@@ -18,11 +20,11 @@ import shutil
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -304,6 +306,18 @@ def _non_finite(value: object, key: str = "") -> tuple[str, float] | None:
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     found = (_non_finite(part, f"{key}.{name}" if key else str(name)) for name, part in inner)
     return next((one for one in found if one is not None), None)
+
+
+def csv_table(rows: Sequence[NamedTuple], digits: int = 9) -> str:
+    """Return rows of one kind as CSV under the names of their fields, numbers with so many digits.
+
+    Whole numbers and text stay what they are; None is left out.
+    """
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(rows[0]._fields)
+    lines.writerows([f"{value:.{digits}g}" if isinstance(value, float) else value for value in row] for row in rows)
+    return text.getvalue()
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

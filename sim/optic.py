@@ -287,6 +287,14 @@ class HeightOptic(CellOptic):
         """The same with other heights."""
         return replace(self, height_m=height_m)
 
+    def made_as(self, doe: ViewedOptic, height_m: Float[Array, "y x"]) -> "HeightOptic":
+        """The same for heights (metres) near these, with all that a DOE made of them does besides, seen from afar."""
+        rates = [self.camera.waves_per_metre(line.wavelength_m) for line in self.lines]
+        pairs = zip(self.lines, rates, strict=True)
+        deviation = [height_deviation(doe.at(line.wavelength_m), height_m, rate) for line, rate in pairs]
+        # The DOE's transmission has the chrome already.
+        return replace(self, deviation=jnp.stack(deviation), coverage=jnp.ones_like(self.coverage))
+
     def raster(self, height_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
         """Heights of the cells."""
         return height_m

@@ -27,9 +27,9 @@ from jaxtyping import Array, Float, UInt8
 from doedesign.design.design import Design
 from doedesign.design.levels.etch_depths import height_histogram, optimal_levels, recipe_depths_m
 from doedesign.design.levels.parametrize import Parameters
-from doedesign.design.levels.printable import PrintableLevels, first_printed, heights_m, pulled
+from doedesign.design.levels.printable import PrintableLevels, first_printed, moved_phases
 from doedesign.design.levels.quantisation import Rounding, rounding_at
-from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, view_of
+from doedesign.design.problem import Problem, SourceSet, StepSources, judge_height, losses, value_and_slope, view_of
 from doedesign.design.robust import RobustState, RobustTask
 from doedesign.design.starts import StartSetup, start_heights
 from doedesign.runtime.compiling import compiled_step
@@ -173,18 +173,11 @@ def make_printed_update(spec: Spec) -> Callable[[Any, Any], Any]:
 
     def update(inputs: tuple[Problem, StepSources, Array], state: tuple[Any, optax.OptState]) -> Any:
         problem, look, height_m = inputs
-        (parameters, adam), parametrization = state, problem.parametrization
-
-        def loss_of(drawn_m: Array) -> tuple[Array, Array]:
-            return losses(problem, view_of(problem, parametrization.cells(drawn_m), look))
-
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(height_m)
-        slope: Any = Parameters(gradient * parametrization.metres_per_radian)
-        updates, adam = optimiser.update(slope, adam)
-        moved: Any = optax.apply_updates(parameters, updates)
-        radians = pulled(moved.radians, height_m, parametrization)
-        wanted = parametrization.level(parametrization.continuous_m(radians)).astype(jnp.uint8)
-        return (Parameters(radians), adam), loss, terms, wanted
+        parametrization = problem.parametrization
+        loss, terms, slope = value_and_slope(problem, height_m, look)
+        parameters, adam = moved_phases(optimiser, parametrization, state, slope, height_m)
+        wanted = parametrization.level(parametrization.continuous_m(parameters.radians)).astype(jnp.uint8)
+        return (parameters, adam), loss, terms, wanted
 
     return compiled_step(update)
 
@@ -218,7 +211,7 @@ def steps(
             state = state._replace(parameters=parameters, adam=adam, step=step + 1)
         else:
             level = _printed(rules, problem, spec, state)
-            height = jnp.asarray(heights_m(level, problem.parametrization))
+            height = problem.parametrization.drawn_height(level)
             (parameters, adam), loss, terms, wanted = printed_update((problem, inputs[1], height), before)
             printed = rules.nearer(level, np.asarray(wanted))
             state = state._replace(parameters=parameters, adam=adam, step=step + 1, printed=printed)

@@ -22,14 +22,15 @@ import optax
 from jaxtyping import Array, Float, UInt8
 
 from doedesign.build import process_from_spec
-from doedesign.design.levels.parametrize import LevelParametrization, Parameters
-from doedesign.design.levels.printable import PrintableLevels, heights_m, pulled
+from doedesign.design.levels.parametrize import Parameters
+from doedesign.design.levels.printable import PrintableLevels, moved_phases
 from doedesign.design.problem import Problem, SourceSet, value_and_slope
 from doedesign.spec import RobustSpec, Spec
 from fab.draws import draw_at, varying
 from fab.errors import InputError
+from fab.levels import height_of
 from fab.process import Normal, Process, Variation
-from sim.optic import HeightOptic, height_deviation
+from sim.optic import HeightOptic
 from sim.surface import as_fabricated
 
 ROUND = 12  # steps that look at the same plates
@@ -114,7 +115,7 @@ class RobustTask(NamedTuple):
         level = self.rules.blank.with_level(level).level  # blank outside the relief
         if self.spec.optimize.min_feature_m is not None:
             level = self.rules.first(level)
-        radians = jnp.asarray(parametrization.radians_of(heights_m(level, parametrization)))
+        radians = jnp.asarray(parametrization.radians_of(height_of(level, parametrization.levels)))
         parameters: Any = Parameters(radians)
         none, losses = np.full(2, -1, np.int32), np.zeros(self.robust.draws, np.float32)
         return RobustState(parameters, self.optimiser.init(parameters), level, level, none, losses)
@@ -138,15 +139,8 @@ class RobustTask(NamedTuple):
         camera = self.problem.camera
         cells = np.where(self.spec.doe.relief.inside(camera.grid), cells, parametrization.levels.count - 1)
         made = as_fabricated(cells.astype(np.uint8), camera, self.process, variation)
-        height = jnp.asarray(heights_m(cells, parametrization))
-        ratio = [
-            height_deviation(made.at(line.wavelength_m), height, camera.waves_per_metre(line.wavelength_m))
-            for line in camera.lines
-        ]
         assert isinstance(optic, HeightOptic)
-        # Its transmission has the chrome already.
-        open_ = jnp.ones_like(optic.coverage)
-        return replace(self.problem, optic=replace(optic, deviation=jnp.stack(ratio), coverage=open_))
+        return replace(self.problem, optic=optic.made_as(made, parametrization.drawn_height(cells)))
 
     def steps(self, state: RobustState, done: int) -> Iterator[tuple[RobustState, dict[str, Any]]]:
         """Run the robust steps that are left.
@@ -171,7 +165,7 @@ class RobustTask(NamedTuple):
                 state = state._replace(seen=state.level, worst=worst, losses=np.zeros_like(state.losses))
             if not plates or place == 0:
                 plates = [self.plate(state.seen, one) for one in self.variations(round_, state.worst)]
-            height = jnp.asarray(heights_m(state.level, parametrization))
+            height = parametrization.drawn_height(state.level)
             look = self.scene.look(self.spec.optimize.seed, self.spec.optimize.steps + step)
             found = [value_and_slope(plate, height, look) for plate in plates]
             losses = np.array([float(loss) for loss, _, _ in found], np.float32)
@@ -180,7 +174,8 @@ class RobustTask(NamedTuple):
                 raise InputError(f"robust, step {step}", "losses must stay finite", losses.tolist(), cure)
             risk, weights = risk_of(losses, self.robust)
             slope = _weighted([gradient for _, _, gradient in found], weights)
-            parameters, adam = _moved(optimiser, parametrization, state.parameters, state.adam, slope, height)
+            before = state.parameters, state.adam
+            parameters, adam = moved_phases(optimiser, parametrization, before, slope, height)
             level = state.level
             if (step + 1) % _FOLLOWED == 0:
                 wanted = parametrization.level(parametrization.continuous_m(parameters.radians))
@@ -240,18 +235,3 @@ def risk_of(losses: Float[np.ndarray, " draw"], robust: RobustSpec) -> tuple[flo
 @jax.jit
 def _weighted(slopes: Sequence[Array], weights: Array) -> Array:
     return sum((weight * slope for weight, slope in zip(weights, slopes, strict=True)), jnp.zeros(()))
-
-
-def _moved(
-    optimiser: optax.GradientTransformation,
-    parametrization: LevelParametrization,
-    parameters: Any,
-    adam: Any,
-    slope: Array,
-    height_m: Array,
-) -> tuple[Parameters, Any]:
-    """Phases and moments after a step, pulled toward the heights that were looked at."""
-    gradient: Any = Parameters(slope * parametrization.metres_per_radian)
-    updates, adam = optimiser.update(gradient, adam)
-    moved: Any = optax.apply_updates(parameters, updates)
-    return Parameters(pulled(moved.radians, height_m, parametrization)), adam

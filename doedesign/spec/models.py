@@ -225,8 +225,8 @@ class OptimizeSpec(SpecTable, frozen=True):
             pixel at every step, so that what one step misses averages out; "exact" integrates every pixel to 0.2 %
             at several times the work, with the image on the axis (for patterns that must fall on certain pixels).
             Both keep the cells' sinc about the axis for near sources, which the reported PSFs do not.
-        colours: "together", or "in_turn": a step looks at one colour, the next at the next. Such a step takes that part
-            of the time, and a design about as many of them. Not for terms that compare colours or depths.
+        colours: "together", or "in_turn": a step looks at one colour, the next at the next. Such a step takes two
+            fifths of the time, and a design half as many more of them. Not for terms that compare colours or depths.
         polish: moves of a descent on levels after the steps (`doedesign.design.descent`); each is kept only if the loss
             falls, and costs as much as the steps that see every depth twice.
         min_feature_m: narrowest line and space of every mask, as a rule that the result never breaks; corners of lines

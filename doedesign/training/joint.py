@@ -43,7 +43,7 @@ from sim.camera import Camera
 from sim.imaging.occlusion import Model
 from sim.light import srgb_from_linear
 from sim.obstruction import ObstructionKind
-from sim.optic import HeightOptic, height_deviation
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.rigorous.edge_optic import EdgeOptic
 from sim.source import SeparableSource
@@ -205,13 +205,8 @@ class Trainer(eqx.Module):
         errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
         doe = as_fabricated(level, camera, self.process, errors)
         height = jnp.asarray(height_of(level, parametrization.levels).astype(np.float32))
-        wavelengths = [line.wavelength_m for line in camera.lines]
-        ratio = [height_deviation(doe.at(w), height, camera.waves_per_metre(w)) for w in wavelengths]
         assert isinstance(self.doe.optic, HeightOptic)
-        # Its transmission has the chrome already.
-        open_ = jnp.ones_like(self.doe.optic.coverage)
-        optic = replace(self.doe.optic, deviation=jnp.stack(ratio), coverage=open_)
-        return replace(self, doe=replace(self.doe, optic=optic))
+        return replace(self, doe=replace(self.doe, optic=self.doe.optic.made_as(doe, height)))
 
 
 def layout_of(spec: Spec, colours: int) -> NetworkShape:

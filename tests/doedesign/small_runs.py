@@ -54,6 +54,9 @@ quantity = "strehl"
 min = 0.9
 """
 
+# The same, whose near light should spread.
+SPREAD = SPEC.replace('name = "far_spot"\n', 'name = "far_spot"\n\n[[objective]]\nname = "near_spread"\nweight = 2.0\n')
+
 
 def call(*arguments: object) -> tuple[int, str, str]:
     """Call a command: its exit code, stdout and stderr."""

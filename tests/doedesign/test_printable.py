@@ -19,10 +19,9 @@ from fab.errors import InputError
 from fab.grid import Grid
 from fab.levels import Levels, planes
 from fab.rules.check import Rules, check
-from tests.doedesign.small_runs import SPEC
+from tests.doedesign.small_runs import SPREAD
 
 UM = 1e-6
-SPREAD = SPEC.replace('name = "far_spot"\n', 'name = "far_spot"\n\n[[objective]]\nname = "near_spread"\nweight = 2.0\n')
 
 
 @pytest.fixture

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from doedesign import optimization
 from doedesign.design.design import Design
-from doedesign.design.levels.printable import heights_m
 from doedesign.design.problem import Problem, SourceSet, problem_of, value_and_slope
 from doedesign.design.robust import ROUND, RobustTask, risk_of, wall_costs
 from doedesign.optimization import optimize
@@ -19,9 +17,8 @@ from fab.levels import Levels
 from fab.process import Normal, Process
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
-from tests.doedesign.small_runs import SPEC
+from tests.doedesign.small_runs import SPREAD
 
-SPREAD = SPEC.replace('name = "far_spot"\n', 'name = "far_spot"\n\n[[objective]]\nname = "near_spread"\nweight = 2.0\n')
 ROBUST = SPREAD.replace("steps = 0", "steps = 24\nlearning_rate = 0.5\nseed = 3\ncheckpoint_every = 1")
 ROBUST += "\n[robust]\nsteps = 16\nlearning_rate = 0.05\n"
 
@@ -90,7 +87,7 @@ def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
     errors = task.variations(0, np.array([-1, -1]))[0]
     level = task.rules.blank.with_level(level).level
     plate = task.plate(level, errors)
-    optic = plate.optic.with_heights(jnp.asarray(heights_m(level, problem.parametrization)))
+    optic = plate.optic.with_heights(problem.parametrization.drawn_height(level))
     made = as_fabricated(level, problem.camera, task.process, errors)
     ours, due = (np.asarray(psf(one, depths=(np.inf,)).energy) for one in (optic, made))
     # Single precision of two ways to the same field.
@@ -106,7 +103,7 @@ def test_the_risk_of_plates_falls(spec: Path) -> None:
 
     def mean_loss(design: Design) -> float:
         level = design.level_map.level
-        height = jnp.asarray(heights_m(level, problem.parametrization))
+        height = problem.parametrization.drawn_height(level)
         looks = [scene.look(5, step) for step in range(4)]
         return float(
             np.mean([float(value_and_slope(unseen.plate(level, v), height, k)[0]) for v in plates for k in looks])

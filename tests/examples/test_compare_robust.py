@@ -8,13 +8,11 @@ import pytest
 
 from doedesign.optimization import optimize
 from doedesign.spec import load_spec
-from tests.doedesign.small_runs import SPEC
+from tests.doedesign.small_runs import SPREAD
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 import compare_robust  # pyright: ignore[reportMissingImports]
-
-SPREAD = SPEC.replace('name = "far_spot"\n', 'name = "far_spot"\n\n[[objective]]\nname = "near_spread"\nweight = 2.0\n')
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped, UInt8
 
 from doedesign.design.levels.quantisation import Rounding, blended_level, stochastic_level
-from fab.levels import Levels
+from fab.levels import Levels, height_of
 from sim.material import full_wave_height_m
 
 # A depth moves all cells at once, so it takes smaller steps than they do: with the usual step size, 1 % at a time.
@@ -152,6 +152,10 @@ class LevelParametrization(eqx.Module):
     def depths_m(self, log_depth_ratio: Float[Array, " k"]) -> Float[Array, " k"]:
         """Depths of the etches from free parameters, 0 for those of the staircase; always positive."""
         return jnp.asarray(self.levels.depths_m, jnp.float32) * jnp.exp(DEPTH_SCALE * log_depth_ratio)
+
+    def drawn_height(self, level: UInt8[np.ndarray, "*s"]) -> Float[Array, "*s"]:
+        """Heights of levels as steps take them, metres, float32."""
+        return jnp.asarray(height_of(level, self.levels).astype(np.float32))
 
     def radians_of(self, height_m: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """Parameters that make a given height, float32."""

@@ -10,12 +10,14 @@ The cells may be coarser than those of the grid (`optimize.drawn_pixel`): rules 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Float, UInt8
 
-from doedesign.design.levels.parametrize import LevelParametrization
+from doedesign.design.levels.parametrize import LevelParametrization, Parameters
 from fab.aperture import Aperture, MaskAperture
 from fab.errors import InputError
 from fab.grid import Grid, fewest_pixels
@@ -99,20 +101,31 @@ class PrintableLevels:
         return follow(old, wanted, self.rules, self.waves_per_metre, self.wall_costs).level
 
 
-def pulled(
-    radians: Float[Array, "y x"], height_m: Float[Array, "y x"], parametrization: LevelParametrization
-) -> Float[Array, "y x"]:
-    """Phases pulled toward those of heights, the nearer way round."""
+def moved_phases(
+    optimiser: optax.GradientTransformation,
+    parametrization: LevelParametrization,
+    state: tuple[Any, Any],
+    slope: Float[Array, "y x"],
+    height_m: Float[Array, "y x"],
+) -> tuple[Parameters, Any]:
+    """Phases and the optimiser's moments after a step that looked at a level map.
+
+    Args:
+        optimiser: moves the phases.
+        parametrization: their staircase.
+        state: `Parameters` and moments before.
+        slope: derivative of the loss with respect to the heights, per metre.
+        height_m: heights of the level map, toward which phases are pulled, the nearer way round.
+    """
+    parameters, moments = state
+    gradient: Any = Parameters(slope * parametrization.metres_per_radian)
+    updates, moments = optimiser.update(gradient, moments)
+    moved: Any = optax.apply_updates(parameters, updates)
     wave = parametrization.levels.period_m / parametrization.metres_per_radian
-    away = height_m / parametrization.metres_per_radian - radians
-    return radians + PULL * (jnp.mod(away + wave / 2, wave) - wave / 2)
+    away = height_m / parametrization.metres_per_radian - moved.radians
+    return Parameters(moved.radians + PULL * (jnp.mod(away + wave / 2, wave) - wave / 2)), moments
 
 
 def first_printed(steps: int) -> int:
     """First of so many steps that looks at a map that can be printed."""
     return steps - int(np.ceil(_SHARE * steps))
-
-
-def heights_m(level: UInt8[np.ndarray, "y x"], parametrization: LevelParametrization) -> Float[np.ndarray, "y x"]:
-    """Heights of levels, metres."""
-    return parametrization.levels.heights_m()[level].astype(np.float32)
