@@ -67,12 +67,14 @@ RING = (
     'optimize.start_options={height="421 nm", duty=0.5}',
     "optimize.learning_rate=0.05",
     "optimize.steps=40",
+    "optimize.colours=together",
     TERMS.format(5, 4),
 )
 EVEN = (
     'optimize.start_options={height="399 nm", duty=0.5}',
     "optimize.learning_rate=0.1",
     "optimize.steps=100",
+    "optimize.colours=together",
     TERMS.format(3.2, 3.5),
 )
 

@@ -87,7 +87,7 @@ def test_the_second_wafer_is_nearer_to_the_design(tmp_path: Path):
         ("samples = 320", "samples = 160"),
         ('aperture = "0.592 mm"', 'aperture = "0.296 mm"'),
         ("window = 128", "window = 96"),
-        ("steps = 60", "steps = 40"),
+        ("steps = 120", "steps = 80"),
     ):
         assert old in text
         text = text.replace(old, new)
