@@ -7,16 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from doedesign.build import camera_from_spec, levels_from_spec
+from doedesign.build import camera_from_spec, levels_from_spec, process_from_spec
 from doedesign.design.design import Design
 from doedesign.design.patterns import spot_centres_m
+from doedesign.runtime.progress import meter
 from doedesign.spec import Spec
-from doedesign.spec.targets.spots import SpotsSpec
+from doedesign.spec.targets.spots import MOST_CELLS, SpotsSpec
 from doedesign.spots.exchange import exchange
 from doedesign.spots.orders import OrderTable, order_table
+from doedesign.spots.plates import SpotPlates, plates_of
 from doedesign.spots.search import search_phases, search_points
 from doedesign.spots.spots import Spots, grid_orders, hexagonal_places, ring_places, shares_of
 from doedesign.spots.superposition import SpotLight, SpotProblem, Staircase, WaveSet
+from fab.draws import varying
+from fab.errors import InputError
 from fab.grid import Grid
 from fab.level_map import LevelMap
 from fab.levels import Levels
@@ -27,10 +31,13 @@ from sim.optic import CellOptic
 # Up to so many levels, phases are searched as the levels have them.
 _FEW_LEVELS = 4
 _TRIED, _TRIAL_STEPS = 4, 30  # candidates of the search, and steps with each before one is chosen
-_MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
 _SWEEPS, _OFFERS = 100, 2**20  # over such a cell: at least, and as many as make so many offers
 _HEATS = (3e-5, 2.5e-4)  # of exchanges of which the best is taken
 _NARROWEST = 32  # cells of a row at which random starts of an exchange begin
+# For plates as fabricated: how many are looked at to choose starts, and to exchange cells; starts tried, and finished;
+# offers to the cells of each of either; heat.
+_FEW_PLATES, _PLATES, _TRIED_ON_PLATES, _FINISHED, _TRIAL_OFFERS, _LAST_OFFERS = 16, 64, 16, 2, 2**18, 2**21
+_PLATE_HEAT = 1e-4
 _ROW_STARTS, _ROW_SWEEPS, _ROW_HEAT, _FINER_HEAT = 200, 1000, 0.05, 1e-4
 
 
@@ -68,8 +75,15 @@ class SpotTask:
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "SpotTask":
-        """Prepare the task of a spec that has spots."""
+        """Prepare the task of a spec that has spots.
+
+        Raises:
+            InputError: spots that stay equal on plates of a process without errors.
+        """
         assert spec.spots is not None
+        if spec.spots.uniformity_as_fabricated and not varying(process_from_spec(spec.process)):
+            key, cure = "spots.uniformity_as_fabricated", 'For example process.stock = "contact_aligner".'
+            raise InputError(key, "plates must differ", "a process without errors", cure)
         camera, levels = camera_from_spec(spec), levels_from_spec(spec.process)
         spots = spots_from_spec(spec.spots, camera)
         rate = camera.waves_per_metre(camera.lines[0].wavelength_m)
@@ -146,7 +160,8 @@ class SpotTask:
         """The design of the best plane waves; the cells of a unit cell are exchanged, and it is repeated."""
         level = self.problem.level(state.best)
         if self.periodic:
-            level = self._exchanged(level)
+            fabricated = self.table.uniformity_as_fabricated > 0
+            level = self._kept_equal(level) if fabricated else self._exchanged(level)
             level = repeated(level, self.camera.grid)
         spec, far_m = self.spec, self.spec.scene.far_m
         level_map = LevelMap(level, self.levels, self.camera.grid, spec.doe.relief, spec.name)
@@ -154,7 +169,7 @@ class SpotTask:
 
     def _exchanged(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
         problem, seed, uniformity = self.problem, self.spec.optimize.seed, self.table.uniformity
-        if level.size > _MOST_CELLS:
+        if level.size > MOST_CELLS:
             return level
         sweeps = max(_SWEEPS, _OFFERS // level.size)
         # Merit counts uniformity as often as its weight says, and so does heat.
@@ -168,6 +183,57 @@ class SpotTask:
             found.append(self._row())
         lights = [problem.light(one).merit(uniformity) for one in found]
         return found[int(np.argmax(lights))]
+
+    def plates(self, count: int) -> SpotPlates:
+        """So many plates with the errors of the spec's process."""
+        process, rate = process_from_spec(self.spec.process), self.camera.waves_per_metre(self._wavelength_m)
+        return SpotPlates.of(self.problem, process, rate, plates_of(process, count, self.spec.optimize.seed))
+
+    def _kept_equal(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
+        """A unit cell whose spots stay equal on plates as fabricated.
+
+        Starts are the level map of before and those of every phase that the search finds, each raised by the number of
+        levels that suits the plates best: what light does is the same, but not where walls of which masks lie.
+        """
+        uniformity, seed, size = self.table.uniformity_as_fabricated, self.spec.optimize.seed, level.size
+        few, plates = self.plates(_FEW_PLATES), self.plates(_PLATES)
+        starts = [max(self._raised(waves), key=lambda one: few.merit(one, uniformity)) for waves in self._searched()]
+        starts = sorted(starts, key=lambda one: -few.merit(one, uniformity))[:_TRIED_ON_PLATES]
+
+        def exchanged(level: UInt8[np.ndarray, "y x"], offers: int) -> UInt8[np.ndarray, "y x"]:
+            sweeps, heat = max(1, offers // size), _PLATE_HEAT * (1 + uniformity)
+            return plates.exchanged(level, sweeps=sweeps, seed=seed, uniformity=uniformity, heat=heat)
+
+        done, found = 0, []
+        share = _LAST_OFFERS // _TRIAL_OFFERS
+        with meter("exchanging cells", 1 + len(starts) + _FINISHED * share) as progress:
+            for start in (level, *starts):
+                found.append(exchanged(start, _TRIAL_OFFERS))
+                progress.advance(done := done + 1)
+            found.sort(key=lambda one: -plates.merit(one, uniformity))
+            for number, one in enumerate(found[:_FINISHED]):
+                found[number] = exchanged(one, _LAST_OFFERS)
+                progress.advance(done := done + share)
+        return max(found, key=lambda one: plates.merit(one, uniformity))
+
+    def _searched(self) -> list[WaveSet]:
+        """Plane waves of every start of a search; the given ones where phases of spots are given."""
+        problem, table, seed = self.problem, self.table, self.spec.optimize.seed
+        if problem.spots.phases is not None:
+            return [WaveSet(np.sqrt(problem.spots.shares), problem.spots.phases)]
+        points = search_points(problem.spots, seed, problem.grid.extent_m)
+        return search_phases(
+            problem.spots, points, starts=table.starts, seed=seed, uniformity=table.uniformity, keep=table.starts
+        ).waves
+
+    def _raised(self, waves: WaveSet) -> list[UInt8[np.ndarray, "y x"]]:
+        """Level maps of a sum of plane waves, raised by every number of levels."""
+        turns = 2 * np.pi * np.arange(self.levels.count) / self.levels.count
+        return [self.problem.level(waves._replace(phases=waves.phases + turn)) for turn in turns]
+
+    @property
+    def _wavelength_m(self) -> float:
+        return self.camera.lines[0].wavelength_m
 
     def _row(self) -> UInt8[np.ndarray, "y x"]:
         """A row of few levels, from random ones by exchange, first in wide cells and then in narrower ones."""

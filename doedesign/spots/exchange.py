@@ -1,6 +1,6 @@
 """Exchange of single cells of a small unit cell: what is left to win where few cells make few levels."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -42,15 +42,53 @@ def exchange(
     best = own.copy()
     for sweep in range(sweeps):
         warm = max(1.0 - sweep / max((1 - _COLD) * sweeps, 1), 0.0)
-        order, chance = rng.permutation(own.size), rng.random(own.size)
-        # A step up or down where there are many levels, or any other level.
-        others = rng.choice([1, count - 1], own.size) if count > 2 else np.ones(own.size, int)
-        others = np.where(rng.random(own.size) < 0.5, others, rng.integers(1, max(count, 2), own.size))
-        others = np.where(rng.random(own.size) < (_ANY_OF_TWO if count == 2 else _ANY), others, 0)
-        sides = rng.integers(0, 4, own.size)
-        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, wanted, level.shape, order,
-               chance, others, sides, heat * warm**2, uniformity)  # fmt: skip
+        offer = offers(rng, own.size, count, _ANY_OF_TWO if count == 2 else _ANY)
+        _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, wanted, level.shape, *offer,
+               heat * warm**2, uniformity)  # fmt: skip
     return best.reshape(level.shape)
+
+
+class Offers(NamedTuple):
+    """What every cell of a level map is offered in a sweep.
+
+    Attributes:
+        order: cells, in the order in which they are asked.
+        chance: a random number from 0 to 1 for each offer, by which a worse one may be taken.
+        others: levels by which an offer differs from the cell's own, or 0 for the level of a neighbour.
+        sides: which neighbour: 0 below, 1 above, 2 behind, 3 before.
+    """
+
+    order: NDArray[np.int64]
+    chance: NDArray[np.float64]
+    others: NDArray[np.int64]
+    sides: NDArray[np.int64]
+
+
+def offers(rng: np.random.Generator, cells: int, levels: int, any_level: float) -> Offers:
+    """Draw the offers of a sweep; a share `any_level` of them is of another level than a neighbour's."""
+    order, chance = rng.permutation(cells), rng.random(cells)
+    # A step up or down where there are many levels, or any other level.
+    others = rng.choice([1, levels - 1], cells) if levels > 2 else np.ones(cells, int)
+    others = np.where(rng.random(cells) < 0.5, others, rng.integers(1, max(levels, 2), cells))
+    others = np.where(rng.random(cells) < any_level, others, 0)
+    return Offers(order, chance, others, rng.integers(0, 4, cells))
+
+
+@njit(cache=True, nogil=True)
+def offered(level: Any, y: int, x: int, other: int, side: int, levels: int) -> int:
+    """The level that a cell of a map is offered (`Offers`)."""
+    if other:
+        return (level[y, x] + other) % levels
+    ny, nx = level.shape
+    if side == 0:
+        y = (y + 1) % ny
+    elif side == 1:
+        y = (y - 1) % ny
+    elif side == 2:
+        x = (x + 1) % nx
+    else:
+        x = (x - 1) % nx
+    return level[y, x]
 
 
 @njit(cache=True, nogil=True)
@@ -92,20 +130,9 @@ def _sweep(
         light += light_of[own[cell]] * waves[cell]
         kept += light_of[best[cell]] * waves[cell]
     merit, highest = _merit(light, shares, wanted, uniformity), _merit(kept, shares, wanted, uniformity)
-    ny, nx = shape
+    drawn, nx = own.reshape(shape), shape[1]
     for cell, throw, other, side in zip(order, chance, others, sides):  # noqa: B905 - numba knows no strict
-        y, x = cell // nx, cell % nx
-        if side == 0:
-            y = (y + 1) % ny
-        elif side == 1:
-            y = (y - 1) % ny
-        elif side == 2:
-            x = (x + 1) % nx
-        else:
-            x = (x - 1) % nx
-        level = own[y * nx + x]
-        if other:
-            level = np.uint8((own[cell] + other) % len(light_of))
+        level = offered(drawn, cell // nx, cell % nx, other, side, len(light_of))
         if level == own[cell]:
             continue
         tried = light + (light_of[level] - light_of[own[cell]]) * waves[cell]

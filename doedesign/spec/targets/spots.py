@@ -44,6 +44,8 @@ class SpotsSpec(SpecTable, frozen=True):
             lens whose front focal plane is the DOE shows them in the spots.
         uniformity: how much of the efficiency a uniformity error (max - min) / (max + min) is worth; 0 is for light
             alone.
+        uniformity_as_fabricated: the same of plates with the errors of the process, for a unit cell: cells are
+            exchanged for spots that stay equal on these (`doedesign.spots.plates`). 0 looks at the plate as drawn.
         starts: random starts of the search for the spots' phases, where these are free.
     """
 
@@ -61,6 +63,7 @@ class SpotsSpec(SpecTable, frozen=True):
     weights: tuple[Positive, ...] = optional(())
     phases_rad: tuple[Annotated[float, bounded("rad", -2 * math.pi, 2 * math.pi)], ...] = optional(())
     uniformity: NotNegative = optional(1.0)
+    uniformity_as_fabricated: NotNegative = optional(0.0)
     starts: Annotated[int, Field(strict=True, ge=1, le=100_000)] = optional(200)
 
     @field_validator("count")
@@ -95,6 +98,7 @@ class SpotsSpec(SpecTable, frozen=True):
 
 _PLACING = ("count", "rings", "number", "spacing_m", "radius_m", "places_m", "period_m")
 _FEWEST_CELLS = 4  # of a unit cell
+MOST_CELLS = 2**16  # of a unit cell whose cells are exchanged one by one
 
 
 def spot_problems(spec: "Spec") -> Iterator[InputError]:
@@ -105,6 +109,7 @@ def spot_problems(spec: "Spec") -> Iterator[InputError]:
     for problem in _keys(spec):
         complete = False
         yield problem
+    yield from _as_fabricated(spec)
     yield from beside_problems(spec, "spots")
     yield from in_focus(spec)
     if complete:
@@ -123,6 +128,22 @@ def _keys(spec: "Spec") -> Iterator[InputError]:
             yield InputError(f"spots.{toml_key(name)}", rule, toml_key(name), "Remove it.")
     if spots.period_m is not None and any(spots.offset_m):
         yield InputError("spots.offset", "orders of a unit cell cannot be moved", "an offset", "Remove it.")
+
+
+def _as_fabricated(spec: "Spec") -> Iterator[InputError]:
+    """Rules of spots that stay equal on plates as fabricated."""
+    spots: Any = spec.spots
+    if not spots.uniformity_as_fabricated:
+        return
+    key = "spots.uniformity_as_fabricated"
+    if spots.period_m is None or spots.count is None:
+        yield InputError(key, "cells of a unit cell are exchanged", "no period", "Give spots.period, or leave it out.")
+        return
+    side = round(spots.period_m / spec.doe.pitch_m)
+    cells = side ** sum(count > 1 for count in spots.count)
+    if cells > MOST_CELLS:
+        rule = f"a unit cell must have at most {MOST_CELLS} cells"
+        yield InputError(key, rule, f"{cells}", "Choose coarser cells or a shorter period, or leave it out.")
 
 
 def _reach(spec: "Spec") -> Iterator[InputError]:

@@ -1,0 +1,131 @@
+"""Do spots stay equal on the wafer? Beam splitters designed as drawn and for plates as fabricated, side by side.
+
+    python examples/compare_splitters.py [--draws 200] [--processes contact_aligner direct_write] [--out FOLDER]
+
+One beam becomes nine in a row, by unit cells of 512 um, and five by five, by unit cells of 192 um, 16 levels each.
+`spots.uniformity_as_fabricated` is the only difference between two designs. Plates are then drawn from every process,
+the first of which is the one that the designs know, with errors that no design has seen, and judged by the whole model
+of the process (`sim.surface`). Five minutes on two cores.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from doedesign.cli import exit_code
+from doedesign.design.design import Design
+from doedesign.optimization import optimize
+from doedesign.spec import load_spec
+from doedesign.spots.design import orders_of_design
+from doedesign.templates import template_text
+from fab.figure import panels, save
+from fab.files import csv_table, write_atomic
+from sim.optic import HeightOptic
+
+SEED = 4711  # of the plates, which no design draws from
+# Spots along x and y, period, and what equal light is worth: of the plate as drawn, and of plates as fabricated.
+SPLITTERS = {"1 x 9": ([9, 1], "512 um", 3.0, 3.0), "5 x 5": ([5, 5], "192 um", 3.0, 1.0)}
+DESIGNS = ("as drawn", "as fabricated")
+SMALL = ("doe.samples=384", "doe.aperture=0.768 mm")  # one period or more in the largest square of the aperture
+
+
+class Splitter(NamedTuple):
+    """Plates of a design and a process; `p95` is what 95 % of them stay below."""
+
+    splitter: str
+    design: str
+    process: str
+    drawn_efficiency: float
+    drawn_uniformity_error: float
+    mean_efficiency: float
+    mean_uniformity_error: float
+    p95_uniformity_error: float
+
+
+def design_of(splitter: str, name: str, process: str, folder: Path, more: Sequence[str] = ()) -> Design:
+    """Design a splitter for the plate as drawn, or for plates of a stock process."""
+    count, period, uniformity, fabricated = SPLITTERS[splitter]
+    path = folder / "fan_out.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, template_text("fan_out").encode())
+    changes = [f"spots.count={count}", f"spots.period={period}", f"spots.uniformity={uniformity}"]
+    if name == "as fabricated":
+        changes.append(f"spots.uniformity_as_fabricated={fabricated}")
+    return optimize(load_spec(path, [*SMALL, f"process.stock={process}", *changes, *more]))
+
+
+def uniformity_errors(design: Design, process: str, draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """Efficiency and uniformity error of so many plates of a stock process."""
+    tables = [
+        orders_of_design(design, design.fabricated(process, seed=SEED, draw=f"normal/{number}"))
+        for number in range(draws)
+    ]
+    return np.array([one.total for one in tables]), np.array([one.uniformity_error for one in tables])
+
+
+def in_words(one: Splitter) -> str:
+    """A line of the table."""
+    return (
+        f"{one.splitter}, {one.design:13} {one.process:16} drawn {one.drawn_efficiency:6.2%}, u "
+        f"{one.drawn_uniformity_error:5.2%};  plates {one.mean_efficiency:6.2%}, u {one.mean_uniformity_error:6.2%} in "
+        f"the mean, below {one.p95_uniformity_error:6.2%} in 95 %"
+    )
+
+
+def plot(errors: dict[tuple[str, str, str], np.ndarray]) -> object:
+    """How unequal spots are on the plates, as the share of plates that stay below."""
+    splitters, processes = (list(dict.fromkeys(keys)) for keys in list(zip(*errors, strict=True))[::2])
+    words = "How unequal the spots of plates as fabricated are, designed for the plate as drawn or for plates"
+    with panels(None, (5 * len(splitters), 4), words, f"{len(next(iter(errors.values())))} plates each") as figure:
+        axes = np.atleast_1d(figure.subplots(1, len(splitters)))
+        for axis, splitter in zip(axes, splitters, strict=True):
+            for process, line in zip(processes, ("-", "--", ":"), strict=False):
+                for number, name in enumerate(DESIGNS):
+                    found = np.sort(errors[splitter, name, process])
+                    share = (np.arange(len(found)) + 1) / len(found)
+                    label = f"{name}, {process.replace('_', ' ')}"
+                    axis.plot(100 * found, share, line, color=f"C{number}", label=label)
+            axis.axhline(0.95, color="0.7", linewidth=0.8)
+            axis.set(title=splitter, xlabel="uniformity error (%)", ylabel="share of plates below", ylim=(0, 1))
+            axis.set_xlim(left=0)
+            axis.grid(alpha=0.3)
+        axes[0].legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def run(draws: int, processes: Sequence[str], out: Path, more: Sequence[str] = ()) -> list[Splitter]:
+    """Design, judge, and write the table and the picture."""
+    found, errors = [], {}
+    for splitter in SPLITTERS:
+        for name in DESIGNS:
+            design = design_of(splitter, name, processes[0], out, more)
+            drawn = orders_of_design(design, HeightOptic.of(design.camera, design.nominal_height_m))
+            for process in processes:
+                light, unequal = uniformity_errors(design, process, draws)
+                errors[splitter, name, process] = unequal
+                numbers = (
+                    drawn.total,
+                    drawn.uniformity_error,
+                    light.mean(),
+                    unequal.mean(),
+                    np.percentile(unequal, 95),
+                )
+                found.append(Splitter(splitter, name, process, *map(float, numbers)))
+                print(in_words(found[-1]), flush=True)
+    write_atomic(out / "splitters.csv", csv_table(found, 5).encode())
+    save(plot(errors), out / "splitters.png")  # pyright: ignore[reportArgumentType]
+    print(f"written to {out}/splitters.csv and .png")
+    return found
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--processes", nargs="+", default=["contact_aligner", "direct_write"])
+    parser.add_argument("--out", type=Path, default=Path("compare-splitters"))
+    given = parser.parse_args()
+    sys.exit(exit_code(lambda: run(given.draws, given.processes, given.out) and None))
