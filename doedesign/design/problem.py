@@ -84,6 +84,15 @@ class SourceSet(NamedTuple):
 
         They depend on the two numbers alone, so a resumed run repeats them.
         """
+        offset = None
+        if self.displacement_m > 0:
+            shift = np.random.default_rng((seed, 2, step)).uniform(-1.0, 1.0, 2) * self.displacement_m
+            offset = jnp.asarray(shift, jnp.float32)
+        colour = step % len(self.lens) if self.in_turn else None
+        return self._chosen(*self.chosen_depths(seed, step), offset, colour)
+
+    def chosen_depths(self, seed: int, step: int) -> tuple[list[int], list[int]]:
+        """Numbers of the near and of the far depths that a step looks at."""
 
         def pick(count: int, salt: int) -> list[int]:
             if count == 0 or self.whole:
@@ -91,12 +100,7 @@ class SourceSet(NamedTuple):
             order = np.random.default_rng((seed, salt, step // count)).permutation(count)
             return [int(order[step % count])]
 
-        offset = None
-        if self.displacement_m > 0:
-            shift = np.random.default_rng((seed, 2, step)).uniform(-1.0, 1.0, 2) * self.displacement_m
-            offset = jnp.asarray(shift, jnp.float32)
-        colour = step % len(self.lens) if self.in_turn else None
-        return self._chosen(pick(len(self.near[0]), 0), pick(len(self.far[0]), 1), offset, colour)
+        return pick(len(self.near[0]), 0), pick(len(self.far[0]), 1)
 
     def first_look(self) -> StepSources:
         """The first near and far depth, or all of them, with the image on the axis."""

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float, UInt8
 from doedesign.build import process_from_spec
 from doedesign.design.levels.parametrize import Parameters
 from doedesign.design.levels.printable import PrintableLevels, moved_phases
-from doedesign.design.problem import Problem, SourceSet, value_and_slope
+from doedesign.design.problem import Problem, SourceSet, StepSources, value_and_slope
+from doedesign.design.ranges import SourceRange
 from doedesign.spec import RobustSpec, Spec
 from fab.draws import draw_at, varying
 from fab.errors import InputError
@@ -68,6 +69,7 @@ class RobustTask(NamedTuple):
         scene: its sources.
         process: the process, whose errors plates have.
         rules: rules of its masks, and the cost of their walls.
+        ranges: where sources may lie beside the listed depths and the axis; None if nowhere.
     """
 
     spec: Spec
@@ -75,6 +77,7 @@ class RobustTask(NamedTuple):
     scene: SourceSet
     process: Process
     rules: PrintableLevels
+    ranges: SourceRange | None = None
 
     @classmethod
     def of(cls, spec: Spec, problem: Problem, scene: SourceSet) -> "RobustTask":
@@ -94,7 +97,9 @@ class RobustTask(NamedTuple):
         rules = PrintableLevels.on(
             problem.camera.grid, spec.doe.relief, parametrization, optimize.min_feature_m or 0.0, optimize.wall_weight
         ).with_costs(by_errors)
-        return cls(spec, problem, scene, process, rules)
+        between, beside = spec.robust.depths == "range", spec.robust.field == "random"
+        ranges = SourceRange.of(spec, problem, between=between, beside=beside) if between or beside else None
+        return cls(spec, problem, scene, process, rules, ranges)
 
     @property
     def robust(self) -> RobustSpec:
@@ -132,6 +137,16 @@ class RobustTask(NamedTuple):
         scores = np.random.default_rng(seed).standard_normal(len(varying(self.process)))
         return draw_at(self.process, scores if place % 2 == 0 else -scores, place)
 
+    def look(self, step: int) -> StepSources:
+        """Sources of a step: those of other steps, or others about them."""
+        seed, scene = self.spec.optimize.seed, self.spec.scene
+        look = self.scene.look(seed, step)
+        if self.ranges is None:
+            return look
+        near, far = self.scene.chosen_depths(seed, step)
+        depths_m = [scene.near_m[number] for number in near], [scene.far_m[number] for number in far]
+        return self.ranges.look(self.problem, look, self.ranges.places(depths_m, seed, step))
+
     def plate(self, level: UInt8[np.ndarray, "y x"], variation: Variation) -> Problem:
         """The problem with a plate as fabricated: its deviation from the heights of a level map."""
         parametrization, optic = self.problem.parametrization, self.problem.optic
@@ -166,7 +181,7 @@ class RobustTask(NamedTuple):
             if not plates or place == 0:
                 plates = [self.plate(state.seen, one) for one in self.variations(round_, state.worst)]
             height = parametrization.drawn_height(state.level)
-            look = self.scene.look(self.spec.optimize.seed, self.spec.optimize.steps + step)
+            look = self.look(self.spec.optimize.steps + step)
             found = [value_and_slope(plate, height, look) for plate in plates]
             losses = np.array([float(loss) for loss, _, _ in found], np.float32)
             if not np.all(np.isfinite(losses)):

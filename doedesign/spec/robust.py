@@ -25,6 +25,9 @@ class RobustSpec(SpecTable, frozen=True):
         limit: loss of a good plate, for "yield".
         walls: cost of a wall of a mask, as a multiple of the light that goes astray beside it where the mask is off by
             the process's errors of its edges, as if its neighbours stayed.
+        depths: "listed" looks at the depths of the scene, "range" anywhere between the nearest and the farthest near
+            and far ones, evenly in their inverse.
+        field: "random" looks from a field angle of its own within the sensor at every step, "off" from the axis.
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
     """
 
@@ -34,6 +37,8 @@ class RobustSpec(SpecTable, frozen=True):
     share: Annotated[float, Field(strict=True, gt=0, le=1)] = 0.5
     limit: Positive | None = optional()
     walls: NotNegative = 0.3
+    depths: Literal["listed", "range"] = "listed"
+    field: Literal["off", "random"] = "off"
     learning_rate: Positive = 0.1
 
 
@@ -45,6 +50,7 @@ def robust_problems(spec: "Spec") -> Iterator[InputError]:
     if robust.measure == "yield" and robust.limit is None:
         cure = "For example limit = 1.5; history.jsonl has the losses of a run."
         yield InputError("robust.limit", '"yield" needs the loss of a good plate', "nothing", cure)
+    yield from _source_problems(spec, robust)
     if not spec.objectives:
         yield InputError("robust", "it minimises the loss of [[objective]]", "none", "Add one, or remove [robust].")
     refused = (
@@ -64,3 +70,21 @@ def robust_problems(spec: "Spec") -> Iterator[InputError]:
         if broken:
             got = getattr(getattr(spec, key.partition(".")[0]), key.partition(".")[2].replace("depths", "depths_m"))
             yield InputError(key, f"in a robust design, {rule}", f"{got}", cure)
+
+
+def _source_problems(spec: "Spec", robust: RobustSpec) -> Iterator[InputError]:
+    """Rules of sources beside the listed depths and the axis."""
+    if robust.depths == "range" and any(objective.compares for objective in spec.objectives):
+        cure = 'Use depths = "listed", or objectives for all depths alike.'
+        yield InputError("robust.depths", "no objective may compare depths or name some", '"range"', cure)
+    if robust.field == "off":
+        return
+    sensor, optics = spec.sensor, spec.optics
+    if sensor.resolution is None or sensor.pitch_m is None:
+        cure = "Give sensor.resolution and sensor.pitch."
+        yield InputError("robust.field", "field angles end where the sensor does", "no size of it", cure)
+    if optics.mapping != "sine" or any(optics.distortion):
+        cure = 'Set field = "off", or leave mapping and distortion out.'
+        yield InputError("robust.field", "the lens images sines, without distortion", '"random"', cure)
+    if spec.illumination is not None:
+        yield InputError("robust.field", "a beam has its own direction", '"random"', 'Set field = "off".')

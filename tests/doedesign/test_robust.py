@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from doedesign import optimization
 from doedesign.design.design import Design
 from doedesign.design.problem import Problem, SourceSet, problem_of, value_and_slope
+from doedesign.design.ranges import SourceRange
 from doedesign.design.robust import ROUND, RobustTask, risk_of, wall_costs
 from doedesign.optimization import optimize
 from doedesign.spec import RobustSpec, load_spec
@@ -15,6 +18,8 @@ from doedesign.spec.process import ErrorsSpec
 from fab.errors import InputError
 from fab.levels import Levels
 from fab.process import Normal, Process
+from sim.metrics import participation
+from sim.optic import HeightOptic
 from sim.psf_bank import psf
 from sim.surface import as_fabricated
 from tests.doedesign.small_runs import SPREAD
@@ -144,6 +149,9 @@ def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monke
         (["optimize.parametrization=radial"], "masks are of cells"),
         (['process.etch_depths="optimize"'], "the depths must be known"),
         (["optics.light=edges"], "light is scalar"),
+        (["robust.depths=range", "objective=[{name='far_spot', over='worst'}]"], "no objective may compare depths"),
+        (["robust.field=random", "optics.mapping=tangent"], "the lens images sines"),
+        (["robust.field=random", "illumination={kind='gaussian', diameter='50 um'}"], "a beam has its own direction"),
     ],
 )
 def test_what_cannot_be_is_told(spec: Path, change: list[str], words: str) -> None:
@@ -157,3 +165,58 @@ def test_a_process_without_errors_has_no_risk(spec: Path) -> None:
     exact = read.process.model_copy(update={"errors": ErrorsSpec()})
     with pytest.raises(InputError, match="plates must differ"):
         RobustTask.of(read.model_copy(update={"process": exact}), problem, scene)
+
+
+def test_sources_lie_between_the_listed_depths_and_on_all_of_the_sensor(spec: Path) -> None:
+    read = load_spec(
+        spec,
+        ["robust.depths=range", "robust.field=random", 'scene.near=["6 mm", "12 mm"]', 'scene.far=["0.5 m", "inf"]'],
+    )
+    problem, scene = problem_of(read, {})
+    task = RobustTask.of(read, problem, scene)
+    assert task.ranges is not None
+    places = [task.ranges.places(((), ()), 3, step) for step in range(200)]
+    near, far = (1 / np.array([getattr(one, side) for one in places])[:, 0] for side in ("near_m", "far_m"))
+    tangents = np.tan([one.field_rad for one in places]) / (np.array([240, 320]) * 1.85e-6 / 1e-3)
+    # Evenly over the inverse depths and over the sensor, whose half is 1 here: means within four standard deviations.
+    for found, (low, high) in (
+        (near, (1 / 12e-3, 1 / 6e-3)),
+        (far, (0.0, 2.0)),
+        (tangents[:, 0], (-1.0, 1.0)),
+        (tangents[:, 1], (-1.0, 1.0)),
+    ):
+        assert found.min() > low - 1e-9
+        assert found.max() < high + 1e-9
+        assert abs(found.mean() - (low + high) / 2) < 4 * (high - low) / np.sqrt(12 * 200)
+    look = task.look(3)
+    drawn = task.ranges.places(((), ()), read.optimize.seed, 3)
+    due = problem.optic.source(problem.optic.lines[0], drawn.near_m[0], drawn.field_rad)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(np.array_equal(a, b)), look.near[0][0], due))
+
+
+def test_the_plain_lens_is_known_between_the_listed_depths(spec: Path) -> None:
+    read = load_spec(spec, ["robust.depths=range", 'scene.near=["6 mm", "12 mm"]'])
+    problem, scene = problem_of(read, {})
+    ranges = RobustTask.of(read, problem, scene).ranges
+    assert ranges is not None
+    for step in range(3):
+        places = ranges.places(((), ()), 4, step)
+        look = ranges.look(problem, scene.look(0, step), places)
+        due = psf(HeightOptic.of(problem.camera), depths=places.near_m)
+        # Interpolation between 9 depths whose blur differs by a factor of 4.
+        assert np.asarray(look.lens) == pytest.approx(np.asarray(participation(jnp.asarray(due.energy))), rel=0.02)
+
+
+def test_listed_sources_on_the_axis_are_those_of_other_steps(spec: Path) -> None:
+    """Ranges without width are the listed sources themselves."""
+    task, problem, scene = task_of(spec)
+    ranges = SourceRange.of(task.spec, problem, between=False, beside=False)
+    look, listed = task._replace(ranges=ranges).look(5), scene.look(task.spec.optimize.seed, 5)
+    same = jax.tree.map(lambda a, b: bool(np.allclose(a, b, rtol=1e-6)), look, listed)
+    assert jax.tree.all(same)
+
+
+def test_a_robust_design_of_all_depths_and_angles(spec: Path) -> None:
+    found = optimize(load_spec(spec, ["robust.depths=range", "robust.field=random", "optimize.steps=6"]))
+    assert len(found.history) == 6 + 16
+    assert all(np.isfinite(line["loss"]) for line in found.history)
