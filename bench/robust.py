@@ -1,10 +1,10 @@
-"""A robust step, which looks at four plates as fabricated, against a step that looks at the plate as drawn; full size.
+"""A robust step of a round of four plates as fabricated against a step that looks at the plate as drawn; full size.
 
     python -m bench.robust           ten minutes
     python -m bench.robust --quick   examples/quick.toml; the targets are for the full size
 
 Both look at all colours. A round of robust steps (`doedesign.design.robust.ROUND`) makes its plates once and moves the
-level map every few steps; what that takes is part of the steps.
+level map every so many steps; what that takes is part of the steps. A step looks at one pair of the plates.
 """
 
 import argparse

@@ -28,7 +28,7 @@ from sim.optic import HeightOptic
 
 SEED = 4711  # of the plates, which no design draws from
 # Spots along x and y, period, and what equal light is worth: of the plate as drawn, and of plates as fabricated.
-SPLITTERS = {"1 x 9": ([9, 1], "512 um", 3.0, 3.0), "5 x 5": ([5, 5], "192 um", 3.0, 1.0)}
+SPLITTERS = {"1 x 9": ([9, 1], "512 um", 3.0, 6.0), "5 x 5": ([5, 5], "192 um", 3.0, 2.0)}
 DESIGNS = ("as drawn", "as fabricated")
 SMALL = ("doe.samples=384", "doe.aperture=0.768 mm")  # one period or more in the largest square of the aperture
 
@@ -79,7 +79,7 @@ def in_words(one: Splitter) -> str:
 def plot(errors: dict[tuple[str, str, str], np.ndarray]) -> object:
     """How unequal spots are on the plates, as the share of plates that stay below."""
     splitters, processes = (list(dict.fromkeys(keys)) for keys in list(zip(*errors, strict=True))[::2])
-    words = "How unequal the spots of plates as fabricated are, designed for the plate as drawn or for plates"
+    words = "How unequal the spots of plates are that come back, by what their splitter was designed for"
     with panels(None, (5 * len(splitters), 4), words, f"{len(next(iter(errors.values())))} plates each") as figure:
         axes = np.atleast_1d(figure.subplots(1, len(splitters)))
         for axis, splitter in zip(axes, splitters, strict=True):
@@ -87,7 +87,7 @@ def plot(errors: dict[tuple[str, str, str], np.ndarray]) -> object:
                 for number, name in enumerate(DESIGNS):
                     found = np.sort(errors[splitter, name, process])
                     share = (np.arange(len(found)) + 1) / len(found)
-                    label = f"{name}, {process.replace('_', ' ')}"
+                    label = f"designed {name}, made by {process.replace('_', ' ')}"
                     axis.plot(100 * found, share, line, color=f"C{number}", label=label)
             axis.axhline(0.95, color="0.7", linewidth=0.8)
             axis.set(title=splitter, xlabel="uniformity error (%)", ylabel="share of plates below", ylim=(0, 1))

@@ -63,20 +63,19 @@ class SourceRange:
             beside: whether sources lie anywhere on the sensor, and not on the axis alone.
         """
         near, far = (sorted(1 / depth for depth in depths_m) for depths_m in (spec.scene.near_m, spec.scene.far_m))
-        tangents = (0.0, 0.0)
+        height = width = 0.0
         if beside:
             sensor = spec.sensor
             assert sensor.resolution is not None
             assert sensor.pitch_m is not None
             width, height = (count * sensor.pitch_m / 2 / spec.image_distance_m for count in sensor.resolution)
-            tangents = (height, width)
         nodes, lens = np.array(near), np.zeros((len(problem.camera.colours), 0), np.float32)
         if near:
             nodes = np.linspace(near[0], near[-1], _NODES) if between and near[0] < near[-1] else np.unique(near)
             bank = psf(HeightOptic.of(problem.camera), depths=tuple(1 / nodes))
             lens = np.asarray(participation(jnp.asarray(bank.energy)))
         ends = [(side[0], side[-1]) if between and side else None for side in (near, far)]
-        return cls(ends[0], ends[1], tangents, nodes, lens)
+        return cls(ends[0], ends[1], (height, width), nodes, lens)
 
     def places(self, depths_m: tuple[Sequence[float], Sequence[float]], seed: int, step: int) -> SourcePlaces:
         """Where the sources of a step lie.
@@ -96,7 +95,7 @@ class SourceRange:
 
     def look(self, problem: Problem, listed: StepSources, places: SourcePlaces) -> StepSources:
         """Sources at these places, in place of those that a step would look at among the listed ones."""
-        near, far, angles = places
+        near, far, angles = places.near_m, places.far_m, places.field_rad
         optic = problem.optic
         sources: Any = optic.source
         near_sources, far_sources = (
@@ -106,8 +105,8 @@ class SourceRange:
         # The blur of a lens grows with a power of the inverse depth.
         lens = np.zeros((len(self.lens), len(near)), np.float32)
         if len(near):
-            places = np.log(1 / np.asarray(near)), np.log(self.nodes_per_m)
-            lens = np.array([np.exp(np.interp(*places, np.log(row))) for row in self.lens], np.float32)
+            at, nodes = np.log(1 / np.asarray(near)), np.log(self.nodes_per_m)
+            lens = np.array([np.exp(np.interp(at, nodes, np.log(row))) for row in self.lens], np.float32)
         return listed._replace(near=near_sources, far=far_sources, lens=jnp.asarray(lens))
 
 

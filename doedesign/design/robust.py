@@ -1,11 +1,12 @@
 """Robust design: steps that minimise the risk of plates as fabricated, not the loss of the plate as drawn.
 
 They begin at the level map that the other steps found. Of every round of steps the plates are drawn anew, in pairs with
-errors of opposite sign, and the worst one of the round before is looked at again; within a round all steps see the same
-ones. `sim.surface.as_fabricated` says what each does to the map: the deviation of its transmission from that of the
-heights, which holds for the steps of a round. The gradient of the losses is taken with that deviation, so that phases
-make up for what the errors do on average. What it cannot see are walls, where the errors act: they have a cost in the
-moves by which the level map follows the phases (`fab.rules.repair.follow`), by the light that they send astray.
+errors of opposite sign, and the worst one of the round before is looked at again; within a round a step looks at one
+pair, the next step at the next. `sim.surface.as_fabricated` says what each does to the map: the deviation of its
+transmission from that of the heights, which holds for the steps of a round. The gradient of the losses is taken with
+that deviation, so that phases make up for what the errors do on average. What it cannot see are walls, where the errors
+act: they have a cost in the moves by which the level map follows the phases (`fab.rules.repair.follow`), by the light
+that they send astray.
 
 Sources: J. Jung et al., BOSON-1, arXiv:2411.08210 (worst cases in the loop); R. T. Rockafellar and S. Uryasev, J. Risk
 2, 21 (2000) (the mean of the worst, CVaR).
@@ -34,8 +35,8 @@ from fab.process import Normal, Process, Variation
 from sim.optic import HeightOptic
 from sim.surface import as_fabricated
 
-ROUND = 12  # steps that look at the same plates
-_FOLLOWED = 6  # steps after which the level map follows the phases: what one look misses the next ones see
+ROUND = 40  # steps that look at the same plates
+_FOLLOWED = 20  # steps after which the level map follows the phases: what one look misses the next ones see
 _SOFT = 0.02  # of the limit, over which a plate turns from good to bad
 _SALT = 3  # of the random numbers, beside those of looks
 
@@ -49,7 +50,7 @@ class RobustState(NamedTuple):
         level: `[y, x]` levels that can be printed, of the pixels that are drawn.
         seen: `[y, x]` levels whose plates as fabricated this round looks at.
         worst: round and place in it of the worst plate of the round before; -1 in the first round.
-        losses: `[draw]` summed losses of this round.
+        losses: `[draw]` last loss of every plate of this round.
     """
 
     parameters: Parameters
@@ -182,21 +183,27 @@ class RobustTask(NamedTuple):
                 plates = [self.plate(state.seen, one) for one in self.variations(round_, state.worst)]
             height = parametrization.drawn_height(state.level)
             look = self.look(self.spec.optimize.steps + step)
-            found = [value_and_slope(plate, height, look) for plate in plates]
-            losses = np.array([float(loss) for loss, _, _ in found], np.float32)
+            # All plates once, then one pair after the other; of those that are not looked at, the last losses count.
+            pairs = -(-len(plates) // 2)
+            first = 2 * (place % pairs)
+            seen = range(len(plates)) if place == 0 else range(first, min(first + 2, len(plates)))
+            found = {number: value_and_slope(plates[number], height, look) for number in seen}
+            losses = state.losses.copy()
+            losses[list(found)] = [float(loss) for loss, _, _ in found.values()]
             if not np.all(np.isfinite(losses)):
                 cure = "Lower robust.learning_rate."
                 raise InputError(f"robust, step {step}", "losses must stay finite", losses.tolist(), cure)
             risk, weights = risk_of(losses, self.robust)
-            slope = _weighted([gradient for _, _, gradient in found], weights)
+            often = pairs if place else 1  # as a pair is seen in one of so many steps, it counts so many times
+            slope = _weighted([gradient for _, _, gradient in found.values()], often * weights[list(found)])
             before = state.parameters, state.adam
             parameters, adam = moved_phases(optimiser, parametrization, before, slope, height)
             level = state.level
             if (step + 1) % _FOLLOWED == 0:
                 wanted = parametrization.level(parametrization.continuous_m(parameters.radians))
                 level = self.rules.nearer(level, np.asarray(wanted).astype(np.uint8))
-            state = RobustState(parameters, adam, level, state.seen, state.worst, state.losses + losses)
-            terms = np.mean([np.asarray(terms) for _, terms, _ in found], axis=0)
+            state = RobustState(parameters, adam, level, state.seen, state.worst, losses)
+            terms = np.mean([np.asarray(terms) for _, terms, _ in found.values()], axis=0)
             record = {"step": self.spec.optimize.steps + step, "loss": risk, "terms": terms.tolist()}
             yield state, record | {"names": [term.name for term in self.problem.terms]}
 

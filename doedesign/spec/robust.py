@@ -18,7 +18,7 @@ class RobustSpec(SpecTable, frozen=True):
 
     Attributes:
         steps: number of these steps.
-        draws: plates that a step looks at; each pair has errors of opposite sign.
+        draws: plates that some steps look at before others are drawn, one pair with errors of opposite sign in a step.
         measure: risk that the steps minimise, of the losses of these plates: their "mean"; "cvar", the mean of the
             worst; or "yield", the share of plates whose loss exceeds `limit`, with a soft edge.
         share: of the plates, that "cvar" looks at.
@@ -31,7 +31,7 @@ class RobustSpec(SpecTable, frozen=True):
         learning_rate: step size of Adam, in radians of phase at the design wavelength.
     """
 
-    steps: Steps = 40
+    steps: Steps = 120
     draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 4
     measure: Literal["mean", "cvar", "yield"] = "mean"
     share: Annotated[float, Field(strict=True, gt=0, le=1)] = 0.5

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from doedesign.spots.exchange import FLAT, offered
 
@@ -86,33 +85,16 @@ def _add_cell(
 
 
 @njit(cache=True, nogil=True)
-def sweep(
-    own: NDArray[np.uint8],
-    best: NDArray[np.uint8],
-    light_of: Any,
-    across_y: Any,
-    across_x: Any,
-    rows: Any,
-    columns: Any,
-    upper: Any,
-    left: Any,
-    shares: Any,
-    order: Any,
-    chance: Any,
-    others: Any,
-    sides: Any,
-    heat: float,
-    uniformity: float,
-) -> None:
+def sweep(own: Any, best: Any, tables: Any, shares: Any, offers: Any, heat: float, uniformity: float) -> None:
     """Offer every cell another level, in place; `best` is the best map met so far."""
-    tables = (light_of, across_y, across_x, rows, columns, upper, left)
     light = amplitudes_of(own, *tables)
     merit = merit_of(light, shares, uniformity)
     highest = merit_of(amplitudes_of(best, *tables), shares, uniformity)
     nx, tried = own.shape[1], np.empty_like(light)
+    order, chance, others, sides = offers
     for cell, throw, other, side in zip(order, chance, others, sides):  # noqa: B905 - numba knows no strict
         y, x = cell // nx, cell % nx
-        level = offered(own, y, x, other, side, len(light_of))
+        level = offered(own, y, x, other, side, len(tables[0]))
         if level == own[y, x]:
             continue
         tried[:] = light

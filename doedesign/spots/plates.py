@@ -116,7 +116,7 @@ class SpotPlates:
         for number in range(sweeps):
             warm = max(1.0 - number / max((1 - _COLD) * sweeps, 1), 0.0)
             offer = offers(rng, own.size, len(self.light), _ANY)
-            sweep(own, best, *self.tables, self.shares, *offer, heat * warm**2, uniformity)
+            sweep(own, best, self.tables, self.shares, offer, heat * warm**2, uniformity)
         return best
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from doedesign import optimization
+from doedesign.design import robust as robust_steps
 from doedesign.design.design import Design
 from doedesign.design.problem import Problem, SourceSet, problem_of, value_and_slope
 from doedesign.design.ranges import SourceRange
-from doedesign.design.robust import ROUND, RobustTask, risk_of, wall_costs
+from doedesign.design.robust import RobustTask, risk_of, wall_costs
 from doedesign.optimization import optimize
 from doedesign.spec import RobustSpec, load_spec
 from doedesign.spec.process import ErrorsSpec
@@ -120,19 +121,21 @@ def test_the_risk_of_plates_falls(spec: Path) -> None:
 
 
 def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robust_steps, "ROUND", 8)
+    monkeypatch.setattr(robust_steps, "_FOLLOWED", 4)
     whole = optimize(spec, tmp_path / "whole")
     save, done = optimization.save_checkpoint, []
 
     def stop_late(*given: object) -> None:
         save(*given)  # pyright: ignore[reportArgumentType]
         done.append(given)
-        if len(done) == 24 + ROUND + 3:  # in the middle of the second round
+        if len(done) == 24 + 8 + 3:  # in the middle of the second round
             raise KeyboardInterrupt
 
     monkeypatch.setattr(optimization, "save_checkpoint", stop_late)
     with pytest.raises(KeyboardInterrupt):
         optimize(spec, tmp_path / "again")
-    monkeypatch.undo()
+    monkeypatch.setattr(optimization, "save_checkpoint", save)
     again = optimize(spec, tmp_path / "again")
     assert np.array_equal(whole.level_map.level, again.level_map.level)
     assert whole.history == again.history
