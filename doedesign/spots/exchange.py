@@ -49,7 +49,7 @@ def exchange(
 
 
 class Offers(NamedTuple):
-    """What every cell of a level map is offered in a sweep.
+    """Offers of a sweep: another level for every cell of a level map.
 
     Attributes:
         order: cells, in the order in which they are asked.

@@ -31,7 +31,7 @@ _COLD = 0.3  # share of the sweeps that take improvements alone
 
 @dataclass(frozen=True, eq=False)
 class SpotPlates:
-    """What the errors of some plates do to the spots of a unit cell.
+    """Effect of the errors of some plates on the spots of a unit cell.
 
     Attributes:
         light: `[level, plate]` transmission of a level.

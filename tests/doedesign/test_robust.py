@@ -122,7 +122,6 @@ def test_the_risk_of_plates_falls(spec: Path) -> None:
 
 def test_a_stopped_run_goes_on_with_its_plates(spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robust_steps, "ROUND", 8)
-    monkeypatch.setattr(robust_steps, "_FOLLOWED", 4)
     whole = optimize(spec, tmp_path / "whole")
     save, done = optimization.save_checkpoint, []
 
