@@ -35,9 +35,9 @@ _SWEEPS, _OFFERS = 100, 2**20  # over such a cell: at least, and as many as make
 _HEATS = (3e-5, 2.5e-4)  # of exchanges of which the best is taken
 _NARROWEST = 32  # cells of a row at which random starts of an exchange begin
 # For plates as fabricated: how many are looked at to choose starts, and to exchange cells; starts tried, and finished;
-# offers to the cells of each of either; heat.
+# offers to the cells of each of either; heat; starts that are raised by every number of levels.
 _FEW_PLATES, _PLATES, _TRIED_ON_PLATES, _FINISHED, _TRIAL_OFFERS, _LAST_OFFERS = 16, 64, 16, 2, 2**18, 2**21
-_PLATE_HEAT = 1e-4
+_PLATE_HEAT, _MOST_RAISED = 1e-4, 400
 _ROW_STARTS, _ROW_SWEEPS, _ROW_HEAT, _FINER_HEAT = 200, 1000, 0.05, 1e-4
 
 
@@ -192,12 +192,17 @@ class SpotTask:
     def _kept_equal(self, level: UInt8[np.ndarray, "y x"]) -> UInt8[np.ndarray, "y x"]:
         """A unit cell whose spots stay equal on plates as fabricated.
 
-        Starts are the level map of before and those of every phase that the search finds, each raised by the number of
-        levels that suits the plates best: what light does is the same, but not where walls of which masks lie.
+        Starts are the level map of before and those of the best phases that the search finds, each raised by the number
+        of levels that suits the plates best: what light does is the same, but not where walls of which masks lie.
         """
         uniformity, seed, size = self.table.uniformity_as_fabricated, self.spec.optimize.seed, level.size
         few, plates = self.plates(_FEW_PLATES), self.plates(_PLATES)
-        starts = [max(self._raised(waves), key=lambda one: few.merit(one, uniformity)) for waves in self._searched()]
+        points = search_points(self.problem.spots, seed, self.problem.grid.extent_m)
+        searched = search_phases(
+            self.problem.spots, points, starts=self.table.starts, seed=seed, uniformity=self.table.uniformity,
+            keep=_MOST_RAISED,
+        ).waves  # fmt: skip
+        starts = [max(self._raised(waves), key=lambda one: few.merit(one, uniformity)) for waves in searched]
         starts = sorted(starts, key=lambda one: -few.merit(one, uniformity))[:_TRIED_ON_PLATES]
 
         def exchanged(level: UInt8[np.ndarray, "y x"], offers: int) -> UInt8[np.ndarray, "y x"]:
@@ -215,16 +220,6 @@ class SpotTask:
                 found[number] = exchanged(one, _LAST_OFFERS)
                 progress.advance(done := done + share)
         return max(found, key=lambda one: plates.merit(one, uniformity))
-
-    def _searched(self) -> list[WaveSet]:
-        """Plane waves of every start of a search; the given ones where phases of spots are given."""
-        problem, table, seed = self.problem, self.table, self.spec.optimize.seed
-        if problem.spots.phases is not None:
-            return [WaveSet(np.sqrt(problem.spots.shares), problem.spots.phases)]
-        points = search_points(problem.spots, seed, problem.grid.extent_m)
-        return search_phases(
-            problem.spots, points, starts=table.starts, seed=seed, uniformity=table.uniformity, keep=table.starts
-        ).waves
 
     def _raised(self, waves: WaveSet) -> list[UInt8[np.ndarray, "y x"]]:
         """Level maps of a sum of plane waves, raised by every number of levels."""

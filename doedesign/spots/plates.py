@@ -81,11 +81,6 @@ class SpotPlates:
         return cls(by_code[codes], across_y, across_x, (rows / area, columns), (upper / area, left), shares)
 
     @property
-    def count(self) -> int:
-        """Number of plates."""
-        return self.light.shape[1]
-
-    @property
     def tables(self) -> tuple[Any, ...]:
         """Everything that the light of a level map is summed from."""
         return (self.light, self.across_y, self.across_x, *self.cells, *self.borders)

@@ -193,6 +193,10 @@ def test_what_cannot_be_is_refused(tmp_path: Path):
         SpotTask.from_spec(spec_of(tmp_path, MADE))
     with pytest.raises(InputError, match=r"unit cell are exchanged.*Give spots\.period"):
         load_spec(free_spec(tmp_path), [MADE, "process.stock=contact_aligner"])
+    with pytest.raises(InputError, match="phases of spots must be free"):
+        spec_of(
+            tmp_path, MADE, "spots.count=[2, 1]", 'spots.phases=["0 rad", "1 rad"]', "process.stock=contact_aligner"
+        )
     with pytest.raises(InputError, match="at most 65536 cells, but got 262144"):
         spec_of(tmp_path, "doe.samples=512", "doe.aperture=1.024 mm", "spots.period=1.024 mm", MADE)
 

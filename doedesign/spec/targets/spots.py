@@ -139,6 +139,8 @@ def _as_fabricated(spec: "Spec") -> Iterator[InputError]:
     if spots.period_m is None or spots.count is None:
         yield InputError(key, "cells of a unit cell are exchanged", "no period", "Give spots.period, or leave it out.")
         return
+    if spots.phases_rad:
+        yield InputError(key, "phases of spots must be free", "spots.phases", "Leave one of them out.")
     side = round(spots.period_m / spec.doe.pitch_m)
     cells = side ** sum(count > 1 for count in spots.count)
     if cells > MOST_CELLS:
