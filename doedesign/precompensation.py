@@ -253,6 +253,20 @@ def precompensate(
     }
     inputs = input_digests(files) | source_digests(drawn.spec, objectives or {})
     inputs |= {"precompensated": sha256_bytes(canonical_json(about))}
+    if (found := _finished(folder, inputs, overwrite=overwrite)) is not None:
+        return found
+    terms = terms_from_spec(drawn.spec, design.camera, files, objectives)
+    task = _Task(design, made_by, _loss_of(design, terms) if by == "loss" else _difference_from(design))
+    commands = task.search(evaluations)
+    compensated = _compensated(task, commands, _next_name(drawn))
+    assert compensated.spec is not None
+    with claim_run(folder, compensated.spec, inputs, overwrite=overwrite) as claimed:
+        _write(claimed, task, compensated, terms, commands, about)
+    return open_design(folder, False)
+
+
+def _finished(folder: Path, inputs: dict[str, str], *, overwrite: bool) -> Design | None:
+    """The design of a folder that holds this pre-compensation, done; an InputError for one that holds another run."""
     # The spec of the new run is known after the search alone.
     before = inputs_of_run(folder)
     if before == inputs:
@@ -263,14 +277,7 @@ def precompensate(
     elif before is not None and not overwrite:
         cure = "Choose another output folder, or give `overwrite` to remove that run and all that was made of it."
         raise InputError(str(folder), "the folder must belong to this pre-compensation", "another run", cure)
-    terms = terms_from_spec(drawn.spec, design.camera, files, objectives)
-    task = _Task(design, made_by, _loss_of(design, terms) if by == "loss" else _difference_from(design))
-    commands = task.search(evaluations)
-    compensated = _compensated(task, commands, _next_name(drawn))
-    assert compensated.spec is not None
-    with claim_run(folder, compensated.spec, inputs, overwrite=overwrite) as claimed:
-        _write(claimed, task, compensated, terms, commands, about)
-    return open_design(folder, False)
+    return None
 
 
 def _next_name(design: Design) -> str:

@@ -63,19 +63,13 @@ class SourceRange:
             beside: whether sources lie anywhere on the sensor, and not on the axis alone.
         """
         near, far = (sorted(1 / depth for depth in depths_m) for depths_m in (spec.scene.near_m, spec.scene.far_m))
-        height = width = 0.0
-        if beside:
-            sensor = spec.sensor
-            assert sensor.resolution is not None
-            assert sensor.pitch_m is not None
-            width, height = (count * sensor.pitch_m / 2 / spec.image_distance_m for count in sensor.resolution)
         nodes, lens = np.array(near), np.zeros((len(problem.camera.colours), 0), np.float32)
         if near:
             nodes = np.linspace(near[0], near[-1], _NODES) if between and near[0] < near[-1] else np.unique(near)
             bank = psf(HeightOptic.of(problem.camera), depths=tuple(1 / nodes))
             lens = np.asarray(participation(jnp.asarray(bank.energy)))
         ends = [(side[0], side[-1]) if between and side else None for side in (near, far)]
-        return cls(ends[0], ends[1], (height, width), nodes, lens)
+        return cls(ends[0], ends[1], spec.half_field if beside else (0.0, 0.0), nodes, lens)
 
     def places(self, depths_m: tuple[Sequence[float], Sequence[float]], seed: int, step: int) -> SourcePlaces:
         """Where the sources of a step lie.

@@ -132,6 +132,15 @@ class RobustTask(NamedTuple):
             drawn[-1] = self._variation(int(worst[0]), int(worst[1]))
         return drawn
 
+    def worst_of(self, state: RobustState, round_: int) -> np.ndarray:
+        """Round and place of the worst plate of a round that has ended; -1 before the first one."""
+        if round_ < 0:
+            return np.full(2, -1, np.int32)
+        place = int(np.argmax(state.losses))
+        if place == self.robust.draws - 1 > 1 and state.worst[0] >= 0:
+            return state.worst  # it was there from an earlier round
+        return np.array([round_, place], np.int32)
+
     def _variation(self, round_: int, place: int) -> Variation:
         seed = [self.spec.optimize.seed, _SALT, round_, place // 2]
         scores = np.random.default_rng(seed).standard_normal(len(varying(self.process)))
@@ -176,8 +185,7 @@ class RobustTask(NamedTuple):
         for step in range(done, self.robust.steps):
             round_, place = divmod(step, ROUND)
             if place == 0:
-                worst = np.array([round_ - 1, np.argmax(state.losses)] if round_ else [-1, -1], np.int32)
-                state = state._replace(worst=worst, losses=np.zeros_like(state.losses))
+                state = state._replace(worst=self.worst_of(state, round_ - 1), losses=np.zeros_like(state.losses))
             if not plates or place == 0:
                 plates = [self.plate(state.level, one) for one in self.variations(round_, state.worst)]
             height = parametrization.drawn_height(state.level)

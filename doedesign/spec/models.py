@@ -352,6 +352,15 @@ class Spec(SpecTable, frozen=True):
         return self.sensor.distance_m or (self.optics.focal_length_m or math.nan) + self.sensor.defocus_m
 
     @property
+    def half_field(self) -> tuple[float, float]:
+        """Tangents (y, x) of the field angles at the borders of a sensor whose resolution and pitch are given."""
+        sensor = self.sensor
+        assert sensor.resolution is not None
+        assert sensor.pitch_m is not None
+        width, height = (count * sensor.pitch_m / 2 / self.image_distance_m for count in sensor.resolution)
+        return height, width
+
+    @property
     def propagation(self) -> Literal["far_field", "fresnel"] | None:
         """How light is to get to the sensor behind a lens; None without one, where its distance says it."""
         return None if self.optics.focal_length_m is None else self.optics.propagation

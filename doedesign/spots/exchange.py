@@ -41,11 +41,15 @@ def exchange(
     own, count = level.reshape(-1).copy(), len(problem.staircase.light)
     best = own.copy()
     for sweep in range(sweeps):
-        warm = max(1.0 - sweep / max((1 - _COLD) * sweeps, 1), 0.0)
         offer = offers(rng, own.size, count, _ANY_OF_TWO if count == 2 else _ANY)
         _sweep(own, best, waves, problem.staircase.light.astype(np.complex128), shares, wanted, level.shape, *offer,
-               heat * warm**2, uniformity)  # fmt: skip
+               cooled(heat, sweep, sweeps), uniformity)  # fmt: skip
     return best.reshape(level.shape)
+
+
+def cooled(heat: float, sweep: int, sweeps: int) -> float:
+    """Heat of one of so many sweeps, which falls to zero before the last ones."""
+    return heat * max(1.0 - sweep / max((1 - _COLD) * sweeps, 1), 0.0) ** 2
 
 
 class Offers(NamedTuple):

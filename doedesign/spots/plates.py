@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int, UInt8
 
-from doedesign.spots.exchange import offers
+from doedesign.spots.exchange import cooled, offers
 from doedesign.spots.plate_sums import amplitudes_of, merit_of, sweep
 from doedesign.spots.superposition import SpotProblem
 from fab.draws import draw_at, varying
@@ -26,7 +26,6 @@ from fab.process import Process, Variation
 from sim.surface.relief import effective_bias, relief_of
 
 _ANY = 0.3  # share of offers of another level than a neighbour's
-_COLD = 0.3  # share of the sweeps that take improvements alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +108,8 @@ class SpotPlates:
         rng = np.random.default_rng((seed, 0x50B5))
         own, best = level.copy(), level.copy()
         for number in range(sweeps):
-            warm = max(1.0 - number / max((1 - _COLD) * sweeps, 1), 0.0)
             offer = offers(rng, own.size, len(self.light), _ANY)
-            sweep(own, best, self.tables, self.shares, offer, heat * warm**2, uniformity)
+            sweep(own, best, self.tables, self.shares, offer, cooled(heat, number, sweeps), uniformity)
         return best
 
 

@@ -37,7 +37,6 @@ from doedesign.training.loss import adam_step, history_line, losses
 from doedesign.training.optics import Capture, TrainingDoe, TrainingScene, shots
 from fab.draws import variation_at
 from fab.errors import InputError
-from fab.levels import height_of
 from fab.process import Process
 from sim.camera import Camera
 from sim.imaging.occlusion import Model
@@ -204,9 +203,9 @@ class Trainer(eqx.Module):
         plate_m = max(camera.grid.extent_m)
         errors = variation_at(self.process, self.spec.train.seed, plate_m, f"normal/{step}")
         doe = as_fabricated(level, camera, self.process, errors)
-        height = jnp.asarray(height_of(level, parametrization.levels).astype(np.float32))
         assert isinstance(self.doe.optic, HeightOptic)
-        return replace(self, doe=replace(self.doe, optic=self.doe.optic.made_as(doe, height)))
+        optic = self.doe.optic.made_as(doe, parametrization.drawn_height(level))
+        return replace(self, doe=replace(self.doe, optic=optic))
 
 
 def layout_of(spec: Spec, colours: int) -> NetworkShape:
@@ -276,11 +275,7 @@ def resting_depths_m(spec: Spec, kind: ObstructionKind) -> tuple[float, ...]:
 def _field_rad(spec: Spec, seed: int, number: int) -> tuple[float, float]:
     """Field angles (y, x) of a scene, anywhere on the sensor."""
     share = np.random.default_rng((seed, _SALT_FIELD, number)).uniform(-0.5, 0.5, 2)
-    sensor = spec.sensor
-    assert sensor.resolution is not None
-    assert sensor.pitch_m is not None
-    width, height = (n * sensor.pitch_m for n in sensor.resolution)
-    y, x = np.arctan(share * np.array([height, width]) / spec.image_distance_m)
+    y, x = np.arctan(share * 2 * np.array(spec.half_field))
     return float(y), float(x)
 
 

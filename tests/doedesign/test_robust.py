@@ -86,6 +86,19 @@ def test_plates_have_opposite_errors_and_the_worst_stays(spec: Path) -> None:
     assert again[0] != drawn[0]
 
 
+def test_a_worst_plate_that_is_carried_on_keeps_its_errors(spec: Path) -> None:
+    task, _, _ = task_of(spec)
+    begun = task.initial_state(np.zeros((48, 48), np.uint8))
+    assert task.worst_of(begun, -1).tolist() == [-1, -1]
+    first = begun._replace(losses=np.array([1.0, 3.0, 2.0, 2.5]))
+    assert task.worst_of(first, 0).tolist() == [0, 1]
+    last = begun._replace(losses=np.array([1.0, 2.0, 2.0, 2.5]))
+    assert task.worst_of(last, 0).tolist() == [0, 3]  # of the first round, which carries none
+    # In the second round the last plate is that of the first one.
+    carried = last._replace(worst=np.array([0, 1]))
+    assert task.variations(1, task.worst_of(carried, 1))[-1] == task.variations(0, task.worst_of(begun, -1))[1]
+
+
 def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
     """The PSF of heights times their deviation is that of the DOE as fabricated, from the axis of a far source."""
     task, problem, _ = task_of(spec)
