@@ -2,11 +2,11 @@
 
 They begin at the level map that the other steps found. Of every round of steps the plates are drawn anew, in pairs with
 errors of opposite sign, and the worst one of the round before is looked at again; within a round a step looks at one
-pair, the next step at the next. `sim.surface.as_fabricated` says what each does to the map: the deviation of its
-transmission from that of the heights, which holds for the steps of a round. The gradient of the losses is taken with
-that deviation, so that phases make up for what the errors do on average. What it cannot see are walls, where the errors
-act: they have a cost in the moves by which the level map follows the phases (`fab.rules.repair.follow`), by the light
-that they send astray.
+pair, the next step at the next, or at all plates where the risk compares them. `sim.surface.as_fabricated` says what
+each does to the map: the deviation of its transmission from that of the heights, which holds for the steps of a round.
+The gradient of the losses is taken with that deviation, so that phases make up for what the errors do on average. What
+it cannot see are walls, where the errors act: they have a cost in the moves by which the level map follows the phases
+(`fab.rules.repair.follow`), by the light that they send astray.
 
 Sources: J. Jung et al., BOSON-1, arXiv:2411.08210 (worst cases in the loop); R. T. Rockafellar and S. Uryasev, J. Risk
 2, 21 (2000) (the mean of the worst, CVaR).
@@ -50,7 +50,7 @@ class RobustState(NamedTuple):
         adam: Adam's moments of them.
         level: `[y, x]` levels that can be printed, of the pixels that are drawn.
         worst: round and place in it of the worst plate of the round before; -1 in the first round.
-        losses: `[draw]` last loss of every plate of this round.
+        losses: `[draw]` summed losses of this round, of every plate in the steps that looked at it.
     """
 
     parameters: Parameters
@@ -141,6 +141,16 @@ class RobustTask(NamedTuple):
             return state.worst  # it was there from an earlier round
         return np.array([round_, place], np.int32)
 
+    def seen(self, place: int) -> tuple[range, float]:
+        """Plates that a step of a round looks at, and the factor of its gradient by which all plates count alike."""
+        count = self.robust.draws
+        if self.robust.measure != "mean":
+            return range(count), 1.0  # which ones are the worst shows in the same light alone
+        pairs = -(-count // 2)
+        first = 2 * (place % pairs)
+        seen = range(first, min(first + 2, count))
+        return seen, len(seen) * pairs / count
+
     def _variation(self, round_: int, place: int) -> Variation:
         seed = [self.spec.optimize.seed, _SALT, round_, place // 2]
         scores = np.random.default_rng(seed).standard_normal(len(varying(self.process)))
@@ -190,27 +200,24 @@ class RobustTask(NamedTuple):
                 plates = [self.plate(state.level, one) for one in self.variations(round_, state.worst)]
             height = parametrization.drawn_height(state.level)
             look = self.look(self.spec.optimize.steps + step)
-            # All plates once, then one pair after the other; of those that are not looked at, the last losses count.
-            pairs = -(-len(plates) // 2)
-            first = 2 * (place % pairs)
-            seen = range(len(plates)) if place == 0 else range(first, min(first + 2, len(plates)))
-            found = {number: value_and_slope(plates[number], height, look) for number in seen}
-            losses = state.losses.copy()
-            losses[list(found)] = [float(loss) for loss, _, _ in found.values()]
+            seen, share = self.seen(place)
+            found = [value_and_slope(plates[number], height, look) for number in seen]
+            losses = np.array([float(loss) for loss, _, _ in found], np.float32)
             if not np.all(np.isfinite(losses)):
                 cure = "Lower robust.learning_rate."
                 raise InputError(f"robust, step {step}", "losses must stay finite", losses.tolist(), cure)
             risk, weights = risk_of(losses, self.robust)
-            often = pairs if place else 1  # as a pair is seen in one of so many steps, it counts so many times
-            slope = _weighted([gradient for _, _, gradient in found.values()], often * weights[list(found)])
+            slope = _weighted([gradient for _, _, gradient in found], share * weights)
             before = state.parameters, state.adam
             parameters, adam = moved_phases(optimiser, parametrization, before, slope, height)
             level = state.level
             if place + 1 == ROUND or step + 1 == self.robust.steps:
                 wanted = parametrization.level(parametrization.continuous_m(parameters.radians))
                 level = self.rules.nearer(level, np.asarray(wanted).astype(np.uint8))
-            state = RobustState(parameters, adam, level, state.worst, losses)
-            terms = np.mean([np.asarray(terms) for _, terms, _ in found.values()], axis=0)
+            summed = state.losses.copy()
+            summed[seen.start : seen.stop] += losses
+            state = RobustState(parameters, adam, level, state.worst, summed)
+            terms = np.mean([np.asarray(terms) for _, terms, _ in found], axis=0)
             record = {"step": self.spec.optimize.steps + step, "loss": risk, "terms": terms.tolist()}
             yield state, record | {"names": [term.name for term in self.problem.terms]}
 

@@ -18,7 +18,8 @@ class RobustSpec(SpecTable, frozen=True):
 
     Attributes:
         steps: number of these steps.
-        draws: plates that some steps look at before others are drawn, one pair with errors of opposite sign in a step.
+        draws: plates that some steps look at before others are drawn: for the "mean" one pair with errors of opposite
+            sign in a step, or else all of them.
         measure: risk that the steps minimise, of the losses of these plates: their "mean"; "cvar", the mean of the
             worst; or "yield", the share of plates whose loss exceeds `limit`, with a soft edge.
         share: of the plates, that "cvar" looks at.

@@ -99,6 +99,20 @@ def test_a_worst_plate_that_is_carried_on_keeps_its_errors(spec: Path) -> None:
     assert task.variations(1, task.worst_of(carried, 1))[-1] == task.variations(0, task.worst_of(begun, -1))[1]
 
 
+@pytest.mark.parametrize("draws", [1, 2, 3, 4])
+def test_every_plate_counts_alike_in_the_mean(spec: Path, draws: int) -> None:
+    task, _, _ = task_of(spec)
+    count = -(-draws // 2)
+    task = task._replace(spec=load_spec(spec, [f"robust.draws={draws}"]))
+    weights = np.zeros(draws)
+    for place in range(count):
+        seen, share = task.seen(place)
+        weights[seen.start : seen.stop] += share * risk_of(np.ones(len(seen)), task.robust)[1] / count
+    assert weights == pytest.approx(np.full(draws, 1 / draws))
+    compared = task._replace(spec=load_spec(spec, [f"robust.draws={draws}", "robust.measure=cvar"]))
+    assert compared.seen(1) == (range(draws), 1.0)
+
+
 def test_a_plate_has_the_light_of_the_model_of_the_process(spec: Path) -> None:
     """The PSF of heights times their deviation is that of the DOE as fabricated, from the axis of a far source."""
     task, problem, _ = task_of(spec)
